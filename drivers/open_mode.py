@@ -148,10 +148,10 @@ class PositionMode(OpenMode):
         self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
     ) -> None:
         super().__init__(guard, wire, frame)
-        self._taken = SentSetPoints(guard, max_gap + 1)
+        self._history = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
-        self._kept = np.ones(len(self._still), dtype=np.bool_)
+        self._continuing = np.ones(len(self._still), dtype=np.bool_)
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
@@ -168,9 +168,9 @@ class PositionMode(OpenMode):
             self._feed_forward.begin()
         self.held = position
         self._sent = target
-        self._taken.begin(target)
+        self._history.begin(target)
         self.lost = 0
-        self._kept[...] = True
+        self._continuing[...] = True
         self._rest(commanded)
 
     def require_start(self, cycle: int) -> None:
@@ -189,7 +189,7 @@ class PositionMode(OpenMode):
         """The motion's next set-point, or the last one where nothing moves."""
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
-        self._check_taken(cycle)
+        self._check_accepted(cycle)
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
@@ -208,14 +208,14 @@ class PositionMode(OpenMode):
             self._write_feed_forward(self._feed_forward, execution, step, cycle)
         self.held = position
         self._sent = motor
-        self._taken.add(motor)
+        self._history.add(motor)
 
-    def _check_taken(self, cycle: int, where: Joints | None = None) -> None:
+    def _check_accepted(self, cycle: int, where: Joints | None = None) -> None:
         """Whether the controller takes the set-points sent.
 
         An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
         """
-        lost = self._taken.check(self._wire.raw[TARGET], self.missed, cycle, where)
+        lost = self._history.check(self._wire.raw[TARGET], self.missed, cycle, where)
         age = self._wire.age
         # The answer to the packet may have been taken all the same if the target is older.
         self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0
@@ -237,7 +237,7 @@ class PositionMode(OpenMode):
 
     def require_carried_on(self, reading: Reading, cycle: int) -> None:
         """Target and velocity received against the set-point sent last."""
-        where = self._kept & reading.ready
+        where = self._continuing & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
         raw = self._wire.raw
         velocity, step = raw[1:4:2], self._step
@@ -245,34 +245,34 @@ class PositionMode(OpenMode):
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:
         """Velocity of the arm against that of the set-points sent last."""
-        where = self._kept & reading.ready
+        where = self._continuing & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), MotionUnknown, cycle, where)
         velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
         """Axes open all the time keep the last set-point; those open again, their target."""
-        raw, kept, held = self._wire.raw, self._kept, reading.held
-        kept &= reading.ready
-        self.require_holdable(held & ~kept, held | reading.ready, cycle)
+        raw, continuing, held = self._wire.raw, self._continuing, reading.held
+        continuing &= reading.ready
+        self.require_holdable(held & ~continuing, held | reading.ready, cycle)
         commanded[0] = np.where(held, measured[0], np.nan)
         commanded[1] = np.where(held, 0.0, np.nan)
         self._guard.check_feedback(
-            raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=kept
+            raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=continuing
         )
-        self._check_taken(cycle, kept)
-        if kept.all():  # a source that ends in mid-motion would leave a jump to rest
+        self._check_accepted(cycle, continuing)
+        if continuing.all():  # a source that ends in mid-motion would leave a jump to rest
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
-        self._taken.add(self._sent)
+        self._history.add(self._sent)
         self._step = self._still
-        slots = self._wire.joint_slots[kept]
-        self._frame.floats[slots, D1] = self._sent[kept]
+        slots = self._wire.joint_slots[continuing]
+        self._frame.floats[slots, D1] = self._sent[continuing]
         self._frame.floats[slots, D2] = 0.0
-        commanded[0, kept] = self.held[kept]
+        commanded[0, continuing] = self.held[continuing]
 
     def _rest(self, commanded: Array) -> None:
         self._step = self._still
-        self._taken.add(self._sent)
+        self._history.add(self._sent)
         self._wire.write(self._frame.floats, self._sent, self._still)
         commanded[0] = self.held
         commanded[1] = 0.0

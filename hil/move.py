@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
 from hil.archive import ArchiveSpec
-from hil.campaign.announced_limits import checks_in_force
+from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.intervals import player_of
 from hil.campaign.motion_link import MotionLink

@@ -244,7 +244,7 @@ class Interpolator(MoveServices):
         status = self._set()
         if status >= 0 and not self._held:
             self._held = True
-            self._stop_told = self._queue is None or not self._queue.ahead
+            self._stop_reported = self._queue is None or not self._queue.ahead
             self._run(self._stopping)
         return status
 
@@ -264,7 +264,7 @@ class Interpolator(MoveServices):
         if self._queue is None or not self._queue.ahead:
             self._held = False
         elif self._moving:
-            self._cancelling, self._stop_told = True, False
+            self._cancelling, self._stop_reported = True, False
             self._run(self._stopping)
         else:
             self._drop()
@@ -282,7 +282,7 @@ class Interpolator(MoveServices):
         self._override = 1.0
         self._elapsed = 0.0
         self._held = self._cancelling = False
-        self._stop_told = True
+        self._stop_reported = True
 
     def _rest_at(self, position: Array) -> None:
         """Begin to wait for targets, at rest."""
@@ -328,8 +328,8 @@ class Interpolator(MoveServices):
 
     def _stand(self, events: tuple[Event, ...]) -> Step:
         """Return the step of an arm that was told to stop and is at rest."""
-        if not self._stop_told:
-            self._stop_told = True
+        if not self._stop_reported:
+            self._stop_reported = True
             target = self.get_current_target_id()
             assert target is not None
             events += (Event(EventKind.MOTION_STOPPED, target),)
@@ -348,7 +348,7 @@ class Interpolator(MoveServices):
             *(Event(EventKind.VIA_POINT_PASSED, passage.target_id) for passage in passed),
             Event(EventKind.MOTION_ENDED, last.target_id),
         )
-        self._stop_told = True
+        self._stop_reported = True
         step = self._step(Status.FINAL_STEP, events)
         self._rest_at(self._position)
         return step

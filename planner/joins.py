@@ -59,7 +59,7 @@ class Solutions(NamedTuple):
     ends: Array
     times: Array
     durations: Array
-    answers: NDArray[np.object_]
+    found: NDArray[np.object_]
 
     def take(self, rows: Rows) -> Solutions:
         """Return some of the solutions, by index."""
@@ -68,7 +68,7 @@ class Solutions(NamedTuple):
             self.ends[rows],
             self.times[rows],
             self.durations[rows],
-            self.answers[rows],
+            self.found[rows],
         )
 
 
@@ -91,7 +91,7 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: LimitRows) -> S
     problem.max_jerk = [FULL * SOLVER_JERK] * n_joints
     solver = ruckig.Ruckig(n_joints)
     durations = np.full(len(starts), np.inf)
-    answers = np.full(len(starts), None, dtype=np.object_)
+    found = np.full(len(starts), None, dtype=np.object_)
     rows = np.flatnonzero(_askable(starts, bounds) & _askable(ends, bounds))
     tasks = zip(
         rows.tolist(),
@@ -108,8 +108,8 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: LimitRows) -> S
             solver.calculate(problem, answer)
         except REFUSALS:
             continue
-        durations[row], answers[row] = answer.duration * time, answer
-    return Solutions(starts, ends, times, durations, answers)
+        durations[row], found[row] = answer.duration * time, answer
+    return Solutions(starts, ends, times, durations, found)
 
 
 def _in_units(
@@ -167,7 +167,7 @@ def _tables(solutions: Solutions, bounds: LimitRows) -> Block:
     profiles = np.array(
         [
             [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in answer.profiles[0]]
-            for answer in solutions.answers
+            for answer in solutions.found
         ]
     )
     lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]

@@ -10,7 +10,7 @@ from drivers.events import AnswersLost, Event, GapSeen, LinkLost, MotionEnded, P
 
 EVERY: Final = 0.1
 """s between two events of the same sort."""
-_Counted = PacketRejected | GapSeen | AnswersLost
+_Mergeable = PacketRejected | GapSeen | AnswersLost
 
 
 class Digest:
@@ -22,25 +22,25 @@ class Digest:
     """
 
     def __init__(self) -> None:
-        self._held: dict[str, _Counted] = {}
+        self._held: dict[str, _Mergeable] = {}
         self._quiet_until: dict[str, float] = {}
 
     def take(self, events: Iterable[Event], now: float) -> list[Event]:
         """What is to be told at this moment, in order."""
-        told: list[Event] = []
+        released: list[Event] = []
         for event in events:
             if isinstance(event, PacketRejected | GapSeen | AnswersLost):
                 sort = _sort(event)
                 held = self._held.get(sort)
                 self._held[sort] = event if held is None else _sum(held, event)
-                self._release(sort, now, told)
+                self._release(sort, now, released)
             else:
                 if isinstance(event, MotionEnded | LinkLost):
-                    told += self.rest()
-                told.append(event)
+                    released += self.rest()
+                released.append(event)
         for sort in tuple(self._held):
-            self._release(sort, now, told)
-        return told
+            self._release(sort, now, released)
+        return released
 
     def rest(self) -> list[Event]:
         """All that is held back."""
@@ -48,17 +48,17 @@ class Digest:
         self._held.clear()
         return held
 
-    def _release(self, sort: str, now: float, told: list[Event]) -> None:
+    def _release(self, sort: str, now: float, released: list[Event]) -> None:
         if now >= self._quiet_until.get(sort, -math.inf):
-            told.append(self._held.pop(sort))
+            released.append(self._held.pop(sort))
             self._quiet_until[sort] = now + EVERY
 
 
-def _sort(event: _Counted) -> str:
+def _sort(event: _Mergeable) -> str:
     return f"rejected: {event.kind}" if isinstance(event, PacketRejected) else type(event).__name__
 
 
-def _sum(earlier: _Counted, later: _Counted) -> _Counted:
+def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
     """Of two of the same sort."""
     if isinstance(earlier, PacketRejected) and isinstance(later, PacketRejected):
         return PacketRejected(later.kind, earlier.count + later.count, later.why)

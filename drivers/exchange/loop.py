@@ -40,7 +40,7 @@ def exchange(
     intake = Intake(transport, session)
     listening = Listening(transport, session)
     punctuality = Punctuality(session, max_late)
-    taken = 0
+    handled = 0
     send, reply = transport.send, session.reply
     while session.state is not State.ENDED and not until():
         try:
@@ -63,8 +63,8 @@ def exchange(
                     punctuality.answered(arrived, now)
                     send(answer)
                 listening.heard(answer is not None)
-            taken += 1
-            if taken % COUNT_EVERY == 0:
+            handled += 1
+            if handled % COUNT_EVERY == 0:
                 _count_rejected(transport, session)
         except TransportClosed:
             if math.isfinite(session.deadline):

@@ -174,17 +174,17 @@ class ExchangeProcess:
             raise ExchangeError(f"the exchange process is gone: {error}") from error
         self._control.program_offered = identity
         try:
-            told = self._answer_to(identity)
-            if told == READ:
+            reply = self._answer_to(identity)
+            if reply == READ:
                 self._permit(identity, wanted)
-                told = self._answer_to(identity, lambda: self._permit(identity, wanted))
+                reply = self._answer_to(identity, lambda: self._permit(identity, wanted))
         except BaseException:
             # Nobody waits for this motion any more: it must not begin after all, nor go on.
             self._control.program_id = -identity
             self.stop()
             raise
-        if told is not None:
-            state, reason = told
+        if reply is not None:
+            state, reason = reply
             raise (WithdrawnError if reason == WITHDRAWN else RequestError)(state, reason)
         return identity
 
@@ -289,9 +289,9 @@ class ExchangeProcess:
     def _answer_to(self, identity: int, meanwhile: Callable[[], None] = _nothing) -> Any:
         """What is said of this program next; the answer to one given up may still come before."""
         while True:
-            answered, told = self._answer(ANSWER_TIMEOUT, meanwhile)
+            answered, reply = self._answer(ANSWER_TIMEOUT, meanwhile)
             if answered == identity:
-                return told
+                return reply
 
     def _answer(self, timeout: float, meanwhile: Callable[[], None] = _nothing) -> Any:
         """The next message of the exchange; `meanwhile` is called ten times a second."""

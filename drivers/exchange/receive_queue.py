@@ -110,13 +110,15 @@ class Intake:
         held_up = late or now - heard > HELD_UP * period or arrived < due
         # Where nobody in particular is listened to, packets of several may wait.
         if held_up and not listens_to_all(session):
-            return self._newest(self._told(packet, stamp, now, self._kept_ages()), period)
-        return (self._told(packet, stamp, now, transport.ages),)
+            return self._newest(self._arrival(packet, stamp, now, self._copied_ages()), period)
+        return (self._arrival(packet, stamp, now, transport.ages),)
 
     def _stamp(self) -> float | None:
         return None if self._stamped is None else self._stamped.arrived
 
-    def _told(self, packet: bytes, stamp: float | None, now: float, ages: Ages | None) -> Arrival:
+    def _arrival(
+        self, packet: bytes, stamp: float | None, now: float, ages: Ages | None
+    ) -> Arrival:
         if stamp is None:
             return Arrival(packet, now, ages, False)
         return Arrival(packet, stamp, ages, True)
@@ -147,25 +149,29 @@ class Intake:
             stamp, now = self._stamp(), transport.now
             if stamp is None:
                 self._guess(following, before, now, period)
-            pile.add(self._told(following, stamp, now, self._kept_ages()))
-        kept, left_out = pile.kept, pile.left_out
-        if left_out and self._too_old(kept, period):
-            kept, left_out = (), left_out + 1
+            pile.add(self._arrival(following, stamp, now, self._copied_ages()))
+        arrivals, left_out = pile.arrivals, pile.left_out
+        if left_out and self._too_old(arrivals, period):
+            arrivals, left_out = (), left_out + 1
         self._session.discarded("late", left_out)
-        return kept
+        return arrivals
 
-    def _too_old(self, kept: tuple[Arrival, ...], period: float) -> bool:
+    def _too_old(self, arrivals: tuple[Arrival, ...], period: float) -> bool:
         """Whether a pile, of one kind, is that of a queue that had no room for the newest.
 
         One packet alone is none: its controller may be waiting for the answer. Packets of several
         kinds tell the session something, however old they are.
         """
-        if len(kept) != 1 or not kept[0].stamped or self._session.state not in HAS_SET_POINTS:
+        if (
+            len(arrivals) != 1
+            or not arrivals[0].stamped
+            or self._session.state not in HAS_SET_POINTS
+        ):
             return False
-        age = self._transport.now - kept[0].arrived
+        age = self._transport.now - arrivals[0].arrived
         return age > max(TOO_OLD * period, _TOO_OLD_AT_LEAST)
 
-    def _kept_ages(self) -> Ages | None:
+    def _copied_ages(self) -> Ages | None:
         """Ages of the packet received last; the link may reuse its array for the next."""
         ages = self._transport.ages
         return None if ages is None else ages.copy()
@@ -192,7 +198,7 @@ class _Pile:
         self._sessions = 0
 
     @property
-    def kept(self) -> tuple[Arrival, ...]:
+    def arrivals(self) -> tuple[Arrival, ...]:
         """In order."""
         return tuple(arrival for _, arrival in self._newest)
 

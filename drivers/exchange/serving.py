@@ -157,7 +157,7 @@ class Serving:
         # In a later call than it was read, so that a stop in between is seen first.
         if self._offered is not None:
             self._take_program(self._offered)
-        if control.program_offered != self._inbox.taken:
+        if control.program_offered != self._inbox.identity:
             self._read_program(now)
         if session.requested and self._needs_archive:
             trouble = self._archive_trouble()
@@ -230,7 +230,7 @@ class Serving:
 
     def _take_program(self, source: MotionSource) -> None:
         """Request the program that was read, once it may begin, and say what became of it."""
-        control, identity = self._control, self._inbox.taken
+        control, identity = self._control, self._inbox.identity
         try:
             if self._withdrawn(identity):
                 raise RequestError(self._state, WITHDRAWN)
@@ -267,9 +267,9 @@ class Serving:
         """Say what became of the program taken last."""
         self._offered = None
         if refusal is None:
-            self._control.program_accepted = self._inbox.taken
+            self._control.program_accepted = self._inbox.identity
         else:
-            self._control.program_refused = self._inbox.taken
+            self._control.program_refused = self._inbox.identity
         self._inbox.answer(refusal)
 
     def _report(self, now: float) -> None:

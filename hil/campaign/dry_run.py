@@ -179,7 +179,7 @@ class DryRun:
             following = np.maximum(following, np.nanmax(behind, axis=0))
             missed += int(columns["gap"].sum())
             if archive.outcome is not None:
-                late += archive.outcome.late_answers or 0
+                late += archive.outcome.late_replies or 0
             cycles += archive.n_samples
         gravity = GravityCheck.of(cell, [folder.archives / name for name in names])
         return cls(
@@ -198,7 +198,7 @@ class DryRun:
         )
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """What speaks against it, in sentences."""
         return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
 

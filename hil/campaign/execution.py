@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 
-from .announced_limits import checks_in_force, narrower_currents
+from .controller_limits import checks_in_force, narrower_currents
 from .dry_run import OVERRIDE
 from .dry_run_stage import DryRunStage
 from .execution_archive import Archiving, provenance_of
@@ -34,7 +34,7 @@ from .gates import (
     require_rehearsed_thresholds,
     require_simulated,
 )
-from .intervals import Interval, require_joined, require_sound, wanted, with_ways
+from .intervals import Interval, require_joined, require_sound, wanted, with_moves
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink
@@ -42,7 +42,7 @@ from .operator import Operator, Unattended
 from .quality_entry import Entering
 from .repeating import any_warmth, play_until_good
 from .stop import Stop
-from .straight_moves import Ways, seen_in_dry_run
+from .straight_moves import StraightMoves, seen_in_dry_run
 from .warmup_stage import WarmUpStage
 
 if TYPE_CHECKING:
@@ -163,9 +163,9 @@ class _Run:
             require_simulated(self._folder, self._simulated)
             return
         rehearsal = require_rehearsed(self._folder, self._archiving.plan_hash)
-        if (doubt := rehearsal.doubt) is not None:
-            self._notes.append(doubt)
-            self._reporter.say(f"note: {doubt}")
+        if (warning := rehearsal.warning) is not None:
+            self._notes.append(warning)
+            self._reporter.say(f"note: {warning}")
         require_dry_run(
             self._folder,
             self._dry_run.found(),
@@ -231,12 +231,12 @@ class _Run:
         if below := narrower_currents(self._cell, link.connection):
             self._notes.append(f"the controller's own current limits counted ({'; '.join(below)})")
         # A dry run and a warm-up go the ways of the motions that they are made of.
-        joined = with_ways(self._cell, [*dry, *missing], where)
+        joined = with_moves(self._cell, [*dry, *missing], where)
         require_sound([one for one in joined if one.kind == "move"], checks)
         require_joined(joined)
         seen = None if self._choices.unrehearsed else seen_in_dry_run(self._folder)
-        ways = Ways(self._cell, checks, joined, seen)
-        times = _times(joined, len(dry), ways, self._cell.campaign.approach_speed)
+        moves = StraightMoves(self._cell, checks, joined, seen)
+        times = _times(joined, len(dry), moves, self._cell.campaign.approach_speed)
         if any(one.kind != "standstill" for one in missing):
             times += self._warm_up.expected()
         total = sum(times)
@@ -244,7 +244,7 @@ class _Run:
             runner = Runner(
                 self._cell,
                 link,
-                ways,
+                moves,
                 self._archiving,
                 self._stop,
                 self._watch,
@@ -300,7 +300,7 @@ class _Run:
 
         found = None if self._choices.unrehearsed else self._dry_run.found()
         notes = [*self._notes]
-        notes += [] if found is None else [f"dry run: {doubt}" for doubt in found.doubts]
+        notes += [] if found is None else [f"dry run: {warning}" for warning in found.warnings]
         if (cold := self._warm_up.note) is not None:
             notes.append(cold)
         notes += self._warm_up.pauses
@@ -324,14 +324,16 @@ class _Run:
         )
 
 
-def _times(joined: Sequence[Interval], dry: int, ways: Ways, approach_speed: float) -> list[float]:
+def _times(
+    joined: Sequence[Interval], dry: int, moves: StraightMoves, approach_speed: float
+) -> list[float]:
     """Seconds of each motion and way: slow are the first `dry`, and ways that nobody has seen."""
     times, first = [], dry > 0
     slow_way = min(1.0, OVERRIDE / approach_speed)
     for one in joined:
         share = OVERRIDE if dry else 1.0
         if one.kind == "move":
-            unseen = one.from_arm if first else ways.unseen(one)
+            unseen = one.from_arm if first else moves.unseen(one)
             share = slow_way if dry or unseen else 1.0
         elif dry:
             dry -= 1

@@ -371,9 +371,9 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: the manifest cannot be read.
         """
-        taken = {entry.name for entry in self.manifest()}
+        used = {entry.name for entry in self.manifest()}
         attempt = 1
-        while (name := ArchiveName(kind, index, attempt).filename) in taken or (
+        while (name := ArchiveName(kind, index, attempt).filename) in used or (
             self.archives / name
         ).exists():
             attempt += 1

@@ -14,7 +14,7 @@ from hil.archive import ArchiveHeader, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .announced_limits import narrower_thresholds
+from .controller_limits import narrower_thresholds
 from .dry_run import DryRun
 from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder

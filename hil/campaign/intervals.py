@@ -70,7 +70,7 @@ def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
     ]
 
 
-def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
+def with_moves(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
     """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
 
     An excitation, and sines of any kind, may begin and end elsewhere than at home; whatever else
@@ -78,17 +78,17 @@ def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[I
     """
     home, at = cell.home, where
     joined: list[Interval] = []
-    ways: dict[bytes, Interval] = {}
+    planned: dict[bytes, Interval] = {}
 
     def go(target: Array) -> None:
         nonlocal at
         from_arm = at is where or target is where
         if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
             key = at.tobytes() + target.tobytes()
-            if key not in ways:
-                ways[key] = way(cell, at, target)
+            if key not in planned:
+                planned[key] = way(cell, at, target)
             index = sum(interval.kind == "move" for interval in joined)
-            joined.append(replace(ways[key], index=index, from_arm=from_arm))
+            joined.append(replace(planned[key], index=index, from_arm=from_arm))
         at = target
 
     for interval in intervals:
@@ -139,7 +139,7 @@ def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None
     checks = checks or MotionChecks.of(cell)
     intervals = wanted(cell, plan)
     require_sound(intervals, checks)  # before ways are planned to where they lead
-    joined = with_ways(cell, intervals, cell.home)
+    joined = with_moves(cell, intervals, cell.home)
     require_sound([interval for interval in joined if interval.kind == "move"], checks)
     require_joined(joined)
 

@@ -127,7 +127,7 @@ class Heartbeat:
             return text
         if self._stalled:
             cause = (
-                f"whatever looks at the motion (show, wish) did not return for "
+                f"whatever looks at the motion (show, request) did not return for "
                 f"{self._stalled:.1f} s, and nobody could have passed on a stop"
             )
         elif (starved := max(self._starved, self._clock() - self._last)) > _STARVED:

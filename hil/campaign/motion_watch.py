@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OperatorRequest:
-    """What the person wants of the motion, until another wish.
+    """What the person wants of the motion, until another request.
 
     Attributes:
         override: fraction (0 to 1) of the planned speed.
@@ -105,8 +105,8 @@ class MotionWatch(Protocol):
         """Look; called about ten times a second."""
         ...
 
-    def wish(self) -> OperatorRequest:
-        """The latest wish."""
+    def request(self) -> OperatorRequest:
+        """The latest request."""
         ...
 
 
@@ -116,7 +116,7 @@ class Unwatched:
     def show(self, progress: MotionProgress) -> None:
         """Nobody looks."""
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """The motion as it was planned."""
         return OperatorRequest()
 

@@ -37,7 +37,7 @@ SATURATED: Final = 0.98
 """Share of the current limit that counts as reaching it."""
 SATURATED_CYCLES: Final = 3
 """So many in a row are no noise."""
-KEPT: Final = 9
+COMPARED: Final = 9
 """Earlier repetitions that a new one is compared with."""
 FEWEST: Final = 4
 """Earlier repetitions that tell their own scatter."""
@@ -59,16 +59,16 @@ class Groups:
     """Repetitions of two kinds: each agrees with its own and with none of the others.
 
     Attributes:
-        counted: file names of those that count.
+        reference: file names of those that count.
         later: of attempts that were rejected for being unlike them.
     """
 
-    counted: tuple[str, ...]
+    reference: tuple[str, ...]
     later: tuple[str, ...]
 
     def with_one(self, name: str) -> Groups:
         """One more later attempt."""
-        return Groups(self.counted, (*self.later, name))
+        return Groups(self.reference, (*self.later, name))
 
 
 @dataclass(frozen=True)
@@ -244,12 +244,12 @@ class RepetitionCheck:
 
     def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
         self._cell, self._trajectory = cell, trajectory
-        self._earlier: deque[Played] = deque(maxlen=KEPT)
-        self._differences: deque[Difference] = deque(maxlen=2 * KEPT)
+        self._earlier: deque[Played] = deque(maxlen=COMPARED)
+        self._differences: deque[Difference] = deque(maxlen=2 * COMPARED)
 
     def learn(self, archives: Sequence[Path]) -> None:
         """Take in repetitions that were found good before."""
-        for path in archives[-2 * KEPT :]:
+        for path in archives[-2 * COMPARED :]:
             self.accept(Played.of(open_archive(path, fields=FIELDS)))
 
     def accept(self, played: Played) -> None:
@@ -277,7 +277,7 @@ class RepetitionCheck:
             bound = _bounds(past, first, least, len(values))
             joint = int(np.argmax(values / bound))
             if values[joint] > bound[joint]:
-                return self._told(what, joint, float(values[joint]), float(bound[joint]))
+                return self._problem(what, joint, float(values[joint]), float(bound[joint]))
         return None
 
     @property
@@ -298,7 +298,7 @@ class RepetitionCheck:
         floor = 1e-3 * cell.drive_train.current_limit
         return Difference(apart / following_threshold(cell), off / np.maximum(size, floor))
 
-    def _told(self, what: str, joint: int, value: float, bound: float) -> Problem:
+    def _problem(self, what: str, joint: int, value: float, bound: float) -> Problem:
         name, earlier = self._cell.joint_names[joint], len(self._earlier)
         scale = "the following-error threshold" if what == "position" else "its rms current"
         return Problem(

@@ -99,9 +99,9 @@ def play_until_good(
         )
         if problem.against is not None:
             raise ArmChangedError(
-                str(interval), problem.sentence, problem.against.counted, problem.against.later
+                str(interval), problem.sentence, problem.against.reference, problem.against.later
             )
-        still = not problem.by_hand or watch.wish().override < 1.0
+        still = not problem.by_hand or watch.request().override < 1.0
         (reasons if still else by_hand).append(problem.sentence)
     raise RepetitionsRejectedError(
         str(interval), reasons if len(by_hand) < MOST_BY_HAND else by_hand

@@ -171,8 +171,8 @@ class WarmUp:
 
     def cooled(self) -> WarmUp:
         """A new warm-up after this one was lost in a pause."""
-        kept = (*self.earlier, *self.motions)
-        return replace(self, motions=(), outcome="going on", earlier=kept)
+        earlier = (*self.earlier, *self.motions)
+        return replace(self, motions=(), outcome="going on", earlier=earlier)
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:

@@ -173,7 +173,7 @@ def to_dict(found: Comparison) -> dict[str, Any]:
         "verdict": verdict(found),
         "told": [vars(one) for one in findings(found)],
         "caveat": caveat(found),
-        "doubts": list(found.warnings),
+        "warnings": list(found.warnings),
         "campaigns": [
             {
                 "name": name,

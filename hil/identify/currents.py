@@ -29,7 +29,7 @@ def with_torques(sources: Sources) -> Sources:
     """These sources with a torque in every recording.
 
     Where there are currents only, the gains are taken from the nominal masses of the URDF, and a
-    doubt says so. Only what is fitted is looked at.
+    warning says so. Only what is fitted is looked at.
 
     Raises:
         ArchiveError: the URDF has no masses that the currents could be compared with.
@@ -68,8 +68,8 @@ def with_torques(sources: Sources) -> Sources:
         training=tuple(source.changed(with_torque) for source in sources.training),
         held_out=tuple(source.changed(with_torque) for source in sources.held_out),
     )
-    for doubt in _warnings(sources.cell.joint_names, scale):
-        sources = sources.with_doubt(doubt)
+    for warning in _warnings(sources.cell.joint_names, scale):
+        sources = sources.with_warning(warning)
     return sources
 
 

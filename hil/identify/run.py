@@ -160,12 +160,12 @@ def identify_archives(
         InputError: the archives cannot be used, or not together, or not by the chosen estimator.
     """
     sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
-    for doubt in warnings:
-        sources = sources.with_doubt(doubt)
+    for warning in warnings:
+        sources = sources.with_warning(warning)
     prepared = prepare_sources(sources, options, reporter)
     estimation = estimate_with(prepared, options, reporter)
-    for doubt in estimation.warnings:
-        prepared = replace(prepared, sources=prepared.sources.with_doubt(doubt))
+    for warning in estimation.warnings:
+        prepared = replace(prepared, sources=prepared.sources.with_warning(warning))
     return _judged(name or paths[0].stem, (*paths, *predict), prepared, estimation, reporter)
 
 
@@ -189,8 +189,8 @@ def _judged(
             essential = essential_of(cell.model, result.phase, estimation.held_out)
         task.advance(1, "verdict")
         sources = prepared.sources
-        for doubt in (*consistency_warnings(consistency), *essential_warnings(essential)):
-            sources = sources.with_doubt(doubt)
+        for warning in (*consistency_warnings(consistency), *essential_warnings(essential)):
+            sources = sources.with_warning(warning)
         nominal = nominal_of(cell)
         evidence = gather(
             cell.model,

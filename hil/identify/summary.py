@@ -362,7 +362,7 @@ def summarise(
             good=verdict.good,
             line=verdict.line,
             reasons=[*verdict.reasons],
-            doubts=[*verdict.doubts, *sources.warnings],
+            warnings=[*verdict.warnings, *sources.warnings],
         ),
         essential=essential_result(essential),
         consistency=consistency_result(model, consistency),

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AliasChoices, Field, ValidationError, model_validator
 
 from hil.errors import InputError
 from hil.files import write_atomically
@@ -43,7 +43,7 @@ class RecordedResult(Frozen):
     """Packets that never arrived."""
     late: int
     """Answers that were late."""
-    not_taken: int
+    not_accepted: int = Field(validation_alias=AliasChoices("not_accepted", "not_taken"))
     """Answers that the controller did not take."""
     lost: int
     """Cycles that were exchanged and not archived."""
@@ -448,7 +448,7 @@ class VerdictResult(Frozen):
     line: str
     reasons: list[str]
     """What is wrong; empty if good."""
-    doubts: list[str]
+    warnings: list[str] = Field(validation_alias=AliasChoices("warnings", "doubts"))
     """What is not as it should be, but too small or too uncertain to say no."""
 
 

@@ -73,7 +73,7 @@ class Shown:
         title: of the run.
         joint_names: of the n joints.
         status: where the run stands; None before the first.
-        wish: the person's.
+        request: the person's.
         stopping: whether a stop was asked for.
         age: s since the status came.
         said: lines that the run said, oldest first.
@@ -85,7 +85,7 @@ class Shown:
     title: str
     joint_names: tuple[str, ...]
     status: RunStatus | None = None
-    wish: OperatorRequest = field(default_factory=OperatorRequest)
+    request: OperatorRequest = field(default_factory=OperatorRequest)
     stopping: bool = False
     age: float = 0.0
     said: tuple[str, ...] = ()
@@ -172,11 +172,11 @@ def _state(shown: Shown, width: int) -> Text:
     text = Text()
     if shown.stopping:
         text.append(" STOPPING ", style="bold red reverse").append("  ")
-    elif shown.wish.held:
+    elif shown.request.held:
         text.append(" HELD ", style="bold yellow reverse").append("  ")
     if shown.age > STALE and status is not None:
         text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
-    override = shown.wish.override if motion is None else motion.override
+    override = shown.request.override if motion is None else motion.override
     text.append(f"override {100.0 * override:.0f} %", style=_slower(override))
     if motion is not None and motion.rate is not None:
         text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")

@@ -201,5 +201,5 @@ def _numbers(values: Array) -> str:
 
 
 def _tuple(items: Iterable[str]) -> str:
-    listed = list(items)
-    return "(" + ", ".join(listed) + ("," if len(listed) == 1 else "") + ")"
+    texts = list(items)
+    return "(" + ", ".join(texts) + ("," if len(texts) == 1 else "") + ")"

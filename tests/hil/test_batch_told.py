@@ -80,7 +80,7 @@ def test_doubts_of_import_and_of_torque_constants_stand_with_every_estimate(
     assert f"note: {told}" in ran.output
     with (tmp_path / "out" / "parameters.csv").open(newline="") as file:
         doubts = {
-            (row["level"], Path(row["campaign"]).name): row["doubts"]
+            (row["level"], Path(row["campaign"]).name): row["warnings"]
             for row in csv.DictReader(file)
         }
     assert all(ASSUMED in text for text in doubts.values())

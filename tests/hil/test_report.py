@@ -80,7 +80,7 @@ def make_results(**changes: Any) -> Results:
             "good": True, "line": "The model predicts unseen motion to 1.5 % of the torque.",
             "reasons": ["Held-out error is 1.3 times the residual of the fit (allowed: 2).",
                         "52 of 58 parameters lie within two standard deviations of the truth."],
-            "doubts": ["f2_1 is not distinct from zero."],
+            "warnings": ["f2_1 is not distinct from zero."],
         },
     }
     plain = json.loads(json.dumps(fields | changes, default=lambda a: np.asarray(a).tolist()))
@@ -100,7 +100,7 @@ def real_recording() -> Results:
         parameters=[p.model_dump() | unknown for p in whole.parameters],
         uncertainty=whole.uncertainty.model_dump() | none | {"reported": "least_squares"},
         validation=[whole.validation[0].model_dump()],
-        verdict={"good": False, "line": "Off by 24 %.", "reasons": [], "doubts": []},
+        verdict={"good": False, "line": "Off by 24 %.", "reasons": [], "warnings": []},
     )
 
 
@@ -216,7 +216,7 @@ def test_the_verdict_comes_before_everything_else(html: str) -> None:
 
 @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
 def test_the_verdict_is_a_word_and_a_symbol_not_only_a_colour(good: bool, word: str) -> None:
-    verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "doubts": []}
+    verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
     text = render_report(make_results(verdict=verdict), make_series())
     card = text[text.index('<section class="verdict') :].split("</section>")[0]
     assert Page(card).text == f"{word} So it is. because"
