@@ -32,7 +32,7 @@
                 ├── MotionHeld     or has been brought to rest
                 ├── MotionPaused   or its arm has, in a pause by the clock
                 │   └── MotionUnknown     or what it is judged by is not of this cycle
-                └── CorrectionNotCarriedOn  or nothing tells whether a correction was kept
+                └── CorrectionNotCarriedOn  or nothing tells whether a correction was applied
 
 All of them survive pickling with message and attributes, though without their cause.
 """
@@ -384,6 +384,6 @@ class MotionUnknown(MotionHeld):
 
 
 class CorrectionNotCarriedOn(MotionNotCarriedOn):
-    """After a long gap nothing tells whether the controller kept the correction sent last."""
+    """After a long gap nothing tells whether the controller applied the correction sent last."""
 
     check = "correction sent last before a gap"

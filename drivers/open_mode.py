@@ -35,7 +35,7 @@ class OpenMode(ABC):
 
     Attributes:
         held: (n,) rad, the set-point sent last.
-        lost: answers that the packet read last shows not to have been taken.
+        lost: answers that the packet read last shows not to have been accepted.
         missed: packets before that one that were not answered; to be set for each.
     """
 

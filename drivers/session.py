@@ -78,7 +78,7 @@ from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
 FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
 STOP_TIMEOUT: Final = 10.0
-"""s that a motion may take from being told to stop to rest; drive-off is asked for after that."""
+"""s that a motion may take from being asked to stop to rest; drive-off is asked for after that."""
 MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
@@ -378,7 +378,7 @@ class Session:
             policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
-            # Whatever it was, the controller is told to stop, by the answer that is due now.
+            # Whatever it was, the controller is asked to stop, by the answer that is due now.
             refusal = as_refusal(error, machine.cycle)
             ring.commanded[row] = math.nan
             status = policy.refuse(machine, refusal, reading, words)

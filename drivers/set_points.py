@@ -66,7 +66,7 @@ class SentSetPoints:
             where: (n,) which joints; None for all.
 
         Returns:
-            How many answers more than in the cycle before were not taken. What a joint at
+            How many answers more than in the cycle before were not accepted. What a joint at
             standstill moves in a cycle hides one.
 
         Raises:

@@ -93,7 +93,7 @@ class Exported:
         return [*lines, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
-        """The same as plain values."""
+        """The same for JSON."""
         compared, spread = self.comparison, self.spread
         return {
             "path": str(self.path),

@@ -52,7 +52,7 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
         return None
     found = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
     if nearest >= violation.bound:
-        return f"{found}, too near the margin to be told from a contact; narrow [workspace] margin"
+        return f"{found}, closer to contact than can be resolved; narrow [workspace] margin"
     if nearest > 0.0:
         return f"{found}; [workspace] margin must be below that"
     return f"{found}: they overlap; correct their collision shapes in the URDF"

@@ -240,7 +240,7 @@ class Interpolator(MoveServices):
         return status
 
     def stop_motion(self) -> Status:
-        """Come to rest on the path, and stay, with targets kept, until told otherwise."""
+        """Come to rest on the path, and stay, with targets kept, until asked otherwise."""
         status = self._set()
         if status >= 0 and not self._held:
             self._held = True
@@ -327,7 +327,7 @@ class Interpolator(MoveServices):
         return self._step(self._refuse(status, reason), ())
 
     def _stand(self, events: tuple[Event, ...]) -> Step:
-        """Return the step of an arm that was told to stop and is at rest."""
+        """Return the step of an arm that was asked to stop and is at rest."""
         if not self._stop_reported:
             self._stop_reported = True
             target = self.get_current_target_id()

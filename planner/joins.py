@@ -119,7 +119,7 @@ def _in_units(
 
     Setting lists costs the solver's face a third of setting arrays.
     """
-    # Powers as plain floats have them: those of arrays may differ in the last digit.
+    # Powers as floats have them: those of arrays may differ in the last digit.
     square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
     way = bounds.jerk / SOLVER_JERK * cube[:, None]
     units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)

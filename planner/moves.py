@@ -58,7 +58,7 @@ def plan_moves(
     Args:
         start: Where the arm rests (n,) [rad].
         moves: At least one, targets inside the limits.
-        limits: Limits, kept exactly (but for rounding) at every instant.
+        limits: Limits, respected exactly (but for rounding) at every instant.
         overrides: Shares that apply to all moves.
 
     Raises:

@@ -29,7 +29,7 @@ class Extrema(NamedTuple):
 class PiecewiseCubic:
     """A motion of constant jerks: per joint its own knots and cubic pieces between them.
 
-    Before time 0 and after `duration` the joints are taken to rest where the motion begins and
+    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
     ends: sampled there, the position is held and velocity and acceleration are zero.
 
     Attributes:
@@ -102,7 +102,7 @@ class PiecewiseCubic:
 
     @cached_property
     def _rows(self) -> list[tuple[list[float], list[list[float]]]]:
-        """Knots and coefficients as plain floats, which a single look-up reads fastest."""
+        """Knots and coefficients as floats, which a single look-up reads fastest."""
         return [
             (knots.tolist(), coefficients.tolist())
             for knots, coefficients in zip(self.knots, self.coefficients, strict=True)
@@ -151,7 +151,7 @@ class PiecewiseCubic:
         return PiecewiseCubic(tuple(knots), tuple(coefficients))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists; `from_dict` restores every bit, through JSON too."""
+        """Return lists; `from_dict` restores every bit, through JSON too."""
         return {
             "type": "piecewise_cubic",
             "knots": [knots.tolist() for knots in self.knots],

@@ -23,7 +23,7 @@ def plan(
 
     Args:
         via_points: Positions (n_points, n_joints) [rad], at least two, inside the limits.
-        limits: Limits, kept exactly (but for rounding) at every instant.
+        limits: Limits, respected exactly (but for rounding) at every instant.
         speed: Share of each joint's velocity limit to use, in (0, 1], a number or (n,).
         fly: Share of each deceleration that the next acceleration overlaps, from 0 (stop at
             every via point) to 1 (the corner begins where the deceleration would).

@@ -84,7 +84,7 @@ def admits(bounds: RateBounds, rate: float, slope: float) -> bool:
 def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
     """Return the fastest change from a state to a target rate, reached without slope.
 
-    A slope beyond its bound is not built up further; it is taken to have come from wider bounds.
+    A slope beyond its bound is not built up further; it is assumed to have come from wider bounds.
     """
     way, change = target - rate, bounds.change
     up = 1.0 if target >= stopping_rate(rate, slope, change) else -1.0

@@ -103,7 +103,7 @@ def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
 
     Durations (...) [s] and limits (..., n) are of one motion or of many.
     """
-    # A knot is told no finer than the clock allows: late in a long motion that shows.
+    # A knot is reported no finer than the clock allows: late in a long motion that shows.
     tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
     return np.stack(
         (

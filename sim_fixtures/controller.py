@@ -110,7 +110,7 @@ class Targets:
         self._break_off()
 
     def _break_off(self) -> None:
-        """The drive was lost: an own motion under way is not taken up again."""
+        """The drive was lost: an own motion under way is not resumed."""
         self._broken_off = self._broken_off or self._moving
         self._moving = False
 
@@ -229,7 +229,7 @@ class SimulatedController:
         truth: planted rotor inertias, friction and inertias of links.
         settings: as given.
         period: cycle [s].
-        rejected_replies: replies that were not taken: wrong number, length or content.
+        rejected_replies: replies that were not accepted: wrong number, length or content.
     """
 
     def __init__(

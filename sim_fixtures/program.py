@@ -99,7 +99,7 @@ class LoopProgram:
         phase: the present one.
         powered: whether the drive is on (status DRIVE_ON).
         braked: whether the brakes are closed.
-        listening: whether targets of open axes are taken from the PC.
+        listening: whether targets of open axes are read from the PC.
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
         intervals: how often all axes have been open.

@@ -1,4 +1,4 @@
-"""What may come in floods is summed up before it is told: a poor link must not drown the rest."""
+"""Frequent events are summed up before they are reported: a poor link must not drown the rest."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def exchange(
     the init packet and after a loss, anybody at the controller's address may begin, see
     `Listening`.
 
-    A closed link is silence for good: the session is told so, and ends what was going on.
+    A closed link is silence for good: the session is informed, and ends what was going on.
     """
     intake = Intake(transport, session)
     listening = Listening(transport, session)

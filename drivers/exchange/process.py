@@ -87,7 +87,7 @@ class ExchangeProcess:
         realtime: what the system granted it.
         notes: options of the link that the system refused, in words.
         ring_fd: memory of the cycle records, for a `RingReader`.
-        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not kept.
+        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not stored.
         event_fd: memory of the events, for an `EventReader`.
         control_fd: memory of the control block, for a `ControlBlock`.
     """

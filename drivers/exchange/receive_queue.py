@@ -1,4 +1,4 @@
-"""Packets as they are taken from a link, and what is left of a pile of them."""
+"""Packets as they are read from a link, and what is left of a pile of them."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ class _Pile:
             stands in those makes no kind.
 
     Attributes:
-        left_out: packets that were not kept; repetitions of one that was do not count.
+        left_out: packets that were not stored; repetitions of one that was do not count.
     """
 
     def __init__(self, n_axes: int) -> None:

@@ -44,7 +44,7 @@ FINISH_LINGER: Final = 1.0
 ARM_MOVED: Final = 5e-4
 """rad; more than an encoder's noise, less than any motion makes in `ARM_RESTS`."""
 ARM_RESTS: Final = 1.0
-"""s without motion after which an arm is taken to be at rest."""
+"""s without motion after which an arm is assumed to be at rest."""
 _POSITION: Final = MEASURED.index("position")
 _SLOW_EVERY: Final = 32
 """Packets between two looks at what need not be looked at in each cycle."""
@@ -57,7 +57,7 @@ _MAY_BE_OPEN: Final = frozenset(
 
 
 class Terminated(Protocol):
-    """True once the process was told to end: stop on the path, leave open mode, end."""
+    """True once the process was asked to end: stop on the path, leave open mode, end."""
 
     def __bool__(self) -> bool: ...
 
@@ -171,7 +171,7 @@ class Serving:
         # Read after `program_id`, which the supervisor writes after a beat: this is never older.
         silent = self._supervisor.quiet()
         if self._terminated:
-            self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
+            self._leave("the exchange process was asked to terminate", ORPHAN_LINGER)
         elif silent > (STALE if self._session.requested else PATIENCE):
             self._orphan(NO_SUPERVISOR)
         elif self._control.finish:

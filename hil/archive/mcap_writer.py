@@ -164,7 +164,7 @@ class McapWriter:
         sequence: NDArray[np.int64],
         messages: Sequence[Rows],
     ) -> None:
-        """Add messages of several channels taken at the same instants, instant by instant.
+        """Add messages of several channels of the same instants, instant by instant.
 
         Args:
             channels: their ids.

@@ -166,7 +166,7 @@ class Campaign:
         are. A rehearsal that passed is not repeated, one that was stopped goes on.
 
         Args:
-            reporter: told of the progress.
+            reporter: receives the progress.
             seed: of what is planted in the twin, its noise and its link's faults.
             stop: ends it early.
             again: rehearse once more even if it passed.
@@ -175,7 +175,7 @@ class Campaign:
 
         Raises:
             MotionRefusedError: a motion breaks a limit of the cell.
-            OperatorStopError: it was stopped; what was recorded is kept.
+            OperatorStopError: it was stopped; what was recorded remains.
             CampaignFolderError: the folder was changed, or a run is at work on it.
         """
         from .rehearsal_run import SEED, rehearse  # which runs campaigns
@@ -248,7 +248,7 @@ class Campaign:
             link: to the controller; the cell's own if left out. A cell with the transport
                 "simulated" has a simulated controller in virtual time.
             stop: set from outside to bring the arm to rest on its path.
-            reporter: told of the progress.
+            reporter: receives the progress.
             operator: sees each motion, may slow or hold it, and is asked to accept the dry run;
                 nobody if left out.
             provenance: goes into the metadata of every archive, e.g. whether it is simulated.

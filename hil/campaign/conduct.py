@@ -22,7 +22,7 @@ T = TypeVar("T")
 def conduct_of(folder: CampaignFolder) -> ConductResult:
     """What rehearsal, dry run, warm-up and archives of a folder say; nothing is changed.
 
-    A file that cannot be read is told in its step's words.
+    A file that cannot be read is reported in its step's words.
 
     Raises:
         CampaignFolderError: the manifest cannot be read.

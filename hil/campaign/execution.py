@@ -188,7 +188,7 @@ class _Run:
             checks = MotionChecks.of(self._cell)
             if checks.not_checked is not None:
                 self._reporter.say(checks.not_checked)
-            # What is wrong with a motion itself is told before anything is connected.
+            # What is wrong with a motion itself is reported before anything is connected.
             warming = warming if missing else []
             require_sound([*dry, *missing, *warming], checks)
             with self._opened(link) as opened:

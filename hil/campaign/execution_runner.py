@@ -1,4 +1,4 @@
-"""Runs motions one after the other, with the ways between them."""
+"""Runs motions one after the other, with the moves between them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Runner:
         archiving: describes the archives.
         stop: brings the arm to rest on its path.
         watch: shows each motion to the operator.
-        task: told of the seconds of motion done.
+        task: receives the seconds of motion done.
         where: (n,) [rad] where the arm was first, and goes back to.
         archives: file names so far, whatever became of them.
     """

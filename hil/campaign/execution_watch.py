@@ -1,4 +1,4 @@
-"""Between a motion and the operator: what is shown of it, and what is wished of it."""
+"""Between a motion and the operator: what is shown of it, and what is requested of it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class RunWatch:
     """A `MotionWatch` that tells the operator where the whole run stands.
 
     What an operator's screen gets wrong must not end a motion: it is reported, and the motion goes
-    on at the speed wished for last. Each wish is asked for anew, whatever the last one met with. A
-    hold is another matter: one that nobody can release any more becomes a stop.
+    on at the speed requested last. Each request is asked for anew, whatever the last one met with.
+    A hold is another matter: one that nobody can release any more becomes a stop.
 
     Attributes:
         operator: who looks.
@@ -33,7 +33,7 @@ class RunWatch:
         began: when the present motion began, or the last one [s since 1970]; later than it was
             asked for where it was held.
         blind: what went wrong with showing, None for nothing; nothing is shown from then on.
-        deaf: what went wrong first with asking for a wish, None for nothing.
+        deaf: what went wrong first with asking for a request, None for nothing.
     """
 
     operator: Operator
@@ -110,11 +110,11 @@ class RunWatch:
                 f"the operator's screen failed ({_words(self.blind)}); nothing was shown"
             )
         if self.deaf is not None:
-            became = "what was wished for last counted"
+            became = "the last request stayed in force"
             if self._held_deaf:
                 became = "the arm was held, which nobody could end any more: the run was stopped"
             why = _words(self.deaf)
-            sentences.append(f"the operator could not be asked for wishes ({why}); {became}")
+            sentences.append(f"the operator could not be asked for requests ({why}); {became}")
         return tuple(sentences)
 
     def _tell(self, progress: MotionProgress | None) -> None:

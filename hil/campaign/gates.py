@@ -106,7 +106,7 @@ def require_link_of(cell: Cell, link: MotionLink, root: Path) -> None:
     """Refuse a link that was opened for another arm than the campaign's.
 
     The address may differ, and what is planted in a simulated arm; a link that does not say what
-    it was opened for is taken as it is.
+    it was opened for is used as it is.
 
     Args:
         cell: of the campaign.

@@ -1,4 +1,4 @@
-"""The motions of a campaign in order, with the ways between them, checked before they are sent."""
+"""The motions of a campaign in order, with the moves between them, checked before they are sent."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Interval:
 
 
 def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
-    """All motions of a plan, without the ways between them."""
+    """All motions of a plan, without the moves between them."""
     settings = cell.campaign
     excitation = plan.excitation.trajectory
     return [

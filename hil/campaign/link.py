@@ -287,7 +287,7 @@ class Link:
         )
 
     def drain_packets(self) -> NDArray[np.void] | None:
-        """Raw packets since the last call; None if they are not kept."""
+        """Raw packets since the last call; None if they are not stored."""
         if self.packets is None or not isinstance(self.transport, TappedTransport):
             return None
         self.transport.settle()
@@ -368,7 +368,7 @@ class _Taking:
 
 
 class _Watching:
-    """Shows a motion to its watch and does what that wishes."""
+    """Shows a motion to its watch and does what that requests."""
 
     def __init__(
         self, link: Link, source: MotionSource, watch: MotionWatch, steering: Steering
@@ -378,7 +378,7 @@ class _Watching:
         self.display = ProgressDisplay(drives, link.guard, steering, duration, self._counts())
 
     def look(self, stop: Stop) -> None:
-        """Show it if that is due, and pass wishes on; returns when no hold stands any more.
+        """Show it if that is due, and pass requests on; returns when no hold stands any more.
 
         A simulated controller waits for its answer, so that a hold costs no simulated time.
         """

@@ -30,7 +30,7 @@ POLL: Final = 0.02
 SLOW_DISK: Final = 1.0
 """s at once that a disk takes for a flush when something is wrong with it."""
 REST_TIMEOUT: Final = 30.0
-"""s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
+"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
 
 
 class LiveMotion:
@@ -136,7 +136,7 @@ class LiveMotion:
             raise ControllerFault(f"{why}; {spec.path} is {closed.outcome}") from error
 
     def _look(self, display: ProgressDisplay) -> None:
-        """Take in what is new, pass wishes on, and show it if that is due."""
+        """Take in what is new, pass requests on, and show it if that is due."""
         self._link.heart.turn()
         display.note(self._view.look())
         if self._stop.requested and not self._stop_passed:
@@ -184,7 +184,7 @@ class LiveMotion:
     def _explained(self, reason: str, closed: Closed) -> str:
         """Why a motion ended, with the cause where a process of ours did not get on."""
         if reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
-            waited = f"its disk kept it waiting for {closed.disk_waited:.1f} s"
+            waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
             return f"{reason} ({waited}: look after that disk)"
         return self._link.heart.explained(reason)
 
@@ -205,11 +205,11 @@ class LiveMotion:
             rests = "the arm was brought to rest"
             if not self._come_to_rest():
                 state = self._view.state.name
-                rests = f"the arm was told to stop, but not seen to rest ({state})"
+                rests = f"the arm was asked to stop, but was not seen at rest ({state})"
             raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
 
     def _come_to_rest(self) -> bool:
-        """Whether the motion has ended; the exchange stops it by itself, but is told to again."""
+        """Whether the motion has ended; the exchange stops it by itself, but is asked to again."""
         self._exchange.stop()
         deadline = time.monotonic() + REST_TIMEOUT
         while not self._view.motion_ended and time.monotonic() < deadline:

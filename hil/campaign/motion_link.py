@@ -150,7 +150,7 @@ class Connection:
 
 
 def not_ready(state: State, waited: float) -> ControllerFault:
-    """What is told where a controller did not come so far that a motion may be asked for.
+    """What is reported where a controller did not come so far that a motion may be asked for.
 
     Args:
         state: of the session.
@@ -217,9 +217,9 @@ class MotionLink(Protocol):
             spec: its archive.
             stop: asks for a stop on the path.
             override: the largest fraction of the planned speed. The motion runs at the smaller of
-                this and the wish's, from its very first cycle.
+                this and the request's, from its very first cycle.
             watch: sees the motion, and may slow, hold and release it. Nothing begins while its
-                wish is a hold.
+                request is a hold.
 
         Raises:
             ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it

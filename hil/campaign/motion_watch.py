@@ -1,4 +1,4 @@
-"""A motion while it goes on: what is seen of it, and what the person at the machine wishes."""
+"""A motion while it goes on: what is seen of it, and what the person at the machine requests."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class MotionWatch(Protocol):
 
 
 class Unwatched:
-    """Nobody looks, and nobody wishes anything else than the motion as it was planned."""
+    """Nobody looks, and nobody requests anything else than the motion as it was planned."""
 
     def show(self, progress: MotionProgress) -> None:
         """Nobody looks."""

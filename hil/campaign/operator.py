@@ -1,4 +1,4 @@
-"""The person at a running campaign: what is shown to them, and what they wish."""
+"""The person at a running campaign: what is shown to them, and what they request."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Operator(Protocol):
         ...
 
     def request(self) -> OperatorRequest:
-        """Return what the person wishes now: override and hold."""
+        """Return what the person requests now: override and hold."""
         ...
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:

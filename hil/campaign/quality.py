@@ -171,7 +171,7 @@ def torn_or_slowed(
 
 
 def unrest(played: Played, cell: Cell) -> Problem | None:
-    """What is wrong with a recording of the arm at rest: the noise of its sensors is taken from it.
+    """What is wrong with a recording of the arm at rest: the noise of its sensors is read from it.
 
     Args:
         played: it, as archived.
@@ -187,19 +187,19 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
         return None
     return Problem(
         f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
-        f"still; below {allowed[joint]:.2g} rad/s it counts as standing"
+        f"still; below {allowed[joint]:.2g} rad/s it counts as at rest"
     )
 
 
 def _stuck(played: Played, cell: Cell) -> Problem | None:
-    """A joint that stands while it is told to move: no estimate is made of such a recording."""
+    """A joint that stands while it is commanded to move: nothing is estimated from such data."""
     for joint, name in enumerate(cell.joint_names):
         found = stuck(played.position[:, joint], played.commanded[:, joint])
         if found is not None:
             start, travel = found
             return Problem(
                 f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
-                f"after the begin on while it is told to move by {travel:.3g}"
+                f"after the begin on while it is commanded to move by {travel:.3g}"
             )
     return None
 

@@ -244,7 +244,7 @@ def rehearse(
 
     Raises:
         MotionRefusedError: a motion breaks a limit of the cell; nothing was rehearsed.
-        OperatorStopError: it was stopped; what was recorded is kept.
+        OperatorStopError: it was stopped; what was recorded remains.
         CampaignFolderError: the folder was changed after the first archive, or meanwhile, or is
             in use.
         OutputError: the result cannot be written.
@@ -338,7 +338,7 @@ def _campaign(root: Path, like: Campaign) -> Campaign:
 
 
 def _seconds(rehearsal: Campaign) -> float:
-    """Length of all motions of a plan, without the ways between them."""
+    """Length of all motions of a plan, without the moves between them."""
     return sum(one.trajectory.duration for one in wanted(rehearsal.cell, rehearsal.plan))
 
 
@@ -357,7 +357,7 @@ def _run(
     except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
             raise OperatorStopError(
-                "the rehearsal was stopped; what was recorded is kept, rehearse again to go on"
+                "the rehearsal was stopped; the recordings remain, rehearse again to go on"
             ) from error
         failures.append(_reason(error))
     return Ran(name, tuple(failures))

@@ -62,9 +62,9 @@ def play_until_good(
 ) -> str:
     """Run a motion, judge it and enter it; again where it fails its check.
 
-    An attempt that a person held or slowed counts as failed only if the wish is still for less than
-    full speed: then the next one would go the same way. Others of them are counted apart, for a
-    script that slows the arm by rule would have it move for ever.
+    An attempt that a person held or slowed counts as failed only if the request is still for less
+    than full speed: then the next one would go the same way. Others of them are counted apart, for
+    a script that slows the arm by rule would have it move for ever.
 
     Args:
         runner: plays it.

@@ -262,7 +262,7 @@ def _left_behind(folder: CampaignFolder, name: str) -> str:
         or folder.whole(parsed.kind, parsed.index) is not None
     ):
         return f"{left}; nothing is missing without it"
-    return f"{left}: taken over if it is whole, its motion run again if not"
+    return f"{left}: used if it is whole, its motion run again if not"
 
 
 def _of_no_use(entry: Entry) -> str:

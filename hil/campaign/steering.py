@@ -1,4 +1,4 @@
-"""Passing on what the person wishes of a motion."""
+"""Passing on what the person requests of a motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .stop import Stop
 NOT_BEGUN: Final = "it had not begun"
 """Why a motion ends that was stopped before it was asked for."""
 ASKED_EVERY: Final = 0.02
-"""s between two questions for a wish where nothing else is to be done."""
+"""s between two questions for a request where nothing else is to be done."""
 
 
 class Steered(Protocol):
@@ -38,11 +38,11 @@ class Steered(Protocol):
 
 
 class Steering:
-    """Takes the wishes of one motion's watch to the motion.
+    """Takes the requests of one motion's watch to the motion.
 
     Args:
-        watch: has the wishes.
-        most: largest fraction of the planned speed, whatever is wished.
+        watch: has the requests.
+        most: largest fraction of the planned speed, whatever is requested.
 
     Attributes:
         fraction: asked of the motion last.
@@ -61,7 +61,7 @@ class Steering:
     def begin(
         self, source: MotionSource, stop: Stop, meanwhile: Callable[[], object] = lambda: None
     ) -> bool:
-        """Have a motion begin at the speed wished for; waits while a hold is wished for.
+        """Have a motion begin at the speed requested; waits while a hold is requested.
 
         Args:
             source: the motion.
@@ -98,7 +98,7 @@ class Steering:
         return not (stop.requested or request.held or request.override < self.fraction)
 
     def follow(self, motion: Steered) -> None:
-        """Pass on what is wished now. A motion held before it began begins at rest."""
+        """Pass on what is requested now. A motion held before it began begins at rest."""
         request = self._watch.request()
         fraction = min(self._most, request.override)
         if fraction != self.fraction:

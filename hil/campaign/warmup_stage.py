@@ -128,7 +128,7 @@ class WarmUpStage:
         found = self._found()
         if not self.threshold or found is None or not found.motions or not found.cold(began):
             return None
-        return Problem(f"{_rested(found, began)} when it began and was taken to be cold", True)
+        return Problem(f"{_rested(found, began)} when it began and was assumed to be cold", True)
 
     def moved(self) -> None:
         """A motion has ended that keeps the joints warm."""
@@ -169,7 +169,7 @@ class WarmUpStage:
             state.save(self._folder.warmup)
         if state.motions and state.cold(time.time()):
             rested = _rested(state, time.time())
-            self._reporter.say(f"{rested} and is taken to be cold: warming up anew")
+            self._reporter.say(f"{rested} and is assumed to be cold: warming up anew")
             self.pauses.append(f"{rested} during the campaign, and was warmed up anew")
             state = state.cooled()
         return state

@@ -278,7 +278,7 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
     lines.append(
         f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
-        f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
+        f"limits, motor currents, floor, walls and the arm itself are respected; to {who}"
     )
     below = narrower_thresholds(cell, link.connection)
     lines += [f"the smaller following-error threshold counts, {note}" for note in below]

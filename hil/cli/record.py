@@ -154,7 +154,7 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     lost += f", {done.events_lost} events LOST" if done.events_lost else ""
     say(
         f"{path}: {seconds:.1f} s in {done.records} cycles, {done.missed} packets missed, "
-        f"{done.late} answers late, {done.untaken} not taken{lost}; "
+        f"{done.late} answers late, {done.untaken} not accepted{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 

@@ -266,7 +266,7 @@ def _what(change: Change) -> str:
             f"its mass not significantly ({change.mass:+.2g} ± {change.mass_std:.1g} kg),"
             " but its centre or inertia"
         )
-    verb = "put on" if change.mass > 0 else "taken off"
+    verb = "put on" if change.mass > 0 else "removed"
     text = f"{abs(change.mass):.2f} ± {change.mass_std:.2g} kg {verb}"
     if np.isfinite(change.moment).all():
         centre = (round(float(c)) for c in change.moment / change.mass / _MILLIMETRE)
@@ -305,7 +305,7 @@ def _order_findings(arm: ArmTrend) -> list[Finding]:
     if arm.dated or len(arm.campaigns) < 2:
         return []
     words = (
-        "No campaign has a time of recording: they are taken in the order of their folders'"
+        "No campaign has a time of recording: they are used in the order of their folders'"
         f" names, from {arm.names[0]} to {arm.names[len(arm.campaigns) - 1]}."
         " If that is not the order of time, before and after mean nothing here."
     )

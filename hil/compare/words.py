@@ -171,7 +171,7 @@ def to_dict(found: Comparison) -> dict[str, Any]:
         "friction_slight": found.friction_slight,
         "load_changed": found.load_changed,
         "verdict": verdict(found),
-        "told": [vars(one) for one in findings(found)],
+        "findings": [vars(one) for one in findings(found)],
         "caveat": caveat(found),
         "warnings": list(found.warnings),
         "campaigns": [

@@ -37,7 +37,7 @@ WEAK: Final = 1e4
 # Farther away [m] nothing is looked for, and nearer by such steps [m].
 _WIDEST: Final = 0.5
 _STEP: Final = 0.005
-# Share of the largest entry of a direction that an entry has at least which is told, and how many.
+# Share of the largest entry of a direction that an entry has at least to be reported, and how many.
 _CONCERNED: Final = 0.3
 _MOST_NAMES: Final = 6
 

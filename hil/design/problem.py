@@ -48,7 +48,7 @@ class Knowledge:
         joint_weights: 1 / variance of each joint's torque residual (n,).
         gram: information (p, p) of all that was moved, held out or not, weighted by these, as if
             sampled every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are.
-        samples: time samples in it, counted alike.
+        samples: time samples in it, of equal weight.
         repetitions: how often the new motion is going to be run.
         archives: name and SHA-256 of each file whose motion is in it.
     """
@@ -127,7 +127,7 @@ def _require_beginning(
     if too_much:
         worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
         remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
-        _refuse_beginning(cell, where, f"standing there, {violation_text(worst, frame)}", remedy)
+        _refuse_beginning(cell, where, f"at rest there, {violation_text(worst, frame)}", remedy)
 
 
 def _refuse_beginning(cell: Cell, where: str, reason: str, remedy: str) -> NoReturn:

@@ -1,4 +1,4 @@
-"""An identification as plain numbers: `results.json`."""
+"""An identification as numbers: `results.json`."""
 
 from __future__ import annotations
 
@@ -453,7 +453,7 @@ def _n_via(via_points: Array | None) -> int | None:
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
-    """Time samples of the motion itself: those of a plan, from where it was told to move.
+    """Time samples of the motion itself: those of a plan, from where it was asked to move.
 
     Where no set-points were recorded, from the first to the last in which some joint moves.
     """

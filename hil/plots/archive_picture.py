@@ -188,7 +188,7 @@ def _headline(figure: Figure, view: ArchiveView, height: float) -> None:
 
 
 def _missed(view: ArchiveView) -> str:
-    """Also where there is nothing to tell, for a person looks for it; "" where nobody counted."""
+    """Also where none were missed, for a person looks for it; "" where they were not counted."""
     if not view.states:
         return ""
     if not len(view.gaps):

@@ -158,7 +158,7 @@ class JudgementResult(Frozen):
 
 
 class EliminationStepResult(Frozen):
-    """The model after one more parameter was taken out."""
+    """The model after one more parameter was removed."""
 
     removed: str | None
     """None for the model it all begins with."""
@@ -492,7 +492,7 @@ class UncertaintyResult(Frozen):
         "scatter_of_mean",
         "posterior",
     ]
-    """The route that `ParameterResult.std` was taken from."""
+    """The route that `ParameterResult.std` was read from."""
     method: str
     """How estimate and reported standard deviation were made, in words."""
     interval_factor: float

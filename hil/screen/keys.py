@@ -68,7 +68,7 @@ def after(request: OperatorRequest, key: str, override: float) -> OperatorReques
     Args:
         request: before it.
         key: one character.
-        override: of the motion that is going on; it may be below what is wished for.
+        override: of the motion that is going on; it may be below what is requested.
     """
     action = _ACTIONS.get(key)
     if action in ("hold", "resume"):

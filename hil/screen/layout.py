@@ -35,7 +35,7 @@ def status_line(status: RunStatus, left: str = "") -> str:
             parts.append(f"override {100.0 * motion.override:.0f} %")
         parts += [f"{motion.missed} missed", f"{motion.late} late"]
         if motion.untaken:
-            parts.append(f"{motion.untaken} not taken")
+            parts.append(f"{motion.untaken} not accepted")
         if motion.latency is not None:
             parts.append(f"latency {marks.duration(motion.latency.p99)} (99 %)")
         for what, share in (
@@ -194,7 +194,7 @@ def _health(shown: Shown, width: int) -> Text:
         return text.append("-", style="dim")
     text.append(f"{motion.cycles}")
     for count, what in (
-        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not taken")
+        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not accepted")
     ):  # fmt: skip
         if count or width >= WIDE:
             text.append(f"  {count} {what}", style="bold yellow" if count else "green")

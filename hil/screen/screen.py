@@ -38,7 +38,7 @@ from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
 _KNOWN_AFTER = 2.0
-"""s of motion and of waiting after which the pace of virtual time is told."""
+"""s of motion and of waiting after which the pace of virtual time is reported."""
 
 _BETWEEN = 0.6
 """s from motion to motion, as if seen once before: drives go off and on."""
@@ -321,7 +321,7 @@ class Screen:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
 
     def request(self) -> OperatorRequest:
-        """What the person wishes.
+        """What the person requests.
 
         Raises:
             ScreenError: keys were read, and are not any more.

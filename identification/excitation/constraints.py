@@ -126,7 +126,7 @@ class MotionCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether every constraint is kept."""
+        """Whether every constraint is satisfied."""
         return not self.violations
 
 
@@ -138,7 +138,7 @@ class Constraints:
     compare, and a motion that is mended in one respect is not found broken in another.
 
     Attributes:
-        limits: joint limits, kept at every instant.
+        limits: joint limits, respected at every instant.
         min_duration, max_duration: of the motion [s].
         checker: floor, walls, boxes and the arm itself; None to look at none of them.
         currents: nominal torques and currents with their uncertainty; None to look at neither.

@@ -80,7 +80,7 @@ class NoFeasibleMotionError(IdentificationError):
         nearest: of each kind the violation that came closest to being none.
         closest: all violations of the motion that came closest to being feasible, by their sum.
         tried: how many motions there were.
-        unexciting: how many kept every constraint, but left a parameter without excitation.
+        unexciting: how many satisfied every constraint, but left a parameter without excitation.
         stopped: whether the search was stopped before its end.
     """
 

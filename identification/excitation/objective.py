@@ -48,7 +48,7 @@ class Objective:
 
     Attributes:
         model: the robot, with p parameters.
-        parameters: indices of the essential ones (e,): the others are taken to be zero, so that
+        parameters: indices of the essential ones (e,): the others are assumed to be zero, so that
             their columns are left out. None for all.
         joint_weights: 1 / variance of each joint's torque (n,). None leaves joints unweighted.
         earlier: Gram matrix (p, p) of earlier archives, all parameters, weighted alike, and as

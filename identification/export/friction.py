@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
-    """Return the friction law and its coefficients (k,) as plain text, a line per joint.
+    """Return the friction law and its coefficients (k,) as text, a line per joint.
 
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.

@@ -45,7 +45,7 @@ def parameters_dict(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return everything about an estimate, of plain values that `json` can write.
+    """Return everything about an estimate, of values that `json` can write.
 
     Args:
         model: the robot.

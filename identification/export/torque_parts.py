@@ -1,4 +1,4 @@
-"""Predicted torque taken apart: inertia, Coriolis and centrifugal, gravity, friction."""
+"""Predicted torque split: inertia, Coriolis and centrifugal, gravity, friction."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 - A moving link gets mass, centre of mass and the tensor about it, in the axes of the inertial
   frame it had (its ``rpy`` stays).
 - What is fixed to a moving link cannot be distinguished from it. Its inertia is contained in the
-  moving link's, so its own ``<inertial>`` is taken out, with a comment in its place.
+  moving link's, so its own ``<inertial>`` is removed, with a comment in its place.
 - A locked joint, and what it carries, stays as it was; the moving link gets what is left of the
   identified inertia. Where that is no possible body, the locked links are treated as fixed ones.
 - The base and what is fixed to it keep theirs: no torque depends on it.

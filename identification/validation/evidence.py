@@ -300,7 +300,7 @@ def gather(
         result: from the training recordings.
         training: as many recordings as the result has.
         same_motion: whether these are repetitions of one motion; only then can what repeats be
-            told from noise.
+            distinguished from noise.
         held_out: motions that were not used for fitting.
         nominal: parameters (p,) of the nominal model.
         surroundings: what is known of the cell beside its model.

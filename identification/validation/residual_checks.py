@@ -1,6 +1,6 @@
 """What is left over, looked at from all sides: is it noise, and if not, what does it follow?
 
-The samples are read once more, one recording at a time; of each only sums are kept. A check
+The samples are read once more, one recording at a time; of each only sums are stored. A check
 gives its size as a share of the torque and whether it stands out of noise. Both matter: of a
 long recording the smallest error is significant, and of a short one a large one may be chance.
 """
@@ -54,7 +54,7 @@ class Ripple:
 
     @property
     def rms(self) -> Array:
-        """Root mean square of what all harmonics explain (n,) [N·m or N], noise taken off."""
+        """Root mean square of what all harmonics explain (n,) [N·m or N], noise subtracted."""
         squares = 0.5 * (self.parts.mean**2 - self.parts.std**2).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum(np.nansum(np.nan_to_num(squares), axis=-1), 0.0)))
 

@@ -283,7 +283,7 @@ def test_half_a_kilogram_taken_off_is_found_between_two_campaigns() -> None:
     change = arm.payload.changes[1]
     assert change is not None
     assert abs(change.mass + 0.5) < 4.0 * change.mass_std
-    assert "taken off" in findings(arm)[0].words
+    assert "removed" in findings(arm)[0].words
 
 
 def test_inertia_of_another_link_is_no_payload() -> None:

@@ -48,7 +48,7 @@ def make_results(**changes: Any) -> Results:
                        "planned": _criteria(88.12, 118.4), "executed": _criteria(87.63, 119.2)},
         "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
                       "prior": "nominal parameters to 10 %", "condition": 26.4,
-                      "grouping": "40 of 66 standard parameters are kept."},
+                      "grouping": "40 of 66 standard parameters are independent."},
         "endogeneity": {"sentence": "Nothing says that noise has biased least squares.",
                         "biased": False, "statistic": 1.2, "p_value": 0.33,
                         "degrees_of_freedom": [6, 33], "noise": [0.001] * 6, "shifted": [],

@@ -82,7 +82,7 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
     text = "\n".join(screen)
     for words in (
         "ns16-october", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
-        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not taken",
+        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not accepted",
         "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 %", "warm below 2 %",
         "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
         "h hold", "space resume", "s stop", "+ - override",

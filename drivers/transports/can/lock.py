@@ -19,7 +19,7 @@ _WITHIN_THIS_PROCESS: Final = "virtual"
 class BusLock:
     """Keeps other programs of ours off a bus; whoever dies lets go of it.
 
-    Advisory, as that of a campaign's folder: programs that do not ask for it are not kept out.
+    Advisory, as that of a campaign's folder: programs that do not ask for it are not excluded.
 
     Raises:
         TransportError: another program has the bus, or the lock cannot be made.

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Finds the scores of motions told by genes.
+    """Finds the scores of motions given by genes.
 
     Attributes:
         genome: what genes mean.

@@ -219,7 +219,7 @@ def search(
     Args:
         population: scores motions; its problem says what they are and must keep.
         settings: how to search, and what for.
-        journal: scores already known, and where new ones are kept.
+        journal: scores already known, and where new ones are stored.
         progress: called after each generation.
         scored: called with a number of motions whenever so many more of a generation are scored
             (those that the journal knows are not).
