@@ -1,4 +1,4 @@
-"""Packets that got no answer: counted, and told once per drain instead of once per packet."""
+"""Packets that got no answer: counted, and reported once per drain instead of once per packet."""
 
 from __future__ import annotations
 

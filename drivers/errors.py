@@ -295,7 +295,7 @@ class VelocityMismatch(GuardError):
 
 
 class FollowingError(GuardError):
-    """The axis does not follow; the controller is told with mode 508 in this axis."""
+    """The axis does not follow; the controller is informed by mode 508 in this axis."""
 
     remedy = "see whether the axis is free, then its following_error in [drive_train]"
 
@@ -306,7 +306,7 @@ class FollowingError(GuardError):
 class CurrentLimit(GuardError):
     """The servo asks for more current than the narrower of cell and controller allows."""
 
-    remedy = "see whether the arm is free and what it carries, then go slower"
+    remedy = "check that the arm is free, check its payload, then go slower"
 
     check = "target current"
     unit = "A"

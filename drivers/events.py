@@ -1,6 +1,6 @@
 """What a session tells whoever runs it. Drained by `Session.events`, in order.
 
-Every event survives pickling, so that another process may be told.
+Every event survives pickling, so that another process may receive it.
 """
 
 from __future__ import annotations

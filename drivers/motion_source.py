@@ -24,7 +24,7 @@ BoundsName = Literal["plan", "override", "stop"]
 
 
 class MotionSource(Protocol):
-    """One motion, told cycle by cycle. Joint arrays are (n,), rad and rad/s.
+    """One motion, given cycle by cycle. Joint arrays are (n,), rad and rad/s.
 
     The session calls `begin` once, in the cycle that carries the first set-point (the position
     given, at zero velocity), then `advance` once for each later packet that it answers. Nothing

@@ -179,7 +179,7 @@ class ReplyPolicy:
         """Axes that are open are answered their target if that can be, else drive-off is asked for.
 
         Raises:
-            GuardError: they cannot be held there; told once, not in each cycle.
+            GuardError: they cannot be held there; raised once, not in each cycle.
         """
         try:
             self._require_targets(reading.answer.held, machine.cycle)

@@ -2,7 +2,7 @@
 
 It plays the usual loop program: start the link, switch the drive on, open all axes (one after the
 other), wait until the PC wants out, close, pause, open again. It knows nothing of packets, motors
-or robots; once a cycle it is told what the PC's answer asked for.
+or robots; once a cycle it receives what the PC's answer asked for.
 
     START -> DRIVE_OFF -> DRIVING_ON -> CLOSED -> OPENING -> OPEN -> CLOSING -+
                   ^           ^           ^                                   |

@@ -239,7 +239,7 @@ class _Server:
         self._deserted = False
 
     def knock(self, request: Callable[[], Request]) -> bool:
-        """Repeat the first packet until it is answered; False if told to end before."""
+        """Repeat the first packet until it is answered; False if asked to end before."""
         packet = self._peer.next_packet()
         if packet is None:
             self.tally.ended = True

@@ -26,7 +26,7 @@ class Digest:
         self._quiet_until: dict[str, float] = {}
 
     def take(self, events: Iterable[Event], now: float) -> list[Event]:
-        """What is to be told at this moment, in order."""
+        """What is to be reported at this moment, in order."""
         released: list[Event] = []
         for event in events:
             if isinstance(event, PacketRejected | GapSeen | AnswersLost):

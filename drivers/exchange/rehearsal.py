@@ -50,7 +50,7 @@ class _Rest:
 
 
 class Rehearsal:
-    """A session of an arm and the controller it is told there is; `cycle` runs one packet.
+    """A session of an arm and the controller it assumes; `cycle` runs one packet.
 
     Attributes:
         state: of the session; `State.OPEN` from the second cycle on.

@@ -75,7 +75,7 @@ def span(entries: Entries) -> tuple[int, int]:
 
 
 class McapWriter:
-    """Writes one MCAP file to `write`, which is told whole records.
+    """Writes one MCAP file to `write`, which receives whole records.
 
     Chunks end at `flush` and nowhere else; a chunk without messages is not written, what was
     registered for it goes into the next. Compressed by Zstandard, with checksums of chunks,

@@ -74,7 +74,7 @@ class Survey(Scan):
         stream: the same, open.
         order: the chunks that must come.
         summary: of the file, None where it is not whole.
-        visit: told each chunk that stands.
+        visit: called with each chunk that stands.
 
     Attributes:
         path: the file.
@@ -345,7 +345,7 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
 
     Args:
         path: the file.
-        visit: makes what is told each chunk that stands, with its messages by topic; a file that
+        visit: makes what is called with each chunk that stands, with its messages by topic; a file that
             must be gone through a second time is given to a new one.
 
     Raises:

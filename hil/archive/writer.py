@@ -223,7 +223,7 @@ class ArchiveWriter:
     Chunks end at fixed cycles, every 100 ms of the controller's time, wherever the caller cuts his
     batches: the same records give the same bytes. A killed process loses what came after the last
     whole chunk. Used as a context manager it is closed in any case: ``interrupted`` with the reason
-    when an exception passes, ``unknown`` when nobody told the outcome.
+    when an exception passes, ``unknown`` when the outcome is not given.
 
     Args:
         path: the file, which must not exist.

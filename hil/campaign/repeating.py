@@ -72,7 +72,7 @@ def play_until_good(
         interval: the motion.
         number: which of its kind, from 1.
         total: of how many.
-        reporter: told of what was rejected.
+        reporter: informed of what was rejected.
         warmth: asked before each attempt, and how it was when the motion began.
 
     Returns:

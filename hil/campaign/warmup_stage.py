@@ -27,7 +27,7 @@ class WarmUpStage:
         cell: of the campaign.
         plan: of the campaign.
         plan_hash: of exactly that plan.
-        reporter: told of what is decided.
+        reporter: informed of what is decided.
         watch: shows the curve.
         simulated: whether nothing but a simulated arm can move.
 

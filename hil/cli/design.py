@@ -255,7 +255,7 @@ def design(
         Literal["arm", "payload"],
         typer.Option(
             "--for",
-            help="arm: all parameters of the arm. payload: what it carries, the arm known, by a "
+            help="arm: all parameters of the arm. payload: only the payload, the arm known, by a "
             "motion of at most ten seconds (`hil payload`).",
         ),
     ] = "arm",

@@ -226,7 +226,7 @@ def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Findin
         where = f"between {names[k - 1]} and {names[k]}"
         if payload.changed[k]:
             beside = "" if statement is None else ", beside what is stated,"
-            words = f"What the arm carries{beside} has changed {where}: {_what(change)}."
+            words = f"The payload{beside} has changed {where}: {_what(change)}."
             step = "State the payload in the cell file, or check the tool and its fastening."
         else:
             words = (
@@ -281,9 +281,9 @@ def _nothing(arm: ArmTrend) -> Finding:
     count = len(arm.campaigns)
     if count < 2:
         return Finding("quiet", "There is one campaign, and nothing to compare it with.")
-    carried = "No change of what it carries was found."
+    carried = "No change of its payload was found."
     if arm.payload.untested:
-        carried = f"Whether it carries the same was not tested: {arm.payload.untested}."
+        carried = f"Whether its payload is the same was not tested: {arm.payload.untested}."
     if count <= FEWEST:
         judged = f"Its axes are judged from the campaign on that has {FEWEST} before it"
         return Finding("quiet", f"{carried} {judged}; there are {count}.")

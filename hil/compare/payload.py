@@ -373,7 +373,7 @@ def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projec
     known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
     rows = sum(int(one.samples.sum()) for one in campaigns)
     onto = projection(model, known, np.sum(information, axis=0), rows)
-    return "nothing that is known of this arm depends on what it carries" if onto is None else onto
+    return "nothing that is known of this arm depends on its payload" if onto is None else onto
 
 
 def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:

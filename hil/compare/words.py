@@ -129,7 +129,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
         words = f"Whether it carries the same was not tested: {found.payload.untested}."
         sentences.append(Finding("same", words))
     elif not found.load_changed:
-        sentences.append(Finding("same", "What it carries has not changed significantly."))
+        sentences.append(Finding("same", "The payload has not changed significantly."))
     return sentences
 
 

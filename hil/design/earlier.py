@@ -44,7 +44,7 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     Args:
         paths: one campaign folder, or archives.
         cell: for which a motion is going to be designed.
-        reporter: is told how far it is, and of joints about whose noise nothing is known.
+        reporter: shows how far it is, and of joints about whose noise nothing is known.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.

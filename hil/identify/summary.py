@@ -394,7 +394,7 @@ def _period(samples: Samples) -> float:
 
 
 def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[slice]) -> Factor:
-    """Every sample of the motion, standing joints included, as the criteria of a plan see it."""
+    """Every sample of the motion, resting joints included, as the criteria of a plan see it."""
     factor = Factor.zero(model)
     for samples, part in zip(training, rows, strict=True):
         motion = samples.motion.rows(part)._replace(direction=None)

@@ -34,7 +34,7 @@ class Known:
     Attributes:
         values: numbers, lists with an entry per joint (`"?"` where one is not known), words.
         origin: of each of these fields, such as "from the URDF".
-        notes: what a person should be told.
+        notes: what a person should know.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)

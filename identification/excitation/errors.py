@@ -103,7 +103,7 @@ class NoFeasibleMotionError(IdentificationError):
         super().__init__(self.sentence())
 
     def sentence(self, text_of: Callable[[Violation], str] = str) -> str:
-        """In words; `told` puts a violation into the words and units of the reader."""
+        """In words; `text_of` puts a violation into the words and units of the reader."""
         reasons = [
             f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])

@@ -195,7 +195,7 @@ class _Tree:
             elif name not in model.joint_names:
                 raise WriteBackError(
                     f"joint {name!r} moves in the description but not in the model: the inertia"
-                    " of what it carries is not known by itself"
+                    " of its payload is not known by itself"
                 )
 
     def link_of(self, joint: str) -> Element:

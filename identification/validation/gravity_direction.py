@@ -1,6 +1,6 @@
 """Whether recordings make more sense with gravity pulling another way than declared.
 
-An arm on a wall, on a ceiling or on a tilted base, described as standing upright, spoils every
+An arm on a wall, on a ceiling or on a tilted base, described as upright, spoils every
 axis that gravity loads, and looks like many wrong torque constants at once.
 """
 

@@ -110,7 +110,7 @@ class NominalScale:
             f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
         ]
         names = [self.joint_names[j] for j in off]
-        step = f"check torque constant and gear ratio of {joined(names)}, what it carries"
+        step = f"check torque constant and gear ratio of {joined(names)}, and the payload"
         if common != 1.0:
             step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
         return [

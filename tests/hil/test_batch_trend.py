@@ -503,8 +503,8 @@ def test_the_page_says_first_in_words_what_was_found() -> None:
     head = page().split("<main>")[0]
     for one in findings(changed()):
         assert one.words.replace("'", "&#39;") in head
-    assert head.index("joint_3 departs") < head.index("What the arm carries has changed")
-    assert "Earlier: What the arm carries" in head
+    assert head.index("joint_3 departs") < head.index("The payload has changed")
+    assert "Earlier: The payload" in head
 
 
 def test_the_page_needs_nothing_but_itself() -> None:

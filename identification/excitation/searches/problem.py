@@ -80,5 +80,5 @@ class Problem:
 
 
 def unplannable(error: PlannerError) -> Violation:
-    """Return how it is told that there is no motion."""
+    """Return how it is reported that there is no motion."""
     return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)
