@@ -345,8 +345,8 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
 
     Args:
         path: the file.
-        visit: makes what is called with each chunk that stands, with its messages by topic; a file that
-            must be gone through a second time is given to a new one.
+        visit: makes what is called with each chunk that stands, with its messages by topic; a
+            file that must be gone through a second time is given to a new one.
 
     Raises:
         ArchiveError: it cannot be read.
