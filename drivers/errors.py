@@ -8,7 +8,7 @@
     ├── RequestError         a motion asked for at a moment when none can be promised
     ├── TransportClosed      the link was closed, or its far end is gone for good
     ├── TransportError       a link that cannot be opened or has broken (`drivers.transports.base`)
-    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.errors`)
+    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.process`)
     └── RefusalError         a set-point that never left, and why
         ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
         ├── AxisLeft         an axis is not in the open mode that the motion needs

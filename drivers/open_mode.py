@@ -11,15 +11,99 @@ from numpy.typing import NDArray
 from drivers.arm_wire import ArmWire
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
-from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
+from drivers.errors import FirstSetPointUnknown, GuardError, MotionNotCarriedOn, MotionUnknown
 from drivers.execution import Execution, MotionExecution
-from drivers.guard import Guard
+from drivers.guard import FIRST_FRACTION, Guard
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
-from drivers.set_points import SentSetPoints
 
+# Whether the controller takes our set-points: its target held against those sent last.
+#
+# While answers are lost the controller has to make do without; when it then hears the next one,
+# the arm is asked to leap by all that was lost. Unlike a packet that never arrived, a lost
+# answer shows nowhere but in the target that the controller reports. A packet that never arrived
+# is no answer either: a controller that carries its target on meanwhile reports one ahead of
+# those sent.
 Array = NDArray[np.float64]
+
+LEAP_FRACTION: Final = 0.25
+"""Share of the following-error threshold allowed between target and set-point sent last."""
+
+
+class SentSetPoints:
+    """The set-points sent last, in motor revolutions.
+
+    Args:
+        guard: whose following-error threshold and standstill apply.
+        depth: how many of them the target received may be.
+    """
+
+    def __init__(self, guard: Guard, depth: int) -> None:
+        n = guard.limits.n_joints
+        self._guard = guard
+        self._depth = depth
+        # One more than allowed, so that one too many can be counted.
+        self._sent = np.zeros((depth + 1, n))
+        self._back = np.arange(depth + 1)
+        self._ahead = np.arange(1.0, depth)[:, None]
+        self._newest = 0
+        self._lag = 0
+        self._every = np.ones(n, dtype=np.bool_)
+
+    def begin(self, target: Array) -> None:
+        """The first set-point (n,) was sent, the target received."""
+        self._sent[...] = target
+        self._lag = 0
+
+    def add(self, target: Array) -> None:
+        """The next set-point (n,) was sent."""
+        self._newest = newest = (self._newest + 1) % len(self._sent)
+        self._sent[newest] = target
+
+    def check(
+        self, target: Array, missed: int, cycle: int, where: NDArray[np.bool_] | None = None
+    ) -> int:
+        """Each joint's target has to be one of the set-points sent last, or the last carried on.
+
+        Args:
+            target: (n,) D1 received, motor revolutions.
+            missed: packets before this one that were not answered: for so many steps, but less
+                than `depth`, the controller may have carried on.
+            cycle: for the error.
+            where: (n,) which joints; None for all.
+
+        Returns:
+            How many answers more than in the cycle before were not accepted. What a joint at
+            standstill moves in a cycle hides one.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn: a target further than `FIRST_FRACTION` of the
+                following-error threshold from all of them, or than `LEAP_FRACTION` from the last.
+        """
+        sent, standstill = self._sent, self._guard.limits.standstill
+        newest = sent[self._newest]
+        # As always: the set-point sent last. All else may take its time.
+        if np.abs(target - newest).max() <= standstill:
+            # Where hardly anything moves, a target reported late looks the same.
+            if self._lag and np.abs(newest - sent[self._newest - 1]).max() > standstill:
+                self._lag = 0
+            return 0
+        rows = sent[(self._newest - self._back) % len(sent)]
+        carried = newest + self._ahead[:missed] * (newest - rows[1])
+        late, ahead = np.abs(rows - target), np.abs(carried - target)
+        where = self._every if where is None else where
+        nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
+        threshold = self._guard.following_error
+        require(where, nearest, FIRST_FRACTION * threshold, MotionNotCarriedOn, cycle)
+        require(where, late[0], LEAP_FRACTION * threshold, MotionNotCarriedOn, cycle)
+        behind = where & (late[0] > standstill)
+        behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
+        lag = int(late.argmin(axis=0)[behind].max(initial=0))
+        more, self._lag = max(0, lag - self._lag), lag
+        return more
+
+
 Joints = NDArray[np.bool_]
 
 # Rows of `ArmWire.raw`.

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from planner.arrays import Array
 from planner.blocks import Block, LimitRows, Mask, Rows
-from planner.corners import FULL, NEAREST_STATE, REFUSALS, SOLVER_JERK
-from planner.solver import require_solver
+from planner.corners import FULL, NEAREST_STATE, REFUSALS, SOLVER_JERK, require_solver
 from planner.verify import jump_rounding
 
 # A join may miss its end by this share of what counts as rounding between two pieces.

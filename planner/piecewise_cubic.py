@@ -6,13 +6,34 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from planner.arrays import Array
 from planner.checked_data import DAMAGED, numbers, rows
 from planner.errors import InvalidTrajectory
+
+
+class Trajectory(Protocol):
+    """A motion of all joints as a function of time, at rest at both ends."""
+
+    @property
+    def duration(self) -> float:
+        """Length in time [s]."""
+        ...
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        ...
+
+    def sample(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q [rad], qd [rad/s], qdd [rad/s²] at the times `t` (m,), each (m, n).
+
+        Outside [0, duration] the joints rest at the nearer end.
+        """
+        ...
 
 
 class Extrema(NamedTuple):

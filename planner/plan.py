@@ -7,9 +7,8 @@ from numpy.typing import ArrayLike
 from planner.commands import FlyPercent, Move, checked_shares
 from planner.errors import InvalidSetting
 from planner.limits import JointLimits
-from planner.moves import planned
+from planner.moves import checked_via_points, planned
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.via_points import checked_via_points
 
 __all__ = ["plan", "checked_via_points"]
 

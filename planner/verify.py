@@ -7,10 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from planner.arrays import Array
-from planner.bounds import Bounds
 from planner.errors import LimitExceeded, NotSmooth
-from planner.piecewise_cubic import Extrema, PiecewiseCubic
-from planner.trajectory import Trajectory
+from planner.limits import Bounds
+from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 
 # Rounding, not licence: a position may leave its range by this share of the range's size, and
 # neighbouring pieces may differ by this share of the limit of the quantity.

@@ -44,11 +44,10 @@ from sim_fixtures.effects import UnmodelledEffects
 from sim_fixtures.errors import SettingError
 from sim_fixtures.layout import Layout
 from sim_fixtures.mishaps import Mishap
-from sim_fixtures.nominal_model import NominalModel
 from sim_fixtures.own_motion import OwnMotion
 from sim_fixtures.plant import Plant
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
-from sim_fixtures.servo import Servo
+from sim_fixtures.servo import NominalModel, Servo
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
 from sim_fixtures.truth import PlantTruth, standard_parameters
 

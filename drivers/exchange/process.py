@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.errors import RequestError
+from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log, memory
-from drivers.exchange.errors import ExchangeError, WithdrawnError
 from drivers.exchange.event_log import EventReader
 from drivers.exchange.inbox import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.notices import ExchangeEvent
@@ -25,6 +24,15 @@ from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.motion_source import MotionSource
 from drivers.states import State
+
+
+class ExchangeError(DriverError):
+    """The exchange process could not be started, does not answer, or is gone."""
+
+
+class WithdrawnError(RequestError):
+    """A motion was handed over, and not wanted any more before it could begin."""
+
 
 START_TIMEOUT: Final = 60.0
 """s until a process that was started has opened its link; imports may be slow on a cold disk."""

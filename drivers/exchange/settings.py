@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange.punctuality import MAX_LATE
+from drivers.exchange.loop import MAX_LATE
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec

@@ -32,7 +32,7 @@ from pydantic import (
 )
 
 from hil.errors import ArchiveError
-from hil.whole_number import whole_number
+from hil.reading import whole_number
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"

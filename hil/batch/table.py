@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 from hil.files import replacing
-from hil.timestamps import instant
+from hil.reading import instant
 from hil.version import software
 
 from .estimates import relative_error

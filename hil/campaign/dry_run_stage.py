@@ -8,7 +8,7 @@ from dataclasses import replace
 from hil.cell import Cell
 from hil.errors import OperatorStopError
 
-from .dry_run import OVERRIDE, DryRun
+from .dry_run import OVERRIDE, DryRun, made_by
 from .execution_result import DryRunState
 from .execution_runner import Runner
 from .folder import CampaignFolder
@@ -16,7 +16,6 @@ from .gates import not_accepted
 from .intervals import Interval
 from .operator import Operator
 from .quality_entry import Entering
-from .simulation_flag import made_by
 from .stop import Stop
 
 

@@ -15,13 +15,12 @@ from hil.cell import Cell
 from hil.errors import ArchiveError
 
 from .controller_limits import narrower_thresholds
-from .dry_run import DryRun
+from .dry_run import DryRun, said_of
 from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST
 from .motion_link import MotionLink
 from .rehearsal import Rehearsal
-from .simulation_flag import said_of
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""

@@ -32,6 +32,7 @@ from hil.errors import ControllerFault, OperatorStopError
 
 from .motion_link import (
     END_TIMEOUT,
+    Beginning,
     Connection,
     Progress,
     Recorded,
@@ -42,7 +43,6 @@ from .motion_link import (
 )
 from .motion_watch import MotionWatch, unwatched_motion
 from .progress import PacketCounts, ProgressDisplay, duration_of
-from .start_timeout import Beginning
 from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
 from .stop import Stop
 

@@ -15,8 +15,7 @@ from hil.reading import lies_there, text_of
 from hil.results.frozen import Frozen
 
 from .errors import CampaignFolderError
-from .folder import CampaignFolder
-from .read_back import read_back
+from .folder import CampaignFolder, read_back
 
 FORMAT_VERSION: Final = 1
 AS_MODELLED: Final = "as modelled"

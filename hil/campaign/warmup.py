@@ -30,8 +30,8 @@ from hil.reading import lies_there, text_of
 from planner import FourierSeries, PiecewiseCubic
 
 from .errors import CampaignFolderError
+from .folder import read_back
 from .operator import DriftCurve
-from .read_back import read_back
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import UnsafeError
-from hil.violation_text import always_so, violation_text
+from hil.motion_checks import always_so, violation_text
 from identification.excitation import (
     CollisionChecker,
     CurrentModel,

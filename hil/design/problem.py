@@ -10,8 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.motion_checks import collision_checker, current_model, planned
-from hil.violation_text import always_so, violation_text
+from hil.motion_checks import always_so, collision_checker, current_model, planned, violation_text
 from identification.excitation import (
     CollisionChecker,
     Constraints,

@@ -10,8 +10,8 @@ from typing import BinaryIO, Final
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
+from hil.motion_checks import violation_text
 from hil.progress import Reporter, Task
-from hil.violation_text import violation_text
 from identification.excitation import (
     Design,
     ForeignJournalError,

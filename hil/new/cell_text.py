@@ -25,7 +25,7 @@ from hil.importers import Convention, urdf_of_dh
 from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
 
 from .known import ASSUMED, Known, assumed_for_design, from_urdf

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
+from identification.excitation.constraints import SAMPLE_PERIOD, midpoints
 from identification.excitation.criteria import Criteria, log10_det_and_coupling
 from identification.excitation.errors import DesignError
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel

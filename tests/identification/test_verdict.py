@@ -18,10 +18,9 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, Causes, Fault, Kind
-from identification.validation.evidence import Evidence, Surroundings, gather
+from identification.validation.evidence import Evidence, Repeatability, Surroundings, gather
 from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
-from identification.validation.repeatability import Repeatability
 from identification.validation.verdict import Thresholds, Verdict, judge
 from sim_fixtures.ns16 import urdf_text
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.constraints import Constraints
+from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Objective
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.searches.scores import Scores, unplanned
 from identification.excitation.violation import Violation, excess_by_kind
 from planner import FourierSeries, PiecewiseCubic, PlannerError
