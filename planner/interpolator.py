@@ -19,8 +19,7 @@ from planner.limits import JointLimits
 from planner.motion_queue import CornerPlanner, MotionQueue
 from planner.move_services import MoveServices, MoveSettings
 from planner.rrs import Event, EventKind, OutputFormat, SpeedCorrection, Status, Step
-from planner.stop import slowing_bounds, within
-from planner.time_law import RateBounds, TimeLaw, admits
+from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 
 # A motion time [s], and a share of a period, shorter than this is rounding.
 _MOTION_TIME_ROUNDING = 1e-9

@@ -15,8 +15,8 @@ from drivers.drive_train import WRIST_AXES
 from drivers.errors import PacketError
 from drivers.packets import N_ARMS, InitPacket
 from hil.archive import Archive, open_archive
+from hil.cell.text import urdf_limits
 from hil.cell.unknown import UNKNOWN
-from hil.cell.urdf import urdf_limits
 from hil.errors import ArchiveError
 from hil.reading import toml_of
 

@@ -16,7 +16,7 @@ import hil.cli.rehearse
 import hil.cli.report
 import hil.cli.status
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.from_design import campaign_of_design
+from hil.campaign.campaign import campaign_of_design
 from hil.cli import app
 from hil.design import DesignResult
 from tests.hil.fast_cell import fast_cell
