@@ -192,8 +192,8 @@ def test_a_distance_of_nothing_is_a_stop(six_axis_limits, random_points):
 
 
 def test_no_corner_is_planned_with_an_unknown_solver(six_axis_limits, random_points, monkeypatch):
-    monkeypatch.setattr("planner.joins._VERSION", "0.20.1")
-    monkeypatch.setattr("planner.joins._SUPPORTED", False)
+    monkeypatch.setattr("planner.corners._VERSION", "0.20.1")
+    monkeypatch.setattr("planner.corners._SUPPORTED", False)
     segments = corner(random_points(3, 3), six_axis_limits)
     with pytest.raises(UnsupportedSolver, match=r"0\.20\.1.*0\.19"):
         fly_by(*segments, six_axis_limits, 0.5)
