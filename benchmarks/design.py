@@ -48,7 +48,7 @@ from hil.design.problem import problem_of, search_settings
 from hil.design.settings import preset
 from identification import Motion
 from identification.excitation import Objective, Population, Problem, search
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
+from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError
 from planner.arrays import Array
 from planner.batch import plan_chunk

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from drivers import Guard, GuardLimits
 from hil import Cell
 from planner import JointLimits, PiecewiseCubic, TrajectoryPlayer, plan
-from planner.stop import slowing_bounds, within
-from planner.time_law import Ramp, RateBounds, ramp
+from planner.time_law import Ramp, RateBounds, ramp, slowing_bounds, within
 from sim_fixtures.ns16 import CELL_PATH
 
 Array = NDArray[np.float64]

@@ -177,7 +177,7 @@ class CorrectionGuard:
         self._require_zero(CorrectionNotEnded, cycle)
 
     def check_after_gap(self, cycle: int) -> None:
-        """After a long gap, whether the controller kept a correction cannot be seen.
+        """After a long gap, whether the controller applied a correction cannot be seen.
 
         Raises:
             CorrectionNotCarriedOn: the one sent last is not zero.

@@ -102,7 +102,7 @@ class CorrectionMode(OpenMode):
         reading: Reading,  # noqa: ARG002  zero is zero in every axis
         cycle: int,
     ) -> None:
-        """A correction that was not zero may have been kept or dropped: nothing tells."""
+        """A correction that was not zero may have been applied or dropped: nothing tells."""
         self._corrections.check_after_gap(cycle)
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:

@@ -8,7 +8,7 @@
     ├── RequestError         a motion asked for at a moment when none can be promised
     ├── TransportClosed      the link was closed, or its far end is gone for good
     ├── TransportError       a link that cannot be opened or has broken (`drivers.transports.base`)
-    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.errors`)
+    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.process`)
     └── RefusalError         a set-point that never left, and why
         ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
         ├── AxisLeft         an axis is not in the open mode that the motion needs
@@ -32,7 +32,7 @@
                 ├── MotionHeld     or has been brought to rest
                 ├── MotionPaused   or its arm has, in a pause by the clock
                 │   └── MotionUnknown     or what it is judged by is not of this cycle
-                └── CorrectionNotCarriedOn  or nothing tells whether a correction was kept
+                └── CorrectionNotCarriedOn  or nothing tells whether a correction was applied
 
 All of them survive pickling with message and attributes, though without their cause.
 """
@@ -295,7 +295,7 @@ class VelocityMismatch(GuardError):
 
 
 class FollowingError(GuardError):
-    """The axis does not follow; the controller is told with mode 508 in this axis."""
+    """The axis does not follow; the controller is informed by mode 508 in this axis."""
 
     remedy = "see whether the axis is free, then its following_error in [drive_train]"
 
@@ -306,7 +306,7 @@ class FollowingError(GuardError):
 class CurrentLimit(GuardError):
     """The servo asks for more current than the narrower of cell and controller allows."""
 
-    remedy = "see whether the arm is free and what it carries, then go slower"
+    remedy = "check that the arm is free, check its payload, then go slower"
 
     check = "target current"
     unit = "A"
@@ -384,6 +384,6 @@ class MotionUnknown(MotionHeld):
 
 
 class CorrectionNotCarriedOn(MotionNotCarriedOn):
-    """After a long gap nothing tells whether the controller kept the correction sent last."""
+    """After a long gap nothing tells whether the controller applied the correction sent last."""
 
     check = "correction sent last before a gap"

@@ -1,6 +1,6 @@
 """What a session tells whoever runs it. Drained by `Session.events`, in order.
 
-Every event survives pickling, so that another process may be told.
+Every event survives pickling, so that another process may receive it.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class GapSeen:
 
 @dataclass(frozen=True)
 class AnswersLost:
-    """The target received in `cycle` is older than the set-point sent last: `count` were not taken.
+    """The target received in `cycle` is older than the last set-point; `count` were not accepted.
 
     Seen only in modes 1, 4 and 5, where a joint moves by more than what counts as standstill in
     each cycle, and where the controller then holds its target rather than carry it on.
@@ -101,7 +101,7 @@ class OverrideChanged:
 
 @dataclass(frozen=True)
 class HoldChanged:
-    """In `cycle` the requested motion was told to rest on its path, or (not `held`) to go on."""
+    """In `cycle` the requested motion was asked to rest on its path, or (not `held`) to go on."""
 
     held: bool
     cycle: int

@@ -43,7 +43,7 @@ class Execution(ABC):
         source: the motion or correction.
         n_joints: n.
         settle_cycles: how long its end is held.
-        stop_cycles: how many set-points it may give after it was told to stop.
+        stop_cycles: how many set-points it may give after a stop was requested.
 
     Attributes:
         started: the first set-point was taken.
@@ -121,7 +121,7 @@ class Execution(ABC):
             if not callable(change):
                 return "this motion knows no override"
             if self.outcome == "stopped":
-                return "the motion was told to stop"
+                return "the motion is being stopped"
             if not 0.0 <= fraction <= 1.0:
                 return f"an override of {fraction!r} is not one of 0..1"
             change(float(fraction))
@@ -163,7 +163,7 @@ class Execution(ABC):
             if not is_holdable(source):
                 return "this motion cannot be held"
             if self.outcome == "stopped":
-                return "the motion was told to stop"
+                return "the motion is being stopped"
             if self.started:
                 source.resume()
         except BaseException as error:
@@ -201,7 +201,7 @@ class Execution(ABC):
         if self._stopping > self._stop_cycles:
             raise SourceFailed(
                 f"the motion source did not come to rest in the {self._stop_cycles} cycles after "
-                "it was told to stop",
+                "a stop was requested",
                 cycle,
             )
 

@@ -24,7 +24,7 @@ BoundsName = Literal["plan", "override", "stop"]
 
 
 class MotionSource(Protocol):
-    """One motion, told cycle by cycle. Joint arrays are (n,), rad and rad/s.
+    """One motion, given cycle by cycle. Joint arrays are (n,), rad and rad/s.
 
     The session calls `begin` once, in the cycle that carries the first set-point (the position
     given, at zero velocity), then `advance` once for each later packet that it answers. Nothing
@@ -164,10 +164,10 @@ def progress_of(source: object) -> tuple[float, float]:
 
     Nothing in the cycle depends on them, so whatever a source raises counts as not telling.
     """
-    return _told(source, "motion_time"), _told(source, "rate")
+    return _number_of(source, "motion_time"), _number_of(source, "rate")
 
 
-def _told(source: object, name: str) -> float:
+def _number_of(source: object, name: str) -> float:
     try:
         return float(getattr(source, name))
     except BaseException:

@@ -40,7 +40,7 @@ _ALL_BITS: Final = -1
 MODE, D1, D2, D3, D4, D5 = range(6)
 
 _HEADER: Final = struct.Struct("<i4sI")
-_KEPT: Final[dict[int, tuple[int, ...]]] = {
+_RETURNED_WORDS: Final[dict[int, tuple[int, ...]]] = {
     Mode.CLOSED: (D1, D2),
     Mode.DRIVING_ON: (D1, D2),
     Mode.CLOSED_MIRRORED: (D1, D2, D3, D4, D5),
@@ -87,9 +87,9 @@ def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> Safe
         if not on[arms[slot] - 1] and mode not in INCREMENTAL:
             answered[slot] = mode
             mask[slot, D1:] = _ALL_BITS
-        elif mode in _KEPT:
+        elif mode in _RETURNED_WORDS:
             answered[slot] = mode
-            mask[slot, list(_KEPT[mode])] = _ALL_BITS
+            mask[slot, list(_RETURNED_WORDS[mode])] = _ALL_BITS
             if mode in HOLDABLE:
                 held.append(slot)
     given_back = bytes(

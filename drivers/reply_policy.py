@@ -110,7 +110,7 @@ class ReplyPolicy:
         self._frame = ReplyFrame(init.n_axes)
         self._open_mode: OpenMode | None = None
         self._asked_at = -1
-        self._told = False
+        self._reported = False
         self._exit_cycles = round(EXIT_TIMEOUT / guard.period)
         self._axis_of = _axes_by_slot(init)
         if self.unusable is not None:
@@ -161,7 +161,7 @@ class ReplyPolicy:
             answer = self._open_mode.leaving if machine.in_interval else self._open_mode.opening
             answer(reading, measured, commanded, machine.cycle)
             self._require_targets(reading.answer.held, machine.cycle)
-            machine.note_answers(self._open_mode.lost, self._max_gap)
+            machine.note_lost(self._open_mode.lost, self._max_gap)
             return self._asking_for_exit(status) if self._exit_due(machine) else status
         if state is State.OPENING:
             self._open_mode.opening(reading, measured, commanded, machine.cycle)
@@ -179,19 +179,19 @@ class ReplyPolicy:
         """Axes that are open are answered their target if that can be, else drive-off is asked for.
 
         Raises:
-            GuardError: they cannot be held there; told once, not in each cycle.
+            GuardError: they cannot be held there; raised once, not in each cycle.
         """
         try:
             self._require_targets(reading.answer.held, machine.cycle)
             if machine.state is State.FREEZING and self._open_mode is not None:
                 self._open_mode.require_holdable(reading.held, reading.held, machine.cycle)
         except GuardError as error:
-            if not self._told:
-                self._told = True
+            if not self._reported:
+                self._reported = True
                 raise
             self.refusal(_offending(error), reading, words)
         else:
-            self._told = False
+            self._reported = False
 
     def _require_targets(self, slots: Sequence[int], cycle: int) -> None:
         """What is given back in an open mode has to be a number, whosever axis it is."""
@@ -240,7 +240,7 @@ class ReplyPolicy:
             elif execution is not None and not moving:
                 open_mode.require_start(cycle)
             open_mode.next(execution if moving else None, measured, commanded, cycle)
-            machine.note_answers(open_mode.lost, self._max_gap)
+            machine.note_lost(open_mode.lost, self._max_gap)
         if execution is None:
             return machine.stop_reason is not None
         if not moving:

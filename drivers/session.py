@@ -49,10 +49,9 @@ from typing import Final
 import numpy as np
 
 from drivers.arm_wire import Ages
-from drivers.counters import Tally
 from drivers.drive_train import DriveTrain
 from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
-from drivers.events import Counters, Event, InitReceived, LinkLost, Refused
+from drivers.events import Counters, Event, InitReceived, LinkLost, PacketRejected, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
 from drivers.motion_source import CorrectionSource, MotionSource
@@ -60,6 +59,7 @@ from drivers.packets import (
     DRIVE_ON,
     INIT_LENGTH,
     INIT_NUMBER,
+    LAST_NUMBER,
     N_ARMS,
     CyclicPacket,
     InitPacket,
@@ -71,14 +71,114 @@ from drivers.packets import (
 from drivers.record import CycleRecords
 from drivers.replies import MODE, words_of
 from drivers.reply_policy import ReplyPolicy
-from drivers.sequence import Sequence
 from drivers.state_machine import Machine
 from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
+
+
+class Tally:
+    """Counts fates of packets.
+
+    Attributes:
+        counters: since the session was made.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._untold: dict[str, int] = {}
+        self._why: dict[str, str] = {}
+
+    def malformed(self, packet: bytes, error: PacketError) -> None:
+        """One was not the packet it should be."""
+        self.counters.malformed += 1
+        self._tell("malformed", 1)
+        self._why["malformed"] = f"{len(packet)} bytes: {error}"
+
+    def stale(self, number: int, last: int) -> None:
+        """One cannot be a later packet of this session."""
+        self.counters.stale += 1
+        self._tell("stale", 1)
+        self._why["stale"] = f"number {number} does not follow {last}"
+
+    def ended(self) -> None:
+        """One came after the end of the session."""
+        self.counters.ended += 1
+        self._tell("ended", 1)
+
+    def discarded(self, kind: str, count: int) -> None:
+        """The link dropped `count` packets of this kind before the session saw them."""
+        if count <= 0:
+            return
+        self.counters.discarded[kind] = self.counters.discarded.get(kind, 0) + count
+        self._tell(kind, count)
+
+    def drain(self) -> list[PacketRejected]:
+        """One event per kind since the last call."""
+        why = self._why
+        events = [PacketRejected(kind, n, why.get(kind, "")) for kind, n in self._untold.items()]
+        self._untold.clear()
+        return events
+
+    def _tell(self, kind: str, count: int) -> None:
+        self._untold[kind] = self._untold.get(kind, 0) + count
+
+
+class Sequence:
+    """Follows the controller's numbers (1..0x7FFF, then 1 again) from the last one answered.
+
+    A number at most `window` ahead is new; the window is what can be missed before silence ends
+    the session, so a number further ahead cannot be a later packet of the same session.
+
+    Attributes:
+        last: number of the last packet answered.
+        cycle: the controller's cycles since its init packet, missed ones counted in.
+        broken: after a silence no number is expected; whatever comes next is new.
+    """
+
+    def __init__(self) -> None:
+        self.last = 0
+        self.cycle = 0
+        self.broken = False
+        self._window = LAST_NUMBER // 2
+
+    def restart(self, number: int, window: float) -> None:
+        """Count from this number on, accepting at most `window` cycles ahead."""
+        self.last = number
+        self.cycle = 0
+        self.broken = False
+        # Beyond half of all numbers, ahead could not be distinguished from behind.
+        self._window = max(1, min(int(window), LAST_NUMBER // 2))
+
+    def distance(self, number: int) -> int:
+        """Cycles from the last packet answered to this one, 0..0x7FFE."""
+        return (number - self.last) % LAST_NUMBER
+
+    def is_duplicate(self, number: int) -> bool:
+        """Whether this is the last packet once more."""
+        return number == self.last and not self.broken
+
+    def is_stale(self, number: int) -> bool:
+        """Whether this cannot be a later packet of the same session."""
+        return not self.broken and not 1 <= self.distance(number) <= self._window
+
+    def leads_to(self, number: int, missed: int) -> bool:
+        """Whether this number comes after the last, at most so many missed, or after none."""
+        return self.broken or self.last == 0 or self.distance(number) <= missed + 1
+
+    def accept(self, number: int) -> int:
+        """Go on to this number; returns how many packets were missed before it."""
+        ahead = self.distance(number)
+        if not 1 <= ahead <= self._window:
+            ahead = 1  # after a silence: how long it was, the numbers cannot tell
+        self.last = number
+        self.cycle += ahead
+        self.broken = False
+        return ahead - 1
+
 
 FLIGHT_RECORDER: Final = 50
 """Records that go with a refusal."""
 STOP_TIMEOUT: Final = 10.0
-"""s that a motion may take from being told to stop to rest; drive-off is asked for after that."""
+"""s that a motion may take from being asked to stop to rest; drive-off is asked for after that."""
 MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES | CORRECTION_MODES))
@@ -378,7 +478,7 @@ class Session:
             policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
-            # Whatever it was, the controller is told to stop, by the answer that is due now.
+            # Whatever it was, the controller is asked to stop, by the answer that is due now.
             refusal = as_refusal(error, machine.cycle)
             ring.commanded[row] = math.nan
             status = policy.refuse(machine, refusal, reading, words)

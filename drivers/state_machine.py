@@ -157,7 +157,7 @@ class Machine:
         if before:
             self.events.append(HoldChanged(False, self.cycle))
 
-    def note_answers(self, lost: int, max_gap: int) -> None:
+    def note_lost(self, lost: int, max_gap: int) -> None:
         """So many of our last answers did not reach the controller, or it did not take them.
 
         More than `max_gap` of them in `LOSS_WINDOW` cycles end a motion on its path: the target

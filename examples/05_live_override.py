@@ -3,7 +3,7 @@
 One sees how far the commanded positions are from the straight way that was planned: rounding. The
 picture shows what was wished, the speed along the path that followed within the limits of
 `[bounds]`, and that of the joints. On a real arm the keys of `hil run` do this; any object with
-`show` and `wish` can.
+`show` and `request` can.
 """
 
 from pathlib import Path
@@ -34,7 +34,7 @@ class Person:
         self.wishes = OperatorRequest(override=0.25 if 0.25 < done < 0.5 else 1.0)
         self.seen.append((progress.cycles, self.wishes.override, progress.rate or 0.0))
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """What it shall do now."""
         return self.wishes
 

@@ -46,7 +46,7 @@ class HilError(Exception):
 
     Attributes:
         exit_code: exit status of the command line when this error ends it.
-        figures: what a script is told beside the sentence, of work that was done until then.
+        figures: what a script receives beside the sentence, of work that was done until then.
     """
 
     exit_code: ClassVar[int] = 1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.cell.urdf import urdf_limits
+from hil.cell.text import urdf_limits
 from hil.errors import InputError
 from hil.files import make_folder, write_together
 from hil.identify import Identification
@@ -93,7 +93,7 @@ class Exported:
         return [*lines, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
-        """The same as plain values."""
+        """The same for JSON."""
         compared, spread = self.comparison, self.spread
         return {
             "path": str(self.path),

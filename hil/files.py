@@ -117,7 +117,7 @@ def writing_to(folder: Path) -> Iterator[None]:
 def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
     """Replace several files of a folder, or none of them.
 
-    All are written beside the old ones first. These are kept until the last is in its place, and
+    All are written beside the old ones first. These are held until the last is in its place, and
     put back if one of them cannot get there.
 
     Args:

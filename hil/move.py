@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
 from hil.archive import ArchiveSpec
-from hil.campaign.announced_limits import checks_in_force
+from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
-from hil.campaign.intervals import player_of
+from hil.campaign.intervals import at_limit, beyond, player_of
 from hil.campaign.motion_link import MotionLink
 from hil.campaign.motion_watch import MotionWatch, unwatched_motion
 from hil.campaign.plan import moves_to_dict
-from hil.campaign.reach import at_limit, beyond
 from hil.campaign.stop import Stop
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError

@@ -11,9 +11,43 @@ import json
 import os
 import stat
 import tomllib
+from datetime import UTC, datetime
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, Final
+
+_FIRST: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
+"""Of the years that calendars, time zones and figures agree on."""
+
+
+def instant(when: str) -> datetime | None:
+    """The moment of an ISO 8601 text, in UTC; None where it is none, or no robot's."""
+    try:
+        at = datetime.fromisoformat(when)
+        at = (at if at.tzinfo else at.replace(tzinfo=UTC)).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return None
+    return at if _FIRST <= at < _LAST else None
+
+
+LAST_PORT: Final = 65535
+_MOST_DIGITS: Final = 18
+"""So that 64 bits hold it, and Python reads it at all."""
+
+
+def whole_number(text: str | None) -> int | None:
+    """A number of 0 or more; None where the text is none, or longer than anything is counted."""
+    if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MOST_DIGITS:
+        return None
+    return int(text)
+
+
+def port_number(text: str) -> int | None:
+    """The number of a UDP or TCP port, 1 to 65535; None where the text is none."""
+    port = whole_number(text)
+    return port if port is not None and 0 < port <= LAST_PORT else None
+
 
 LONGEST_TEXT: Final = 1 << 28
 """Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""

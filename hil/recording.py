@@ -40,7 +40,7 @@ def record(
         stop: ends the recording.
         duration: s of the controller's time; None: until `stop`, or the session's end.
         wait: s that the controller is waited for; None: for ever.
-        watch: told of the progress.
+        watch: receives the progress.
         durable: wait at each flush until the disk has the data.
 
     Raises:

@@ -105,7 +105,7 @@ def recording_of(archive: Archive) -> Recording:
 
 
 def _commanded(archive: Archive) -> Array | None:
-    """What the arm was told: by the PC, or by the controller's own program."""
+    """What the arm was commanded: by the PC, or by the controller's own program."""
     own = archive.header.controllers_own
     return archive.columns.get("target_position" if own else "commanded_position")
 
@@ -135,7 +135,7 @@ def _time(archive: Archive) -> Array:
 
 
 def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
-    """Where motion is not smooth: cycles lost by the link or not archived, answers not taken.
+    """Where motion is not smooth: cycles lost by the link or not archived, answers not accepted.
 
     Of several such answers within 0.1 s the first and the last are known.
     """

@@ -52,7 +52,7 @@ class Replayed:
         return [*lines, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
-        """The same as plain values."""
+        """The same for JSON."""
         return {
             "joints": [*self.joint_names],
             "units": [*self.units],

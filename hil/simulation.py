@@ -142,7 +142,7 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
 def simulated_drive(cell: Cell) -> SimulatedDrive:
     """The drive train as the simulated robot has it, by its own formulas.
 
-    What `[simulation.drive_train]` names is taken from there: a mistake in `[drive_train]` then
+    What `[simulation.drive_train]` names is read from there: a mistake in `[drive_train]` then
     shows, as it would on the robot.
     """
     simulation = cell.file.simulation

@@ -39,13 +39,12 @@ from planner.limits import JointLimits
 from planner.motion_csv import from_csv, to_csv
 from planner.motion_plan import MotionPlan, TargetPassage
 from planner.moves import plan_moves
-from planner.piecewise_cubic import Extrema, PiecewiseCubic
+from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 from planner.plan import plan
 from planner.plan_file import PlanFile
 from planner.player import TrajectoryPlayer
 from planner.remote import load, pack
 from planner.sampled import SampledTrajectory
-from planner.trajectory import Trajectory
 from planner.verify import check_limits, check_rest
 
 __all__ = [

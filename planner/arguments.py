@@ -1,4 +1,4 @@
-"""What a service was called with, as plain numbers; anything else is no number, never an error."""
+"""What a service was called with, as numbers; anything else is no number, never an error."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def _profiles(
     holds = distance >= 2.0 * acceleration * full * full
     held = (np.sqrt(full * full + 4.0 * distance / acceleration) - 3.0 * full) / 2.0
     short = full.copy()
-    # As plain floats have it: that of arrays may differ in the last digit.
+    # As floats have it: that of arrays may differ in the last digit.
     least = (distance / (2.0 * jerk))[~holds].tolist()
     short[~holds] = [cbrt(cube) for cube in least]
     rise = np.where(cruises, rise, short)

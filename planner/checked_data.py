@@ -1,4 +1,4 @@
-"""What plain data of a file hold, type by type; nothing is taken for what it only resembles."""
+"""What data of a file hold, type by type; nothing is mistaken for what it only resembles."""
 
 from __future__ import annotations
 

@@ -20,12 +20,86 @@ from numpy.typing import NDArray
 
 from planner.arrays import Array
 from planner.blocks import Block, LimitRows
-from planner.bounds import Bounds
-from planner.passing import passing
+from planner.errors import UnsupportedSolver
+from planner.limits import Bounds
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.segments import StraightSegment
-from planner.solver import require_solver
 from planner.verify import jump_rounding
+
+_SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
+_STEPS = 60  # of Newton's method, four or five as a rule; halving alone would need about fifty
+_RESOLUTION = 1e-15  # share of the duration that a time is told to
+
+
+# Which versions of the corner solver (community ruckig) this package was measured with.
+#
+# Its margins against crashes are measurements of one series of versions, not properties of the
+# algorithm. So another version is not merely warned of: no corner is planned with it. Whatever
+# does not fly by (stops, playing, reading of plans) works with any version.
+SERIES: Final = "0.19"
+
+
+def is_supported(version: str) -> bool:
+    """Whether a version is of the series measured."""
+    return version.split(".")[:2] == SERIES.split(".")
+
+
+_VERSION: Final = str(getattr(ruckig, "__version__", "unknown"))
+_SUPPORTED: Final = is_supported(_VERSION)
+
+
+def require_solver() -> None:
+    """Return if the installed solver is of the series measured.
+
+    Raises:
+        UnsupportedSolver: it is of another one.
+    """
+    if not _SUPPORTED:
+        raise UnsupportedSolver(_VERSION, SERIES)
+
+
+class Passing(NamedTuple):
+    """Where a motion is nearest to a point.
+
+    Attributes:
+        time: When, from the beginning of the motion [s].
+        distance: Euclidean distance in joint space [rad].
+    """
+
+    time: float
+    distance: float
+
+
+def passing(motion: PiecewiseCubic, point: Array) -> Passing:
+    """Return where `motion` comes nearest to `point` (n,) [rad].
+
+    The distance is that of a point of the path, so that the true one is never larger: what is
+    found to be within a tolerance is.
+    """
+    times = np.linspace(0.0, motion.duration, _SAMPLES)
+    apart = motion.sample(times)[0] - point
+    square = np.einsum("ij,ij->i", apart, apart)
+    index = int(square.argmin())
+    time, best = float(times[index]), float(square[index])
+    low, high = float(times[max(index - 1, 0)]), float(times[min(index + 1, _SAMPLES - 1)])
+    # At its ends a motion may rest, where the slope tells nothing.
+    t = time if low < time < high else 0.5 * (low + high)
+    for _ in range(_STEPS):
+        q, qd, qdd = motion.sample_one(t)
+        gap = q - point
+        apart_here, slope = float(gap @ gap), float(gap @ qd)
+        if apart_here < best:
+            time, best = t, apart_here
+        low, high = (t, high) if slope < 0.0 else (low, t)
+        bend = float(qd @ qd + gap @ qdd)
+        closer = t - slope / bend if bend > 0.0 else high
+        if not low < closer < high:  # Newton's step is none: halve what is left
+            closer = 0.5 * (low + high)
+        if abs(closer - t) <= _RESOLUTION * motion.duration:
+            break
+        t = closer
+    return Passing(time, float(np.sqrt(best)))
+
 
 How = Literal["stopped", "flown", "reduced"]
 

@@ -162,7 +162,7 @@ class StartMismatch(PlannerError):
 
 
 class NotBegun(PlannerError, RuntimeError):
-    """A player gives set-points only after `begin` told it where the arm is."""
+    """A player gives set-points only after `begin` was given where the arm is."""
 
     def __init__(self) -> None:
         super().__init__("advance() before begin(): the motion does not know where the arm is")

@@ -26,7 +26,7 @@ from planner.piecewise_cubic import Extrema
 
 # The result may exceed the truth by this share of `largest`; some 1e4 times what rounding does.
 _RESOLUTION = 1e-10
-# At first the function is told to this share; each division tells _PARTS² times more.
+# At first the function is known to this share; each division tells _PARTS² times more.
 _FIRST = 1e-3
 _PARTS = 8
 # Below this, quotients of bounds lose their digits; no motion is so small.
@@ -128,7 +128,7 @@ def harmonic_bounds(limits: JointLimits, offset: ArrayLike, harmonics: int) -> H
 class FourierSeries:
     """A sum of sines per joint (eq. 8), at rest at both ends if it has a ramp.
 
-    Before time 0 and after `duration` the joints are taken to rest where the motion begins and
+    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
     ends. Without a ramp that is a jump of velocity: such a series can be looked at and designed
     with, not executed.
 
@@ -227,7 +227,7 @@ class FourierSeries:
         return self._bounds(order, ramps and self.ramp > 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists; `from_dict` restores every bit, through JSON too."""
+        """Return lists; `from_dict` restores every bit, through JSON too."""
         return {
             "type": "fourier_series",
             "offset": self.offset.tolist(),

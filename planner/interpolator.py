@@ -19,8 +19,7 @@ from planner.limits import JointLimits
 from planner.motion_queue import CornerPlanner, MotionQueue
 from planner.move_services import MoveServices, MoveSettings
 from planner.rrs import Event, EventKind, OutputFormat, SpeedCorrection, Status, Step
-from planner.stop import slowing_bounds, within
-from planner.time_law import RateBounds, TimeLaw, admits
+from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 
 # A motion time [s], and a share of a period, shorter than this is rounding.
 _MOTION_TIME_ROUNDING = 1e-9
@@ -240,11 +239,11 @@ class Interpolator(MoveServices):
         return status
 
     def stop_motion(self) -> Status:
-        """Come to rest on the path, and stay, with targets kept, until told otherwise."""
+        """Come to rest on the path, and stay, with targets kept, until asked otherwise."""
         status = self._set()
         if status >= 0 and not self._held:
             self._held = True
-            self._stop_told = self._queue is None or not self._queue.ahead
+            self._stop_reported = self._queue is None or not self._queue.ahead
             self._run(self._stopping)
         return status
 
@@ -264,7 +263,7 @@ class Interpolator(MoveServices):
         if self._queue is None or not self._queue.ahead:
             self._held = False
         elif self._moving:
-            self._cancelling, self._stop_told = True, False
+            self._cancelling, self._stop_reported = True, False
             self._run(self._stopping)
         else:
             self._drop()
@@ -282,7 +281,7 @@ class Interpolator(MoveServices):
         self._override = 1.0
         self._elapsed = 0.0
         self._held = self._cancelling = False
-        self._stop_told = True
+        self._stop_reported = True
 
     def _rest_at(self, position: Array) -> None:
         """Begin to wait for targets, at rest."""
@@ -327,9 +326,9 @@ class Interpolator(MoveServices):
         return self._step(self._refuse(status, reason), ())
 
     def _stand(self, events: tuple[Event, ...]) -> Step:
-        """Return the step of an arm that was told to stop and is at rest."""
-        if not self._stop_told:
-            self._stop_told = True
+        """Return the step of an arm that was asked to stop and is at rest."""
+        if not self._stop_reported:
+            self._stop_reported = True
             target = self.get_current_target_id()
             assert target is not None
             events += (Event(EventKind.MOTION_STOPPED, target),)
@@ -348,7 +347,7 @@ class Interpolator(MoveServices):
             *(Event(EventKind.VIA_POINT_PASSED, passage.target_id) for passage in passed),
             Event(EventKind.MOTION_ENDED, last.target_id),
         )
-        self._stop_told = True
+        self._stop_reported = True
         step = self._step(Status.FINAL_STEP, events)
         self._rest_at(self._position)
         return step

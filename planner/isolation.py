@@ -2,7 +2,7 @@
 
 The solver behind the corners can crash its process on legal input. Whatever must not die, such
 as the process that supervises a live arm, plans through `plan_in_child` or `in_child`: the child
-is started once, kept warm, and started anew after a crash. Search workers (`planner.batch`) are
+is started once, held ready, and started anew after a crash. Search workers (`planner.batch`) are
 made of the same children.
 
 The child is a new interpreter, not a fork: it shares no locks, threads or memory with its parent
@@ -216,7 +216,7 @@ _warm: list[WorkerProcess] = []
 
 
 def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Return what a function of this package returns, called in a child process kept warm.
+    """Return what a function of this package returns, called in a child process held ready.
 
     Calls from several threads take turns. A call that takes longer than 10 s is ended.
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from planner.arrays import Array
 from planner.blocks import Block, LimitRows, Mask, Rows
-from planner.corners import FULL, NEAREST_STATE, REFUSALS, SOLVER_JERK
-from planner.solver import require_solver
+from planner.corners import FULL, NEAREST_STATE, REFUSALS, SOLVER_JERK, require_solver
 from planner.verify import jump_rounding
 
 # A join may miss its end by this share of what counts as rounding between two pieces.
@@ -59,7 +58,7 @@ class Solutions(NamedTuple):
     ends: Array
     times: Array
     durations: Array
-    answers: NDArray[np.object_]
+    found: NDArray[np.object_]
 
     def take(self, rows: Rows) -> Solutions:
         """Return some of the solutions, by index."""
@@ -68,7 +67,7 @@ class Solutions(NamedTuple):
             self.ends[rows],
             self.times[rows],
             self.durations[rows],
-            self.answers[rows],
+            self.found[rows],
         )
 
 
@@ -91,7 +90,7 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: LimitRows) -> S
     problem.max_jerk = [FULL * SOLVER_JERK] * n_joints
     solver = ruckig.Ruckig(n_joints)
     durations = np.full(len(starts), np.inf)
-    answers = np.full(len(starts), None, dtype=np.object_)
+    found = np.full(len(starts), None, dtype=np.object_)
     rows = np.flatnonzero(_askable(starts, bounds) & _askable(ends, bounds))
     tasks = zip(
         rows.tolist(),
@@ -108,8 +107,8 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: LimitRows) -> S
             solver.calculate(problem, answer)
         except REFUSALS:
             continue
-        durations[row], answers[row] = answer.duration * time, answer
-    return Solutions(starts, ends, times, durations, answers)
+        durations[row], found[row] = answer.duration * time, answer
+    return Solutions(starts, ends, times, durations, found)
 
 
 def _in_units(
@@ -119,7 +118,7 @@ def _in_units(
 
     Setting lists costs the solver's face a third of setting arrays.
     """
-    # Powers as plain floats have them: those of arrays may differ in the last digit.
+    # Powers as floats have them: those of arrays may differ in the last digit.
     square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
     way = bounds.jerk / SOLVER_JERK * cube[:, None]
     units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)
@@ -167,7 +166,7 @@ def _tables(solutions: Solutions, bounds: LimitRows) -> Block:
     profiles = np.array(
         [
             [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in answer.profiles[0]]
-            for answer in solutions.answers
+            for answer in solutions.found
         ]
     )
     lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]

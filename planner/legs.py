@@ -11,11 +11,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from planner.arrays import Array
-from planner.bounds import Allowance, Bounds
 from planner.commands import Fly, FlyDistance, FlyPercent, Move, Overrides
 from planner.corners import STOP, Corner, fly_by, fly_within
 from planner.errors import InvalidSetting
-from planner.limits import JointLimits
+from planner.limits import Allowance, Bounds, JointLimits
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.segments import StraightSegment
 

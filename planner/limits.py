@@ -3,13 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
+
+
+class Bounds(Protocol):
+    """Range and largest rates of every joint, each (n,)."""
+
+    @property
+    def lower(self) -> Array:
+        """Smallest position [rad]."""
+        ...
+
+    @property
+    def upper(self) -> Array:
+        """Largest position [rad]."""
+        ...
+
+    @property
+    def velocity(self) -> Array:
+        """Largest |velocity| [rad/s]."""
+        ...
+
+    @property
+    def acceleration(self) -> Array:
+        """Largest |acceleration| [rad/s²]."""
+        ...
+
+    @property
+    def jerk(self) -> Array:
+        """Largest |jerk| [rad/s³]."""
+        ...
+
+
+class Allowance(NamedTuple):
+    """`Bounds` made of others that were checked before, each (n,), SI units."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
 
 # No arm comes near; far beyond, the corners' solver has been seen to take its process with it.
 SMALLEST_RATE: Final = 1e-10

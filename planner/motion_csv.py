@@ -16,8 +16,8 @@ import numpy as np
 
 from planner.arrays import Array
 from planner.errors import InvalidSetting, InvalidTrajectory
+from planner.piecewise_cubic import Trajectory
 from planner.sampled import SampledTrajectory
-from planner.trajectory import Trajectory
 
 _TIME = "time [s]"
 _BOM = "\ufeff"  # spreadsheets begin their tables with it

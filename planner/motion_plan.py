@@ -9,9 +9,8 @@ from itertools import pairwise
 
 from planner.arrays import Array
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides
-from planner.corners import STOP, Corner, How
+from planner.corners import STOP, Corner, How, passing
 from planner.limits import JointLimits
-from planner.passing import passing
 from planner.piecewise_cubic import PiecewiseCubic
 
 

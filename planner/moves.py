@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
-from planner.bounds import Allowance, Bounds
 from planner.commands import (
     Fly,
     FlyDistance,
@@ -19,12 +19,46 @@ from planner.commands import (
     Termination,
 )
 from planner.corners import STOP, Corner
+from planner.errors import (
+    InvalidViaPoints,
+    NonFiniteViaPoint,
+    TooFewViaPoints,
+    ViaPointOutOfLimits,
+    WrongShape,
+)
 from planner.legs import Leg, Shares, between, corner, leg_with, shares_of
-from planner.limits import JointLimits
+from planner.limits import Allowance, Bounds, JointLimits
 from planner.motion_plan import MotionPlan, TargetPassage
 from planner.piecewise_cubic import PiecewiseCubic, concatenate
 from planner.verify import check_limits, check_smooth
-from planner.via_points import checked_via_points
+
+
+def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
+    """Return via points (n_points, n_joints) [rad] that a motion can be planned through.
+
+    Raises:
+        InvalidViaPoints: wrong shape, fewer than two, not finite, or out of limits.
+    """
+    try:
+        points = np.array(via_points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidViaPoints(f"via points are not a table of numbers: {error}") from error
+    if points.ndim != 2 or points.shape[1] != limits.n_joints:
+        raise WrongShape(points.shape, limits.n_joints)
+    if len(points) < 2:
+        raise TooFewViaPoints(len(points))
+    for index, joint in np.argwhere(~np.isfinite(points)).tolist():
+        raise NonFiniteViaPoint(index, joint, float(points[index, joint]))
+    for index, joint in np.argwhere((points < limits.lower) | (points > limits.upper)).tolist():
+        raise ViaPointOutOfLimits(
+            index,
+            joint,
+            float(points[index, joint]),
+            float(limits.lower[joint]),
+            float(limits.upper[joint]),
+        )
+    return points
+
 
 __all__ = [
     "plan_moves",
@@ -58,7 +92,7 @@ def plan_moves(
     Args:
         start: Where the arm rests (n,) [rad].
         moves: At least one, targets inside the limits.
-        limits: Limits, kept exactly (but for rounding) at every instant.
+        limits: Limits, respected exactly (but for rounding) at every instant.
         overrides: Shares that apply to all moves.
 
     Raises:

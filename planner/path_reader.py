@@ -8,8 +8,7 @@ import numpy as np
 
 from planner.arrays import Array
 from planner.fourier import FourierSeries
-from planner.piecewise_cubic import PiecewiseCubic
-from planner.trajectory import Trajectory
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory
 
 
 class PathReader:

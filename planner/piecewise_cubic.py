@@ -6,13 +6,34 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from planner.arrays import Array
 from planner.checked_data import DAMAGED, numbers, rows
 from planner.errors import InvalidTrajectory
+
+
+class Trajectory(Protocol):
+    """A motion of all joints as a function of time, at rest at both ends."""
+
+    @property
+    def duration(self) -> float:
+        """Length in time [s]."""
+        ...
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        ...
+
+    def sample(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return q [rad], qd [rad/s], qdd [rad/s²] at the times `t` (m,), each (m, n).
+
+        Outside [0, duration] the joints rest at the nearer end.
+        """
+        ...
 
 
 class Extrema(NamedTuple):
@@ -29,7 +50,7 @@ class Extrema(NamedTuple):
 class PiecewiseCubic:
     """A motion of constant jerks: per joint its own knots and cubic pieces between them.
 
-    Before time 0 and after `duration` the joints are taken to rest where the motion begins and
+    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
     ends: sampled there, the position is held and velocity and acceleration are zero.
 
     Attributes:
@@ -102,7 +123,7 @@ class PiecewiseCubic:
 
     @cached_property
     def _rows(self) -> list[tuple[list[float], list[list[float]]]]:
-        """Knots and coefficients as plain floats, which a single look-up reads fastest."""
+        """Knots and coefficients as floats, which a single look-up reads fastest."""
         return [
             (knots.tolist(), coefficients.tolist())
             for knots, coefficients in zip(self.knots, self.coefficients, strict=True)
@@ -151,7 +172,7 @@ class PiecewiseCubic:
         return PiecewiseCubic(tuple(knots), tuple(coefficients))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists; `from_dict` restores every bit, through JSON too."""
+        """Return lists; `from_dict` restores every bit, through JSON too."""
         return {
             "type": "piecewise_cubic",
             "knots": [knots.tolist() for knots in self.knots],

@@ -7,9 +7,8 @@ from numpy.typing import ArrayLike
 from planner.commands import FlyPercent, Move, checked_shares
 from planner.errors import InvalidSetting
 from planner.limits import JointLimits
-from planner.moves import planned
+from planner.moves import checked_via_points, planned
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.via_points import checked_via_points
 
 __all__ = ["plan", "checked_via_points"]
 
@@ -23,7 +22,7 @@ def plan(
 
     Args:
         via_points: Positions (n_points, n_joints) [rad], at least two, inside the limits.
-        limits: Limits, kept exactly (but for rounding) at every instant.
+        limits: Limits, respected exactly (but for rounding) at every instant.
         speed: Share of each joint's velocity limit to use, in (0, 1], a number or (n,).
         fly: Share of each deceleration that the next acceleration overlaps, from 0 (stop at
             every via point) to 1 (the corner begins where the deceleration would).

@@ -1,4 +1,4 @@
-"""A plan as plain data: the moves that were asked for, and the motion that came of them.
+"""A plan as data: the moves that were asked for, and the motion that came of them.
 
 `PlanFile.to_dict` is what an archive carries (JSON, SI units); `to_toml` is the same for people,
 with angles in degrees, and restores the same bits.
@@ -148,7 +148,7 @@ class PlanFile:
         return replace(planned, trajectory=self.trajectory)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists in SI units; `from_dict` restores every bit, through JSON too."""
+        """Return lists in SI units; `from_dict` restores every bit, through JSON too."""
         data: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,

@@ -11,10 +11,8 @@ from planner.arrays import Array
 from planner.errors import InvalidSetting, LimitExceeded, NotBegun, StartMismatch
 from planner.limits import JointLimits
 from planner.path_reader import PathReader
-from planner.piecewise_cubic import PiecewiseCubic
-from planner.stop import slowing_bounds, within
-from planner.time_law import RateBounds, TimeLaw, admits
-from planner.trajectory import Trajectory
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory
+from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 from planner.verify import position_rounding
 
 # A last period this much shorter than the others is rounding, not motion.

@@ -52,7 +52,7 @@ class MotionType(IntEnum):
 
 
 class OutputFormat(IntEnum):
-    """What a step is told in."""
+    """What a step reports."""
 
     JOINT = 0
     CARTESIAN = 1
@@ -121,7 +121,7 @@ class Step(NamedTuple):
         position: Set-point (n,) [rad], read-only; the last one where there is no step, NaN where
             there never was one.
         elapsed_time: Time since the arm last stood at the end of a motion [s]; the end of a
-            motion is told to a fraction of a step.
+            motion is known to a fraction of a step.
         joint_limits: Bit j is set while joint j stands at an end of its range.
         events: What happened since the step before, in order.
     """

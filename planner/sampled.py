@@ -21,7 +21,7 @@ class SampledTrajectory:
     2.5 times the limit for less than two periods, whatever the period; what acceleration,
     velocity and position are off by falls with the first, second and third power of the period.
 
-    Before time 0 and after `duration` the joints are taken to rest where the motion begins and
+    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
     ends.
 
     Attributes:

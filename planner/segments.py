@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from planner.arrays import Array
-from planner.bounds import Bounds
+from planner.limits import Bounds
 from planner.piecewise_cubic import PiecewiseCubic
 
 

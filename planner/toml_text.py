@@ -1,4 +1,4 @@
-"""Plain data as TOML for people, to the last bit: angles in degrees, one line per list.
+"""Data as TOML for people, to the last bit: angles in degrees, one line per list.
 
 A field of angles is an `Angles` in the data and a name that ends in `_deg` in the text. Numbers are
 read as `Decimal`, which keeps angles exact.

@@ -7,10 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from planner.arrays import Array
-from planner.bounds import Bounds
 from planner.errors import LimitExceeded, NotSmooth
-from planner.piecewise_cubic import Extrema, PiecewiseCubic
-from planner.trajectory import Trajectory
+from planner.limits import Bounds
+from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 
 # Rounding, not licence: a position may leave its range by this share of the range's size, and
 # neighbouring pieces may differ by this share of the limit of the quantity.
@@ -103,7 +102,7 @@ def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
 
     Durations (...) [s] and limits (..., n) are of one motion or of many.
     """
-    # A knot is told no finer than the clock allows: late in a long motion that shows.
+    # A knot is reported no finer than the clock allows: late in a long motion that shows.
     tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
     return np.stack(
         (

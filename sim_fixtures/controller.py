@@ -44,11 +44,10 @@ from sim_fixtures.effects import UnmodelledEffects
 from sim_fixtures.errors import SettingError
 from sim_fixtures.layout import Layout
 from sim_fixtures.mishaps import Mishap
-from sim_fixtures.nominal_model import NominalModel
 from sim_fixtures.own_motion import OwnMotion
 from sim_fixtures.plant import Plant
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
-from sim_fixtures.servo import Servo
+from sim_fixtures.servo import NominalModel, Servo
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
 from sim_fixtures.truth import PlantTruth, standard_parameters
 
@@ -110,7 +109,7 @@ class Targets:
         self._break_off()
 
     def _break_off(self) -> None:
-        """The drive was lost: an own motion under way is not taken up again."""
+        """The drive was lost: an own motion under way is not resumed."""
         self._broken_off = self._broken_off or self._moving
         self._moving = False
 
@@ -229,7 +228,7 @@ class SimulatedController:
         truth: planted rotor inertias, friction and inertias of links.
         settings: as given.
         period: cycle [s].
-        rejected_replies: replies that were not taken: wrong number, length or content.
+        rejected_replies: replies that were not accepted: wrong number, length or content.
     """
 
     def __init__(

@@ -68,7 +68,7 @@ class UdpFarEnd:
         trouble: why it refused the last one, in words; "" if it never did.
 
     Raises:
-        FarEndError: no such host, or the local port is taken.
+        FarEndError: no such host, or the local port is in use.
     """
 
     def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:

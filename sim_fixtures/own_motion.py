@@ -44,7 +44,7 @@ class OwnMotion:
 
     Attributes:
         position, velocity: set-point of the present tick, (n,) [rad], [rad/s].
-        finished: the last posture is reached, or the motion was told to end.
+        finished: the last posture is reached, or the motion was asked to end.
         at_rest: no move is under way.
     """
 
@@ -64,7 +64,7 @@ class OwnMotion:
             speed: greatest speed of each joint, (n,) [rad/s].
             period: cycle [s].
             dwell: rest in each posture [s].
-            repeats: go back through the list at its end, and forth again, until told to end.
+            repeats: go back through the list at its end, and forth again, until asked to end.
 
         Raises:
             SettingError: a posture of another size, or a speed that is not a finite number above 0.

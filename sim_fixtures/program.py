@@ -2,7 +2,7 @@
 
 It plays the usual loop program: start the link, switch the drive on, open all axes (one after the
 other), wait until the PC wants out, close, pause, open again. It knows nothing of packets, motors
-or robots; once a cycle it is told what the PC's answer asked for.
+or robots; once a cycle it receives what the PC's answer asked for.
 
     START -> DRIVE_OFF -> DRIVING_ON -> CLOSED -> OPENING -> OPEN -> CLOSING -+
                   ^           ^           ^                                   |
@@ -99,7 +99,7 @@ class LoopProgram:
         phase: the present one.
         powered: whether the drive is on (status DRIVE_ON).
         braked: whether the brakes are closed.
-        listening: whether targets of open axes are taken from the PC.
+        listening: whether targets of open axes are read from the PC.
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
         intervals: how often all axes have been open.

@@ -206,7 +206,7 @@ def serve(
         patience: see `request`, s.
         stretch: a cycle without an answer is made longer by up to so many s until one comes. No
             real controller does that; it is for PCs that are held up now and then. Once the end is
-            wished, a PC that let such a wait pass counts as gone until it answers again.
+            requested, a PC that let such a wait pass counts as gone until it answers again.
     """
     clock = clock if clock is not None else MonotonicClock()
     server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
@@ -239,7 +239,7 @@ class _Server:
         self._deserted = False
 
     def knock(self, request: Callable[[], Request]) -> bool:
-        """Repeat the first packet until it is answered; False if told to end before."""
+        """Repeat the first packet until it is answered; False if asked to end before."""
         packet = self._peer.next_packet()
         if packet is None:
             self.tally.ended = True
@@ -259,7 +259,7 @@ class _Server:
     def _patient_reply(
         self, packet: bytes, until: float, request: Callable[[], Request]
     ) -> bytes | None:
-        """An answer to the first packet, in steps short enough to notice a wish to end."""
+        """An answer to the first packet, in steps short enough to notice a request to end."""
         while request() is Request.GO_ON and (now := self._clock.now()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self._watch(self.tally)

@@ -44,7 +44,7 @@ class ServoSettings:
         current_lag: time constant of the current loop, s.
         model_error: range of the relative errors of the built-in dynamic model; each link's
             inertia, each rotor and each friction figure is off by one of them, either way.
-        deadband_counts: encoder counts within which a standing axis stops integrating.
+        deadband_counts: encoder counts within which a resting axis stops integrating.
     """
 
     position_gain: float = 20.0
@@ -105,7 +105,7 @@ class ControllerSettings:
         own_motion: joint angles [rad] of postures that the controller's own program moves to, one
             after the other, with closed axes; then it ends the session. In a mode in which the
             PC only corrects, it moves while the axes are open.
-        own_motion_repeats: go to and fro through these postures until told to finish.
+        own_motion_repeats: go to and fro through these postures until asked to finish.
         own_speed: of those moves, as a fraction of the URDF's velocity limits.
         version: major, minor, build in the init packet.
     """

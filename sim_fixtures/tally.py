@@ -10,7 +10,7 @@ REMEMBERED: Final = 1000
 
 
 class Histogram:
-    """Durations in bins of 5 µs up to 50 ms; the largest is kept as it is."""
+    """Durations in bins of 5 µs up to 50 ms; the largest is left as it is."""
 
     BIN: Final = 5e-6
     BINS: Final = 10_000
@@ -45,7 +45,7 @@ class ServeSummary:
         knocks: how often the first packet was sent until somebody answered.
         replies: answers the controller took, at most one a cycle.
         missed: cycles that no valid answer came in.
-        late: answers that came after their cycle; not taken.
+        late: answers that came after their cycle; not accepted.
         surplus: further answers to a cycle that had been answered.
         rejected: answers of wrong length, number or content.
         stretched: cycles made longer than a period to wait for their answer.

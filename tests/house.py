@@ -27,11 +27,24 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "banned names": 0,
     "functions over 60 lines": None,
 }
+CEILINGS: Final[Mapping[str, int]] = {
+    "product lines": 101_520,
+    "product files": 510,
+    "test lines": 94_392,
+    "test files": 521,
+    "import circles": 0,
+    "imports inside functions": 38,
+    "files with one importer": 31,
+    "banned names": 0,
+    "functions over 60 lines": 39,
+}
+"""Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {
     *("kept", "told", "taken", "answers", "announced", "standing", "sight", "wish", "doubts"),
     *("strangers", "plain", "ways", "drawn", "listed", "counted", "settling"),
 }
 _LONG: Final = 60
+_LINES: Final = ("product lines", "test lines")
 
 
 @dataclass(frozen=True)
@@ -177,31 +190,44 @@ def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
             yield from _loaded(node)
 
 
-def main() -> None:
-    """Print the table, or one row in full."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--list", choices=[name for name in TARGETS if "lines" not in name[-6:]])
-    wanted = parser.parse_args().list
-    sources = Sources.read()
-    product = [*sources.files.values()]
-    tests = sorted((ROOT / "tests").rglob("*.py"))
-    listed = {
-        "product files": [str(path.relative_to(ROOT)) for path in product],
-        "test files": [str(path.relative_to(ROOT)) for path in tests],
+def lists(sources: Sources) -> dict[str, list[str]]:
+    """Each row of the table that is not lines, in full."""
+    return {
+        "product files": [str(path.relative_to(ROOT)) for path in sources.files.values()],
+        "test files": [str(path.relative_to(ROOT)) for path in _tests()],
         "import circles": sources.circles(),
         "imports inside functions": sources.inner_imports(),
         "files with one importer": sources.single_importers(),
         "banned names": sources.banned_names(),
         "functions over 60 lines": sources.long_functions(),
     }
+
+
+def figures(sources: Sources) -> dict[str, int]:
+    """The table."""
+    return {name: len(one) for name, one in lists(sources).items()} | {
+        "product lines": _lines([*sources.files.values()]),
+        "test lines": _lines(_tests()),
+    }
+
+
+def main() -> None:
+    """Print the table, or one row in full."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--list", choices=[name for name in TARGETS if name not in _LINES])
+    wanted = parser.parse_args().list
+    sources = Sources.read()
     if wanted is not None:
-        print(*listed[wanted], sep="\n")
+        print(*lists(sources)[wanted], sep="\n")
         return
-    figures = {name: len(lines) for name, lines in listed.items()}
-    figures["product lines"] = _lines(product)
-    figures["test lines"] = _lines(tests)
-    for name, target in TARGETS.items():
-        print(f"{name:26}{figures[name]:8}" + ("" if target is None else f"   target {target}"))
+    print(f"{'':26}{'now':>8}{'ceiling':>9}{'target':>8}")
+    for name, figure in figures(sources).items():
+        target = TARGETS[name]
+        print(f"{name:26}{figure:8}{CEILINGS[name]:9}{'' if target is None else target:>8}")
+
+
+def _tests() -> list[Path]:
+    return sorted((ROOT / "tests").rglob("*.py"))
 
 
 def _lines(paths: list[Path]) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from drivers.exchange.control import ArchiveState, ControlBlock, Ended
-from drivers.exchange.errors import ExchangeError, WithdrawnError
 from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.exchange.loop import exchange
 from drivers.exchange.notices import (
@@ -19,7 +18,7 @@ from drivers.exchange.notices import (
     OverrideRefused,
     ResumeRefused,
 )
-from drivers.exchange.process import ExchangeProcess, ExchangeStatus
+from drivers.exchange.process import ExchangeError, ExchangeProcess, ExchangeStatus, WithdrawnError
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import (

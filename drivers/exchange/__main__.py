@@ -36,7 +36,7 @@ CRASHED: Final = 70
 def main(arguments: Sequence[str]) -> int:
     """Run the exchange over descriptors: channel, settings, ring, events, control block, packets.
 
-    The last one is there only if raw packets are to be kept.
+    The last one is there only if raw packets are to be stored.
     """
     channel_fd, settings_fd, ring_fd, event_fd, control_fd, *packets_fd = map(int, arguments)
     # Whoever started this may be interrupted or hung up on while an arm moves.

@@ -13,10 +13,10 @@ from drivers.exchange import memory
 from drivers.exchange.latency import BINS
 
 STALE: Final = 0.5
-"""s after which a heartbeat is taken for that of a dead process."""
+"""s after which a heartbeat counts as that of a dead process."""
 PATIENCE: Final = 5.0
 """The same where no motion was requested: a busy computer may keep a supervisor waiting, and the
-death of one is told by its end of the pipe at once."""
+death of one is shown by its end of the pipe at once."""
 _WORDS: Final = 128
 _LATENCIES: Final = 64
 

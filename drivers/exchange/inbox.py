@@ -46,11 +46,11 @@ class Inbox:
     """The exchange's end; never waits.
 
     Attributes:
-        taken: id of the program taken last.
+        identity: id of the program received last.
     """
 
     def __init__(self, channel: socket.socket) -> None:
-        self.taken = 0
+        self.identity = 0
         self._channel = channel
 
     def hung_up(self) -> bool:
@@ -74,21 +74,21 @@ class Inbox:
         if len(message) != _IDENTITY.size or not ancillary:
             return None
         (fd,) = _DESCRIPTOR.unpack(ancillary[0][2])
-        self.taken = _IDENTITY.unpack(message)[0]
-        return HandedOver(self.taken, fd)
+        self.identity = _IDENTITY.unpack(message)[0]
+        return HandedOver(self.identity, fd)
 
     def read(self) -> None:
-        """Say that the program taken last was read."""
+        """Say that the program received last was read."""
         self._say(READ)
 
     def answer(self, refusal: RequestError | None) -> None:
-        """Say what became of the program taken last."""
+        """Say what became of the program received last."""
         self._say(None if refusal is None else (refusal.state, refusal.reason))
 
-    def _say(self, told: str | tuple[str, str] | None) -> None:
+    def _say(self, message: str | tuple[str, str] | None) -> None:
         # Without a supervisor nobody wants to know.
         with contextlib.suppress(OSError):
-            self._channel.send(pickle.dumps((self.taken, told)), socket.MSG_DONTWAIT)
+            self._channel.send(pickle.dumps((self.identity, message)), socket.MSG_DONTWAIT)
 
 
 def hand_over(channel: socket.socket, identity: int, source: MotionSource) -> None:

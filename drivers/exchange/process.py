@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.errors import RequestError
+from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log, memory
-from drivers.exchange.errors import ExchangeError, WithdrawnError
 from drivers.exchange.event_log import EventReader
 from drivers.exchange.inbox import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.notices import ExchangeEvent
@@ -25,6 +24,15 @@ from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.motion_source import MotionSource
 from drivers.states import State
+
+
+class ExchangeError(DriverError):
+    """The exchange process could not be started, does not answer, or is gone."""
+
+
+class WithdrawnError(RequestError):
+    """A motion was handed over, and not wanted any more before it could begin."""
+
 
 START_TIMEOUT: Final = 60.0
 """s until a process that was started has opened its link; imports may be slow on a cold disk."""
@@ -87,7 +95,7 @@ class ExchangeProcess:
         realtime: what the system granted it.
         notes: options of the link that the system refused, in words.
         ring_fd: memory of the cycle records, for a `RingReader`.
-        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not kept.
+        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not stored.
         event_fd: memory of the events, for an `EventReader`.
         control_fd: memory of the control block, for a `ControlBlock`.
     """
@@ -174,17 +182,17 @@ class ExchangeProcess:
             raise ExchangeError(f"the exchange process is gone: {error}") from error
         self._control.program_offered = identity
         try:
-            told = self._answer_to(identity)
-            if told == READ:
+            reply = self._answer_to(identity)
+            if reply == READ:
                 self._permit(identity, wanted)
-                told = self._answer_to(identity, lambda: self._permit(identity, wanted))
+                reply = self._answer_to(identity, lambda: self._permit(identity, wanted))
         except BaseException:
             # Nobody waits for this motion any more: it must not begin after all, nor go on.
             self._control.program_id = -identity
             self.stop()
             raise
-        if told is not None:
-            state, reason = told
+        if reply is not None:
+            state, reason = reply
             raise (WithdrawnError if reason == WITHDRAWN else RequestError)(state, reason)
         return identity
 
@@ -289,9 +297,9 @@ class ExchangeProcess:
     def _answer_to(self, identity: int, meanwhile: Callable[[], None] = _nothing) -> Any:
         """What is said of this program next; the answer to one given up may still come before."""
         while True:
-            answered, told = self._answer(ANSWER_TIMEOUT, meanwhile)
+            answered, reply = self._answer(ANSWER_TIMEOUT, meanwhile)
             if answered == identity:
-                return told
+                return reply
 
     def _answer(self, timeout: float, meanwhile: Callable[[], None] = _nothing) -> Any:
         """The next message of the exchange; `meanwhile` is called ten times a second."""

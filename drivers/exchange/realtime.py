@@ -45,7 +45,7 @@ class RealTimeReport:
     Attributes:
         scheduling: in words.
         memory_locked: whether every page, also of memory asked for later, stays in memory.
-        cpu_awake: whether the processors are kept out of slow idle states.
+        cpu_awake: whether the processors are held out of slow idle states.
         refused: one sentence per refusal, with its remedy.
     """
 

@@ -1,4 +1,4 @@
-"""Packets as they are taken from a link, and what is left of a pile of them."""
+"""Packets as they are read from a link, and what is left of a pile of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.exchange.listening import listens_to_all
 from drivers.packets import (
     AXIS_LENGTH,
     HEADER_LENGTH,
@@ -19,8 +18,53 @@ from drivers.packets import (
     is_init,
 )
 from drivers.session import Session
-from drivers.states import HAS_SET_POINTS
+from drivers.states import HAS_SET_POINTS, State
 from drivers.transports.base import Stamped, Transport
+
+FALLEN_SILENT: Final = 1.0
+"""s without a packet that gets an answer, after which another sender may begin the session."""
+
+
+def listens_to_all(session: Session) -> bool:
+    """Whether there is no session that a change of port could break.
+
+    Before the init packet there is none, and a lost one goes on with the first packet that gets
+    an answer: a stray datagram must not decide who is listened to.
+    """
+    return session.state is State.SYNC or session.deadline == math.inf
+
+
+class Listening:
+    """Lets the link forget its peer where that one does not lead to a session.
+
+    Before the init packet, whoever gets answers is listened to alone until it sends something
+    that gets none, or falls silent: another host cannot take over a start that is going on, and one
+    that does not go on cannot keep the controller out.
+    """
+
+    def __init__(self, transport: Transport, session: Session) -> None:
+        self._transport = transport
+        self._session = session
+        self._answered_at = -math.inf
+
+    def heard(self, answered: bool) -> None:
+        """A packet came and was answered, or was not."""
+        if not listens_to_all(self._session):
+            return
+        if answered:
+            self._answered_at = self._transport.now
+        else:
+            self._transport.forget_peer()
+
+    def heard_nothing(self) -> None:
+        """Nothing came for a while."""
+        session, transport = self._session, self._transport
+        if not listens_to_all(session):
+            return
+        starting = session.state is State.SYNC
+        if not starting or transport.now - self._answered_at >= FALLEN_SILENT:
+            transport.forget_peer()
+
 
 POLL: Final = 0.1
 """s, longest wait for a packet."""
@@ -110,13 +154,15 @@ class Intake:
         held_up = late or now - heard > HELD_UP * period or arrived < due
         # Where nobody in particular is listened to, packets of several may wait.
         if held_up and not listens_to_all(session):
-            return self._newest(self._told(packet, stamp, now, self._kept_ages()), period)
-        return (self._told(packet, stamp, now, transport.ages),)
+            return self._newest(self._arrival(packet, stamp, now, self._copied_ages()), period)
+        return (self._arrival(packet, stamp, now, transport.ages),)
 
     def _stamp(self) -> float | None:
         return None if self._stamped is None else self._stamped.arrived
 
-    def _told(self, packet: bytes, stamp: float | None, now: float, ages: Ages | None) -> Arrival:
+    def _arrival(
+        self, packet: bytes, stamp: float | None, now: float, ages: Ages | None
+    ) -> Arrival:
         if stamp is None:
             return Arrival(packet, now, ages, False)
         return Arrival(packet, stamp, ages, True)
@@ -147,25 +193,29 @@ class Intake:
             stamp, now = self._stamp(), transport.now
             if stamp is None:
                 self._guess(following, before, now, period)
-            pile.add(self._told(following, stamp, now, self._kept_ages()))
-        kept, left_out = pile.kept, pile.left_out
-        if left_out and self._too_old(kept, period):
-            kept, left_out = (), left_out + 1
+            pile.add(self._arrival(following, stamp, now, self._copied_ages()))
+        arrivals, left_out = pile.arrivals, pile.left_out
+        if left_out and self._too_old(arrivals, period):
+            arrivals, left_out = (), left_out + 1
         self._session.discarded("late", left_out)
-        return kept
+        return arrivals
 
-    def _too_old(self, kept: tuple[Arrival, ...], period: float) -> bool:
+    def _too_old(self, arrivals: tuple[Arrival, ...], period: float) -> bool:
         """Whether a pile, of one kind, is that of a queue that had no room for the newest.
 
         One packet alone is none: its controller may be waiting for the answer. Packets of several
         kinds tell the session something, however old they are.
         """
-        if len(kept) != 1 or not kept[0].stamped or self._session.state not in HAS_SET_POINTS:
+        if (
+            len(arrivals) != 1
+            or not arrivals[0].stamped
+            or self._session.state not in HAS_SET_POINTS
+        ):
             return False
-        age = self._transport.now - kept[0].arrived
+        age = self._transport.now - arrivals[0].arrived
         return age > max(TOO_OLD * period, _TOO_OLD_AT_LEAST)
 
-    def _kept_ages(self) -> Ages | None:
+    def _copied_ages(self) -> Ages | None:
         """Ages of the packet received last; the link may reuse its array for the next."""
         ages = self._transport.ages
         return None if ages is None else ages.copy()
@@ -182,7 +232,7 @@ class _Pile:
             stands in those makes no kind.
 
     Attributes:
-        left_out: packets that were not kept; repetitions of one that was do not count.
+        left_out: packets that were not stored; repetitions of one that was do not count.
     """
 
     def __init__(self, n_axes: int) -> None:
@@ -192,7 +242,7 @@ class _Pile:
         self._sessions = 0
 
     @property
-    def kept(self) -> tuple[Arrival, ...]:
+    def arrivals(self) -> tuple[Arrival, ...]:
         """In order."""
         return tuple(arrival for _, arrival in self._newest)
 

@@ -50,7 +50,7 @@ class _Rest:
 
 
 class Rehearsal:
-    """A session of an arm and the controller it is told there is; `cycle` runs one packet.
+    """A session of an arm and the controller it assumes; `cycle` runs one packet.
 
     Attributes:
         state: of the session; `State.OPEN` from the second cycle on.
@@ -63,7 +63,7 @@ class Rehearsal:
         self._axes = CyclicPacket.zeros(1, n).axes
         self._axes["d"][:, 0] = self._axes["d"][:, 2] = drive_train.motor_revolutions(position)
         self._number = INIT_NUMBER
-        init = InitPacket.build(n, round(1000.0 * period), _announced(drive_train, limits))
+        init = InitPacket.build(n, round(1000.0 * period), _init_values(drive_train, limits))
         self._session.reply(init.encode(), 0.0)
         self._session.request(_Rest(position))
 
@@ -81,7 +81,7 @@ class Rehearsal:
         return self._session.reply(packet, 0.0)
 
 
-def _announced(drives: DriveTrain, limits: GuardLimits) -> Mapping[str, ArrayLike]:
+def _init_values(drives: DriveTrain, limits: GuardLimits) -> Mapping[str, ArrayLike]:
     """What the controller of this arm would say of it."""
     return {
         "gear_ratio": drives.gear_ratio,

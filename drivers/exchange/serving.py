@@ -6,14 +6,14 @@ import math
 import pickle
 import socket
 import time
+from collections.abc import Iterable
 from typing import Final, Protocol
 
 import numpy as np
 
 from drivers.errors import DriverError, RequestError
-from drivers.events import Event, MotionEnded
+from drivers.events import AnswersLost, Event, GapSeen, LinkLost, MotionEnded, PacketRejected
 from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock, Ended
-from drivers.exchange.digest import Digest
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import WITHDRAWN, Inbox
 from drivers.exchange.latency import bin_of
@@ -36,6 +36,66 @@ from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
 
+EVERY: Final = 0.1
+"""s between two events of the same sort."""
+_Mergeable = PacketRejected | GapSeen | AnswersLost
+
+
+class Digest:
+    """Lets one rejection of each kind, one gap and one loss of answers through each 0.1 s.
+
+    Those that follow sooner are added up; their sum, with the cycle of the last, comes when the
+    time is over. Everything else passes at once. Before the end of a motion or of the link comes
+    what was held back till then.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[str, _Mergeable] = {}
+        self._quiet_until: dict[str, float] = {}
+
+    def take(self, events: Iterable[Event], now: float) -> list[Event]:
+        """What is to be reported at this moment, in order."""
+        released: list[Event] = []
+        for event in events:
+            if isinstance(event, PacketRejected | GapSeen | AnswersLost):
+                sort = _sort(event)
+                held = self._held.get(sort)
+                self._held[sort] = event if held is None else _sum(held, event)
+                self._release(sort, now, released)
+            else:
+                if isinstance(event, MotionEnded | LinkLost):
+                    released += self.rest()
+                released.append(event)
+        for sort in tuple(self._held):
+            self._release(sort, now, released)
+        return released
+
+    def rest(self) -> list[Event]:
+        """All that is held back."""
+        held: list[Event] = list(self._held.values())
+        self._held.clear()
+        return held
+
+    def _release(self, sort: str, now: float, released: list[Event]) -> None:
+        if now >= self._quiet_until.get(sort, -math.inf):
+            released.append(self._held.pop(sort))
+            self._quiet_until[sort] = now + EVERY
+
+
+def _sort(event: _Mergeable) -> str:
+    return f"rejected: {event.kind}" if isinstance(event, PacketRejected) else type(event).__name__
+
+
+def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
+    """Of two of the same sort."""
+    if isinstance(earlier, PacketRejected) and isinstance(later, PacketRejected):
+        return PacketRejected(later.kind, earlier.count + later.count, later.why)
+    if isinstance(earlier, GapSeen) and isinstance(later, GapSeen):
+        return GapSeen(earlier.missed + later.missed, later.cycle)
+    assert isinstance(earlier, AnswersLost) and isinstance(later, AnswersLost)
+    return AnswersLost(earlier.count + later.count, later.cycle)
+
+
 STOPPED: Final = "the supervisor asked for a stop"
 ORPHAN_LINGER: Final = 2.0
 """s that packets are answered, after the axes were closed, for nobody."""
@@ -44,7 +104,7 @@ FINISH_LINGER: Final = 1.0
 ARM_MOVED: Final = 5e-4
 """rad; more than an encoder's noise, less than any motion makes in `ARM_RESTS`."""
 ARM_RESTS: Final = 1.0
-"""s without motion after which an arm is taken to be at rest."""
+"""s without motion after which an arm is assumed to be at rest."""
 _POSITION: Final = MEASURED.index("position")
 _SLOW_EVERY: Final = 32
 """Packets between two looks at what need not be looked at in each cycle."""
@@ -57,7 +117,7 @@ _MAY_BE_OPEN: Final = frozenset(
 
 
 class Terminated(Protocol):
-    """True once the process was told to end: stop on the path, leave open mode, end."""
+    """True once the process was asked to end: stop on the path, leave open mode, end."""
 
     def __bool__(self) -> bool: ...
 
@@ -157,7 +217,7 @@ class Serving:
         # In a later call than it was read, so that a stop in between is seen first.
         if self._offered is not None:
             self._take_program(self._offered)
-        if control.program_offered != self._inbox.taken:
+        if control.program_offered != self._inbox.identity:
             self._read_program(now)
         if session.requested and self._needs_archive:
             trouble = self._archive_trouble()
@@ -171,7 +231,7 @@ class Serving:
         # Read after `program_id`, which the supervisor writes after a beat: this is never older.
         silent = self._supervisor.quiet()
         if self._terminated:
-            self._leave("the exchange process was told to terminate", ORPHAN_LINGER)
+            self._leave("the exchange process was asked to terminate", ORPHAN_LINGER)
         elif silent > (STALE if self._session.requested else PATIENCE):
             self._orphan(NO_SUPERVISOR)
         elif self._control.finish:
@@ -230,7 +290,7 @@ class Serving:
 
     def _take_program(self, source: MotionSource) -> None:
         """Request the program that was read, once it may begin, and say what became of it."""
-        control, identity = self._control, self._inbox.taken
+        control, identity = self._control, self._inbox.identity
         try:
             if self._withdrawn(identity):
                 raise RequestError(self._state, WITHDRAWN)
@@ -267,9 +327,9 @@ class Serving:
         """Say what became of the program taken last."""
         self._offered = None
         if refusal is None:
-            self._control.program_accepted = self._inbox.taken
+            self._control.program_accepted = self._inbox.identity
         else:
-            self._control.program_refused = self._inbox.taken
+            self._control.program_refused = self._inbox.identity
         self._inbox.answer(refusal)
 
     def _report(self, now: float) -> None:

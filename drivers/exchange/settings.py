@@ -1,4 +1,4 @@
-"""What an exchange process is told before it begins."""
+"""What an exchange process receives before it begins."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange.punctuality import MAX_LATE
+from drivers.exchange.loop import MAX_LATE
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportSpec
@@ -24,8 +24,8 @@ class ExchangeSettings:
         period: the controller's cycle, s.
         session: further keyword arguments of `Session`.
         realtime: what to ask the system for.
-        ring_capacity: cycle records kept for whoever archives them.
-        packets: raw packets kept for whoever archives them; 0: none, and the link is as it is.
+        ring_capacity: cycle records stored for whoever archives them.
+        packets: raw packets stored for whoever archives them; 0: none, and the link is as it is.
         preload: modules imported before the link opens, so that programs made of their classes
             are read quickly.
         needs_archive: whether a motion is accepted and goes on only while the archive process

@@ -159,7 +159,7 @@ class RingReader(_RowReader):
     Args:
         fd: descriptor of the memory.
         n_joints: of the records.
-        acknowledge: whether the writer is told how far this reader got, so that it counts what
+        acknowledge: whether the writer learns how far this reader got, so that it counts what
             it overwrites; one reader at a time may.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A link whose packets are kept as they were, both ways."""
+"""A link whose packets are left as they were, both ways."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TappedTransport:
     A packet reaches the sink when its answer is out, before the next one is waited for: nothing
     but its place in a list is taken note of between the two. Its cycle is known by then; packets
     that had piled up and were left out have that of the one answered, but for those of a pile of
-    more than `MOST_WAITING`: they are not kept waiting, and have that of the one answered before.
+    more than `MOST_WAITING`: they are not delayed, and have that of the one answered before.
 
     Args:
         transport: the link.

@@ -63,7 +63,7 @@ class UdpSpec:
         """Bind the port.
 
         Raises:
-            TransportError: address unknown, port taken, or not permitted.
+            TransportError: address unknown, port in use, or not permitted.
         """
         return UdpTransport(self.peer_host, self.port, self.bind)
 
@@ -90,7 +90,7 @@ class UdpTransport:
             clock was set since the last one, when it was received.
 
     Raises:
-        TransportError: address unknown, port taken, or not permitted.
+        TransportError: address unknown, port in use, or not permitted.
     """
 
     def __init__(self, peer_host: str, port: int, bind: str = "0.0.0.0") -> None:

@@ -215,7 +215,7 @@ class _Cursor:
 
     def __init__(self, message: bytes) -> None:
         if message[:4] != ENCAPSULATION:
-            raise LayoutError("the message is not plain little-endian CDR")
+            raise LayoutError("the message is not little-endian CDR")
         self._data = message
         self._at = 4
 

@@ -1,7 +1,7 @@
 """The messages of a decompressed chunk, found all at once.
 
 A recording repeats itself: each cycle adds the same few messages of the same lengths. Once that
-pattern is known, what follows is taken for a matrix with a pattern per row, and that is *verified*:
+pattern is known, what follows is read as a matrix with a pattern per row, and that is *verified*:
 opcode, length and channel at each place where a message should begin. That is the whole walk, done
 in a few array operations. Anything else in between is walked record by record.
 """
@@ -115,7 +115,7 @@ class KnownChannels:
     """Schemas and channels by their numbers; what is known once stays what it is.
 
     Were a number or a topic to change its meaning in mid-file, samples of one channel would be
-    taken for those of another.
+    mistaken for those of another.
     """
 
     def __init__(self, known: KnownChannels | None = None) -> None:

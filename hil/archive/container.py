@@ -311,7 +311,7 @@ def chunk_data(
 
 
 def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompressor) -> bytes:
-    """Decompress to at most one byte more than announced: a corrupt frame fills no memory."""
+    """Decompress to at most one byte more than declared: a corrupt frame fills no memory."""
     size = chunk.uncompressed_size
     try:
         if chunk.compression == "zstd":

@@ -32,7 +32,7 @@ from pydantic import (
 )
 
 from hil.errors import ArchiveError
-from hil.whole_number import whole_number
+from hil.reading import whole_number
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"
@@ -310,7 +310,7 @@ class ArchiveOutcome(BaseModel):
         samples, events, packets: how many were written.
         first_cycle, last_cycle: of the controller.
         lost_packets, records_lost, events_lost: what the link and this PC lost.
-        late_answers, answers_not_taken: answers that missed their cycle.
+        late_replies, replies_not_accepted: those that missed their cycle.
         repaired: whether something was lost and the file repaired.
         samples_lost: by repairs, None where nobody can say.
         losses: by repairs, a sentence each.
@@ -332,8 +332,8 @@ class ArchiveOutcome(BaseModel):
     lost_packets: _Count = None
     records_lost: _Count = None
     events_lost: _Count = None
-    late_answers: _Count = None
-    answers_not_taken: _Count = None
+    late_replies: Annotated[_Count, Field(alias="late_answers")] = None
+    replies_not_accepted: Annotated[_Count, Field(alias="answers_not_taken")] = None
     repaired: Annotated[bool, BeforeValidator(lambda text: text == "yes")] = False
     samples_lost: Annotated[_Count, Field(alias="repaired.samples_lost")] = 0
     losses: Annotated[_Names, WrapValidator(_or_default), Field(alias="repaired.losses")] = ()

@@ -34,7 +34,7 @@ import re
 from typing import Self
 
 from hil.errors import InputError
-from hil.whole_number import LAST_PORT
+from hil.reading import LAST_PORT
 
 LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8765

@@ -75,7 +75,7 @@ def span(entries: Entries) -> tuple[int, int]:
 
 
 class McapWriter:
-    """Writes one MCAP file to `write`, which is told whole records.
+    """Writes one MCAP file to `write`, which receives whole records.
 
     Chunks end at `flush` and nowhere else; a chunk without messages is not written, what was
     registered for it goes into the next. Compressed by Zstandard, with checksums of chunks,
@@ -164,7 +164,7 @@ class McapWriter:
         sequence: NDArray[np.int64],
         messages: Sequence[Rows],
     ) -> None:
-        """Add messages of several channels taken at the same instants, instant by instant.
+        """Add messages of several channels of the same instants, instant by instant.
 
         Args:
             channels: their ids.

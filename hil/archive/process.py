@@ -2,7 +2,7 @@
 
 Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block,
 command socket and exchange process, the number of joints, and the descriptor of the raw packets
-where they are kept. It is in a process session of its own and ignores SIGINT and SIGHUP: what is
+where they are stored. It is in a process session of its own and ignores SIGINT and SIGHUP: what is
 being recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on
 until the exchange has ended the motion or is dead, closes the archive with the true outcome, and
 ends. If it cannot write, it says so in the control block, and the exchange brings the arm to rest.
@@ -194,7 +194,7 @@ class ArchiveProcess:
         self._recent = Recent()
 
     def run(self) -> None:
-        """Work until told to end, or left alone with nothing to do."""
+        """Work until asked to end, or left alone with nothing to do."""
         threading.Thread(target=self._beat, daemon=True).start()
         while not (self._leaving and self._job is None):
             self._progress = time.monotonic()

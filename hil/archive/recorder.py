@@ -54,7 +54,7 @@ def describe(event: ExchangeEvent) -> str:
             return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
             were = f"{plural(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
-            return f"{were} not taken by the controller, until cycle {event.cycle}"
+            return f"{were} not accepted by the controller, until cycle {event.cycle}"
         case MotionStarted():
             return f"first set-point in cycle {event.cycle}"
         case OverrideChanged():
@@ -174,7 +174,7 @@ class Recorder:
         records: how many were archived.
         records_lost: how many were overwritten before they could be archived.
         events_lost: likewise of the events.
-        packets_lost: likewise of the raw packets, where they are kept.
+        packets_lost: likewise of the raw packets, where they are stored.
         missed: packets that never arrived.
         late: packets whose answer was late or left out for a newer one.
         untaken: answers that the controller did not take.

@@ -168,7 +168,7 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
 
 
 class Batch(NamedTuple):
-    """Messages of several channels taken at the same instants.
+    """Messages of several channels of the same instants.
 
     Attributes:
         stamp: shape (k,), nanoseconds.
@@ -268,7 +268,7 @@ class SampleEncoder:
         torque: Array | None,
         motor_current: Array | None,
     ) -> Batch:
-        """Encode k samples; arrays (k, n), None for what was announced as absent."""
+        """Encode k samples; arrays (k, n), None for what was declared as absent."""
         state = _stamped(self._state, stamp)
         for name, values in (("position", position), ("velocity", velocity), ("effort", torque)):
             if values is not None:

@@ -220,7 +220,7 @@ class ArchiveProcessHandle:
     def start(
         cls, memory: SharedMemory, n_joints: int, packets_fd: int = -1
     ) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory; `packets_fd` where packets are kept.
+        """Start the process on the exchange's shared memory; `packets_fd` where packets are stored.
 
         Raises:
             OSError: the system refuses a process, a socket or memory.

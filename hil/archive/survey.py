@@ -74,7 +74,7 @@ class Survey(Scan):
         stream: the same, open.
         order: the chunks that must come.
         summary: of the file, None where it is not whole.
-        visit: told each chunk that stands.
+        visit: called with each chunk that stands.
 
     Attributes:
         path: the file.
@@ -225,7 +225,7 @@ class Survey(Scan):
         self.pieces.append(Piece(record.offset, record.size, record.opcode, shift))
 
     def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
-        """Take header or outcome; another one is kept as it is."""
+        """Take header or outcome; another one is left as it is."""
         self._anew.copy(record)
         super().take_metadata(record, name, entries)
         if name not in (METADATA, OUTCOME):
@@ -345,8 +345,8 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
 
     Args:
         path: the file.
-        visit: makes what is told each chunk that stands, with its messages by topic; a file that
-            must be gone through a second time is told to a new one.
+        visit: makes what is called with each chunk that stands, with its messages by topic; a
+            file that must be gone through a second time is given to a new one.
 
     Raises:
         ArchiveError: it cannot be read.

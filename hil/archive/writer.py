@@ -223,7 +223,7 @@ class ArchiveWriter:
     Chunks end at fixed cycles, every 100 ms of the controller's time, wherever the caller cuts his
     batches: the same records give the same bytes. A killed process loses what came after the last
     whole chunk. Used as a context manager it is closed in any case: ``interrupted`` with the reason
-    when an exception passes, ``unknown`` when nobody told the outcome.
+    when an exception passes, ``unknown`` when the outcome is not given.
 
     Args:
         path: the file, which must not exist.
@@ -314,7 +314,7 @@ class ArchiveWriter:
         """Append cycle records.
 
         Args:
-            records: shape (k,), structure of `drivers.cycle_dtype`; kept until their chunk is
+            records: shape (k,), structure of `drivers.cycle_dtype`; held until their chunk is
                 written, so hand over a copy. Batches of some 100 cycles cost least.
             torque: joint torque of each record, shape (k, n) [N·m]; None when it is not known.
 
@@ -351,7 +351,7 @@ class ArchiveWriter:
 
         Args:
             packets: shape (k,), structure `drivers.packet_records.PACKET_DTYPE`, cycles not
-                falling; kept until written, so hand over a copy.
+                falling; held until written, so hand over a copy.
 
         Raises:
             ValueError: the archive was opened without packets.

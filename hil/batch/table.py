@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 from hil.files import replacing
-from hil.timestamps import instant
+from hil.reading import instant
 from hil.version import software
 
 from .estimates import relative_error
@@ -110,7 +110,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             "relative_error": relative_error(level.noise_std, level.torque_rms, level.samples),
             "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
             "method": level.method,
-            "doubts": "; ".join(level.warnings),
+            "warnings": "; ".join(level.warnings),
             "estimator": result.estimator,
             "settings": level.settings,
             "code": result.code,
@@ -172,7 +172,7 @@ TABLES: Final = (
         _columns(
             f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
             "determined:truth archives:count samples:count condition:number relative_error:number "
-            "unseen_relative_error:number method doubts estimator settings code software "
+            "unseen_relative_error:number method warnings estimator settings code software "
             "covariance:numbers"
         ),
         _parameter_rows,

@@ -36,6 +36,13 @@ if TYPE_CHECKING:
     from sim_fixtures import SimulatedDrive
 
 
+import shutil
+
+from hil.errors import HilError
+
+from .folder_lock import LOCK
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign:
     """One folder: a cell, a plan, and what of it has been done."""
@@ -166,7 +173,7 @@ class Campaign:
         are. A rehearsal that passed is not repeated, one that was stopped goes on.
 
         Args:
-            reporter: told of the progress.
+            reporter: receives the progress.
             seed: of what is planted in the twin, its noise and its link's faults.
             stop: ends it early.
             again: rehearse once more even if it passed.
@@ -175,7 +182,7 @@ class Campaign:
 
         Raises:
             MotionRefusedError: a motion breaks a limit of the cell.
-            OperatorStopError: it was stopped; what was recorded is kept.
+            OperatorStopError: it was stopped; what was recorded remains.
             CampaignFolderError: the folder was changed, or a run is at work on it.
         """
         from .rehearsal_run import SEED, rehearse  # which runs campaigns
@@ -248,7 +255,7 @@ class Campaign:
             link: to the controller; the cell's own if left out. A cell with the transport
                 "simulated" has a simulated controller in virtual time.
             stop: set from outside to bring the arm to rest on its path.
-            reporter: told of the progress.
+            reporter: receives the progress.
             operator: sees each motion, may slow or hold it, and is asked to accept the dry run;
                 nobody if left out.
             provenance: goes into the metadata of every archive, e.g. whether it is simulated.
@@ -302,3 +309,59 @@ def _require(given: object, name: str, kinds: tuple[type, ...], remedy: str) -> 
     """Refuse what is of another type than was asked for."""
     if not isinstance(given, kinds):
         raise WrongObjectError(name, given, remedy)
+
+
+_OURS = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)
+"""What a campaign has before anything is recorded; the manifest goes first, so that what a crash
+leaves of the others is no campaign."""
+
+
+def require_replaceable(root: Path) -> None:
+    """Refuse to replace a campaign that something was recorded in.
+
+    Raises:
+        CampaignFolderError: there is one in the folder.
+    """
+    if CampaignFolder(root).manifest():
+        raise CampaignFolderError(
+            root, "holds a campaign with recordings", "name another folder (-o)"
+        )
+
+
+def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campaign:
+    """A campaign of a designed motion, made in the folder of the design.
+
+    One that is there already is kept if it is of this motion and cell, and replaced otherwise.
+
+    Raises:
+        CampaignFolderError: something was recorded in the campaign that is there, or the folder
+            holds files that are no campaign's and no design's.
+        CellError: the cell file lacks what a campaign needs.
+        MotionRefusedError, NoExcitationError: see `Campaign.create`.
+    """
+    _ = cell.controller  # named before anything is drawn
+    folder = CampaignFolder(root)
+    if folder.sealed:
+        there = _there(root)
+        if there is not None and _same(there, cell, excitation):
+            return there
+        require_replaceable(root)
+        with folder.locked():
+            for name in _OURS:
+                (root / name).unlink(missing_ok=True)
+            shutil.rmtree(folder.archives, ignore_errors=True)
+            shutil.rmtree(folder.rehearsed, ignore_errors=True)
+    return Campaign.create(root, cell, excitation)
+
+
+def _there(root: Path) -> Campaign | None:
+    try:
+        return Campaign.open(root)
+    except HilError:
+        return None
+
+
+def _same(there: Campaign, cell: Cell, excitation: Excitation) -> bool:
+    own = cell.with_urdf(there.folder.cell, there.folder.urdf.name)
+    mine, theirs = (one.trajectory.to_dict() for one in (excitation, there.plan.excitation))
+    return (there.cell.text, there.cell.urdf, theirs) == (own.text, own.urdf, mine)

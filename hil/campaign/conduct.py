@@ -22,7 +22,7 @@ T = TypeVar("T")
 def conduct_of(folder: CampaignFolder) -> ConductResult:
     """What rehearsal, dry run, warm-up and archives of a folder say; nothing is changed.
 
-    A file that cannot be read is told in its step's words.
+    A file that cannot be read is reported in its step's words.
 
     Raises:
         CampaignFolderError: the manifest cannot be read.
@@ -55,7 +55,7 @@ def _rehearsed(folder: CampaignFolder) -> StepResult:
         return StepResult(step=name, done=False, words=words, details=[])
     passed = sum(one.passed for one in found.criteria)
     words = f"{passed} of {len(found.criteria)} criteria passed on the simulated arm"
-    details = [] if found.doubt is None else [found.doubt]
+    details = [] if found.warning is None else [found.warning]
     details += [one.sentence for one in found.criteria]
     details += [f"not seen by it: {sentence}" for sentence in found.not_seen]
     return StepResult(step=name, done=found.passed, words=words, details=details)
@@ -82,7 +82,7 @@ def _dry_run(folder: CampaignFolder) -> StepResult:
         details=[
             f"largest current, of its limit: {currents}",
             f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late",
-            *(f"{doubt}; it was accepted by name" for doubt in found.doubts),
+            *(f"{warning}; it was accepted by name" for warning in found.warnings),
         ],
     )
 
@@ -155,8 +155,8 @@ def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:
         seconds=float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0,
         cycles=archive.n_samples,
         missed=outcome.lost_packets or 0,
-        late=outcome.late_answers or 0,
-        not_taken=outcome.answers_not_taken or 0,
+        late=outcome.late_replies or 0,
+        not_accepted=outcome.replies_not_accepted or 0,
         lost=outcome.records_lost or 0,
         outcome=entry.outcome,
         why=entry.reason or ("" if entry.outcome == "completed" else outcome.reason),

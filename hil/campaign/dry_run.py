@@ -14,15 +14,32 @@ import numpy as np
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from hil.errors import ArchiveError
 from hil.files import write_or_tell
 from hil.reading import json_of, lies_there, text_of
 
 from .errors import CampaignFolderError
-from .folder import CampaignFolder
+from .folder import CampaignFolder, read_back
 from .gravity_check import AGAINST, GravityCheck
 from .operator import DryRunSummary
-from .read_back import read_back
-from .simulation_flag import made_by
+
+SIMULATED: Final = "simulated"
+"""Metadata: whether nothing but a simulated arm can have moved, "yes" or "no". The link says so,
+whatever the caller of a run says."""
+
+
+def said_of(only_simulated: bool) -> str:
+    """The kind of arm as archives name it under `SIMULATED`."""
+    return "yes" if only_simulated else "no"
+
+
+def made_by(path: Path, only_simulated: bool) -> bool:
+    """Whether an archive says that this kind of arm made it; a damaged one does not."""
+    try:
+        return open_archive(path, fields=()).header.simulated == said_of(only_simulated)
+    except ArchiveError:
+        return False
+
 
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""
@@ -179,7 +196,7 @@ class DryRun:
             following = np.maximum(following, np.nanmax(behind, axis=0))
             missed += int(columns["gap"].sum())
             if archive.outcome is not None:
-                late += archive.outcome.late_answers or 0
+                late += archive.outcome.late_replies or 0
             cycles += archive.n_samples
         gravity = GravityCheck.of(cell, [folder.archives / name for name in names])
         return cls(
@@ -198,7 +215,7 @@ class DryRun:
         )
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """What speaks against it, in sentences."""
         return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
 

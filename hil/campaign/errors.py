@@ -124,19 +124,19 @@ class ArmChangedError(RepetitionsRejectedError):
     """Later attempts at a motion agree with each other, and not with the repetitions that count.
 
     Attributes:
-        counted: file names of the archives that count.
+        reference: file names of the archives that count.
         later: of those that agree with each other and were rejected.
     """
 
     def __init__(
-        self, motion: str, differs: str, counted: Sequence[str], later: Sequence[str]
+        self, motion: str, differs: str, reference: Sequence[str], later: Sequence[str]
     ) -> None:
         self.motion, self.reasons = motion, (differs,)
-        self.counted, self.later = tuple(counted), tuple(later)
+        self.reference, self.later = tuple(reference), tuple(later)
         HilError.__init__(
             self,
             f"{motion}: the last {len(later)} attempts ({', '.join(later)}) agree with each other, "
-            f"and not with the {len(counted)} repetitions that count ({', '.join(counted)}): "
+            f"and not with the {len(reference)} repetitions that count ({', '.join(reference)}): "
             f"{differs}. Something drags on the arm, slipped or was changed, or the first ones "
             "were disturbed. Look at the arm: payload, tool, cables, belts, brakes, what stands "
             "near it. If it can be put back as it was, do so and run the campaign again; if the "

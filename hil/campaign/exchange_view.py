@@ -28,8 +28,7 @@ from drivers.exchange.liveness import Pulse
 from drivers.states import State
 from hil.terminal_text import plural
 
-from .motion_link import Connection
-from .start_timeout import Beginning
+from .motion_link import Beginning, Connection
 
 HUNG = 5.0
 """s without a sign of life after which an exchange process is ended: the controller, unanswered

@@ -18,9 +18,8 @@ from hil.cell import Cell
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 
-from .announced_limits import checks_in_force, narrower_currents
+from .controller_limits import checks_in_force, narrower_currents
 from .dry_run import OVERRIDE
-from .dry_run_stage import DryRunStage
 from .execution_archive import Archiving, provenance_of
 from .execution_result import DryRunState, RunResult
 from .execution_runner import Runner
@@ -34,7 +33,7 @@ from .gates import (
     require_rehearsed_thresholds,
     require_simulated,
 )
-from .intervals import Interval, require_joined, require_sound, wanted, with_ways
+from .intervals import Interval, require_joined, require_sound, wanted, with_moves
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink
@@ -42,11 +41,130 @@ from .operator import Operator, Unattended
 from .quality_entry import Entering
 from .repeating import any_warmth, play_until_good
 from .stop import Stop
-from .straight_moves import Ways, seen_in_dry_run
+from .straight_moves import StraightMoves, seen_in_dry_run
 from .warmup_stage import WarmUpStage
 
 if TYPE_CHECKING:
     from .campaign import Campaign
+
+
+from dataclasses import replace
+
+from hil.errors import OperatorStopError
+
+from .dry_run import DryRun, made_by
+from .folder import CampaignFolder
+from .gates import not_accepted
+
+
+class DryRunStage:
+    """Every motion that will be sent at full speed, once and slowly.
+
+    Args:
+        folder: of the campaign.
+        cell: of the campaign.
+        motions: excitations and validation motions; repetitions of one are looked at once.
+        operator: may be asked.
+        accept: whether the caller accepts without being asked.
+        accept_torque: joints that the caller knows to run against the model's gravity.
+        simulated: whether nothing but a simulated arm can move.
+        plan_hash: of exactly the plan that is run.
+        stop: asked for at the question, it is no answer.
+    """
+
+    def __init__(
+        self,
+        folder: CampaignFolder,
+        cell: Cell,
+        motions: Sequence[Interval],
+        operator: Operator,
+        *,
+        accept: bool,
+        accept_torque: Sequence[str],
+        simulated: bool,
+        plan_hash: str,
+        stop: Stop,
+    ) -> None:
+        self._folder, self._cell, self._operator = folder, cell, operator
+        self._accept, self._simulated = accept, simulated
+        self._plan_hash, self._stop = plan_hash, stop
+        self._motions = [one for one in motions if one.kind == "validation" or one.index == 0]
+        # Nobody knows beforehand what will contradict: only what an earlier run saw is accepted.
+        self._known = tuple(accept_torque)
+        if accept_torque and self.found() is None:
+            self._known = ()
+
+    def found(self) -> DryRun | None:
+        """The dry run of exactly this plan and kind of arm; None where none counts."""
+        return DryRun.that_counts(
+            self._folder,
+            plan_hash=self._plan_hash,
+            motions=len(self._motions),
+            simulated=self._simulated,
+        )
+
+    @property
+    def intervals(self) -> list[Interval]:
+        """The motions under the names of their slow runs."""
+        return [replace(one, kind="dryrun", index=k) for k, one in enumerate(self._motions)]
+
+    def missing(self) -> list[tuple[Interval, Interval]]:
+        """Each motion that was not run slowly yet, and the same as a dry run."""
+        both = zip(self._motions, self.intervals, strict=True)
+        return [(one, slow) for one, slow in both if self._whole(slow) is None]
+
+    def run(self, runner: Runner, entering: Entering) -> None:
+        """Run what is missing, slowly."""
+        for _, slow in self.missing():
+            name = runner.play(slow, slow.index + 1, len(self._motions), OVERRIDE)
+            entering.enter(slow, name)
+
+    def settle(self, *, ask: bool = True) -> DryRunState:
+        """Write down what was done, once all of it is, and have it accepted.
+
+        Args:
+            ask: whether it must be accepted now.
+
+        Raises:
+            DryRunError: it must be and is not.
+            OperatorStopError: a stop was asked for instead of an answer.
+        """
+        found = self.found()
+        if found is None:
+            names = [name for slow in self.intervals if (name := self._whole(slow)) is not None]
+            if len(names) < len(self._motions):
+                return "to be accepted"
+            found = DryRun.of(
+                self._folder,
+                self._cell,
+                names,
+                plan_hash=self._plan_hash,
+                simulated=self._simulated,
+            )
+            found.save(self._folder.dry_run)
+        if found.accepted is None:
+            summary = found.summary(self._folder.root.resolve().name)
+            unknown = [joint for joint in found.against_gravity if joint not in self._known]
+            agreed = self._accept and not unknown
+            if not agreed and self._operator.can_answer:
+                agreed = self._operator.accept_dry_run(summary)
+                if not agreed and self._stop.requested:
+                    raise OperatorStopError(
+                        f"{self._folder.root}: stopped instead of an answer; its slow dry run was "
+                        "done, and is not accepted."
+                    )
+            if not agreed and ask:
+                raise not_accepted(self._folder, unknown)
+            if not agreed:
+                return "to be accepted"
+            found.accepted_now().save(self._folder.dry_run)
+        return "accepted"
+
+    def _whole(self, slow: Interval) -> str | None:
+        """Name of its whole archive, if this kind of arm made it."""
+        name = self._folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(self._folder.archives / name, self._simulated)
+        return name if made else None
 
 
 @dataclass(frozen=True)
@@ -163,9 +281,9 @@ class _Run:
             require_simulated(self._folder, self._simulated)
             return
         rehearsal = require_rehearsed(self._folder, self._archiving.plan_hash)
-        if (doubt := rehearsal.doubt) is not None:
-            self._notes.append(doubt)
-            self._reporter.say(f"note: {doubt}")
+        if (warning := rehearsal.warning) is not None:
+            self._notes.append(warning)
+            self._reporter.say(f"note: {warning}")
         require_dry_run(
             self._folder,
             self._dry_run.found(),
@@ -188,7 +306,7 @@ class _Run:
             checks = MotionChecks.of(self._cell)
             if checks.not_checked is not None:
                 self._reporter.say(checks.not_checked)
-            # What is wrong with a motion itself is told before anything is connected.
+            # What is wrong with a motion itself is reported before anything is connected.
             warming = warming if missing else []
             require_sound([*dry, *missing, *warming], checks)
             with self._opened(link) as opened:
@@ -231,12 +349,12 @@ class _Run:
         if below := narrower_currents(self._cell, link.connection):
             self._notes.append(f"the controller's own current limits counted ({'; '.join(below)})")
         # A dry run and a warm-up go the ways of the motions that they are made of.
-        joined = with_ways(self._cell, [*dry, *missing], where)
+        joined = with_moves(self._cell, [*dry, *missing], where)
         require_sound([one for one in joined if one.kind == "move"], checks)
         require_joined(joined)
         seen = None if self._choices.unrehearsed else seen_in_dry_run(self._folder)
-        ways = Ways(self._cell, checks, joined, seen)
-        times = _times(joined, len(dry), ways, self._cell.campaign.approach_speed)
+        moves = StraightMoves(self._cell, checks, joined, seen)
+        times = _times(joined, len(dry), moves, self._cell.campaign.approach_speed)
         if any(one.kind != "standstill" for one in missing):
             times += self._warm_up.expected()
         total = sum(times)
@@ -244,7 +362,7 @@ class _Run:
             runner = Runner(
                 self._cell,
                 link,
-                ways,
+                moves,
                 self._archiving,
                 self._stop,
                 self._watch,
@@ -300,7 +418,7 @@ class _Run:
 
         found = None if self._choices.unrehearsed else self._dry_run.found()
         notes = [*self._notes]
-        notes += [] if found is None else [f"dry run: {doubt}" for doubt in found.doubts]
+        notes += [] if found is None else [f"dry run: {warning}" for warning in found.warnings]
         if (cold := self._warm_up.note) is not None:
             notes.append(cold)
         notes += self._warm_up.pauses
@@ -324,14 +442,16 @@ class _Run:
         )
 
 
-def _times(joined: Sequence[Interval], dry: int, ways: Ways, approach_speed: float) -> list[float]:
+def _times(
+    joined: Sequence[Interval], dry: int, moves: StraightMoves, approach_speed: float
+) -> list[float]:
     """Seconds of each motion and way: slow are the first `dry`, and ways that nobody has seen."""
     times, first = [], dry > 0
     slow_way = min(1.0, OVERRIDE / approach_speed)
     for one in joined:
         share = OVERRIDE if dry else 1.0
         if one.kind == "move":
-            unseen = one.from_arm if first else ways.unseen(one)
+            unseen = one.from_arm if first else moves.unseen(one)
             share = slow_way if dry or unseen else 1.0
         elif dry:
             dry -= 1

@@ -12,10 +12,10 @@ from hil.cell import Cell
 from hil.recording import dated_anew, origin_of
 from hil.version import software
 
+from .dry_run import SIMULATED, said_of
 from .folder import CampaignFolder
 from .intervals import Interval
 from .plan import CampaignPlan, moves_to_dict
-from .simulation_flag import SIMULATED, said_of
 
 REPEATED = ("excitation", "warmup")
 """Kinds that run the excitation as it was designed."""

@@ -1,4 +1,4 @@
-"""Runs motions one after the other, with the ways between them."""
+"""Runs motions one after the other, with the moves between them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .execution_watch import RunWatch
 from .intervals import Interval, ends, player_of
 from .motion_link import MotionLink
 from .stop import Stop
-from .straight_moves import Ways
+from .straight_moves import StraightMoves
 
 Array = NDArray[np.float64]
 
@@ -30,18 +30,18 @@ class Runner:
     Attributes:
         cell: of the campaign.
         link: to its controller; connected.
-        ways: between the motions.
+        moves: between the motions.
         archiving: describes the archives.
         stop: brings the arm to rest on its path.
         watch: shows each motion to the operator.
-        task: told of the seconds of motion done.
+        task: receives the seconds of motion done.
         where: (n,) [rad] where the arm was first, and goes back to.
         archives: file names so far, whatever became of them.
     """
 
     cell: Cell
     link: MotionLink
-    ways: Ways
+    moves: StraightMoves
     archiving: Archiving
     stop: Stop
     watch: RunWatch
@@ -81,14 +81,14 @@ class Runner:
 
     def _go(self, target: Array, most: float) -> None:
         """Go a straight way; what nobody has watched yet is not gone faster than a dry run."""
-        way = self.ways.between(self._at, target)
+        way = self.moves.between(self._at, target)
         if way is not None:
-            share = min(most, OVERRIDE) if self.ways.unseen(way) else most
+            share = min(most, OVERRIDE) if self.moves.unseen(way) else most
             slow = min(1.0, share / self.cell.campaign.approach_speed)
             name = self._run(way, way.index + 1, way.index + 1, slow)
             self.archiving.folder.add(name, "completed")
             if most <= OVERRIDE:
-                self.ways.saw(way)
+                self.moves.saw(way)
         self._at = target
 
     def _ends(self, interval: Interval) -> tuple[Array, Array]:

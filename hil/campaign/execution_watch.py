@@ -1,4 +1,4 @@
-"""Between a motion and the operator: what is shown of it, and what is wished of it."""
+"""Between a motion and the operator: what is shown of it, and what is requested of it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ NOTES = 4
 class RunWatch:
     """A `MotionWatch` that tells the operator where the whole run stands.
 
-    What an operator's screen gets wrong must not end a motion: it is told, and the motion goes on
-    at the speed wished for last. Each wish is asked for anew, whatever the last one met with. A
-    hold is another matter: one that nobody can release any more becomes a stop.
+    What an operator's screen gets wrong must not end a motion: it is reported, and the motion goes
+    on at the speed requested last. Each request is asked for anew, whatever the last one met with.
+    A hold is another matter: one that nobody can release any more becomes a stop.
 
     Attributes:
         operator: who looks.
@@ -33,7 +33,7 @@ class RunWatch:
         began: when the present motion began, or the last one [s since 1970]; later than it was
             asked for where it was held.
         blind: what went wrong with showing, None for nothing; nothing is shown from then on.
-        deaf: what went wrong first with asking for a wish, None for nothing.
+        deaf: what went wrong first with asking for a request, None for nothing.
     """
 
     operator: Operator
@@ -51,7 +51,7 @@ class RunWatch:
     _total: int = 1
     _duration: float = 0.0
     _most: float = 1.0
-    _wish: OperatorRequest = field(default_factory=OperatorRequest)
+    _request: OperatorRequest = field(default_factory=OperatorRequest)
     _notes: tuple[str, ...] = ()
 
     def expect(self, seconds: float) -> None:
@@ -88,38 +88,40 @@ class RunWatch:
             self._shown, self.began = True, time.time()
         self._tell(progress)
 
-    def wish(self) -> OperatorRequest:
-        """See `MotionWatch.wish`."""
+    def request(self) -> OperatorRequest:
+        """See `MotionWatch.request`."""
         try:
-            wish: object = self.operator.wish()
-            if not isinstance(wish, OperatorRequest):
-                raise TypeError(f"{wish!r} is no wish")
-            self._wish = wish
+            request: object = self.operator.request()
+            if not isinstance(request, OperatorRequest):
+                raise TypeError(f"{request!r} is no OperatorRequest")
+            self._request = request
         except Exception as error:  # the arm moves: a screen must not decide how it ends
             self.deaf = self.deaf or error
-            if self._wish.held and not self.stop.requested:
+            if self._request.held and not self.stop.requested:
                 self._held_deaf = self.stop.requested = True
-        return self._wish
+        return self._request
 
     @property
     def troubles(self) -> tuple[str, ...]:
         """What went wrong with the operator's screen, in sentences."""
-        told = []
+        sentences = []
         if self.blind is not None:
-            told.append(f"the operator's screen failed ({_words(self.blind)}); nothing was shown")
+            sentences.append(
+                f"the operator's screen failed ({_words(self.blind)}); nothing was shown"
+            )
         if self.deaf is not None:
-            became = "what was wished for last counted"
+            became = "the last request stayed in force"
             if self._held_deaf:
                 became = "the arm was held, which nobody could end any more: the run was stopped"
             why = _words(self.deaf)
-            told.append(f"the operator could not be asked for wishes ({why}); {became}")
-        return tuple(told)
+            sentences.append(f"the operator could not be asked for requests ({why}); {became}")
+        return tuple(sentences)
 
     def _tell(self, progress: MotionProgress | None) -> None:
         if self.blind is not None:
             return
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
-        wished = max(self._wish.override, 0.01)
+        wished = max(self._request.override, 0.01)
         left = max(self._duration - done, 0.0) / min(self._most, wished) + self.time_left / wished
         status = RunStatus(
             self._phase,

@@ -31,10 +31,41 @@ if TYPE_CHECKING:
 
 import io
 from collections.abc import Mapping
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from hil.reading import toml_of
 from identification.errors import ModelError
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
+
+T = TypeVar("T")
+
+
+def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
+    """An object of a dataclass or model, from the JSON that its fields were written as.
+
+    Args:
+        kind: of the object.
+        text: the JSON.
+        strict: numbers are no texts. If not, each field is as strict as it says itself: a model
+            writes infinite numbers as words.
+
+    Raises:
+        ValueError: it is no JSON, or a field is not what it has to be; names the first one.
+    """
+    try:
+        return TypeAdapter(kind).validate_json(text, strict=strict or None)
+    except ValidationError as error:
+        raise ValueError(first_of(error)) from error
+
+
+def first_of(error: ValidationError) -> str:
+    """The first thing that is wrong, with its place."""
+    first = error.errors()[0]
+    place = ".".join(map(str, first["loc"]))
+    return f"{place}: {first['msg']}" if place else str(first["msg"])
+
 
 MESH: Final = "mesh "
 """Begins the entry of a mesh, by its name in the URDF."""
@@ -371,9 +402,9 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: the manifest cannot be read.
         """
-        taken = {entry.name for entry in self.manifest()}
+        used = {entry.name for entry in self.manifest()}
         attempt = 1
-        while (name := ArchiveName(kind, index, attempt).filename) in taken or (
+        while (name := ArchiveName(kind, index, attempt).filename) in used or (
             self.archives / name
         ).exists():
             attempt += 1

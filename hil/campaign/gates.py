@@ -14,14 +14,13 @@ from hil.archive import ArchiveHeader, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .announced_limits import narrower_thresholds
-from .dry_run import DryRun
+from .controller_limits import narrower_thresholds
+from .dry_run import DryRun, said_of
 from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .gravity_check import AGAINST
 from .motion_link import MotionLink
 from .rehearsal import Rehearsal
-from .simulation_flag import said_of
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""
@@ -106,7 +105,7 @@ def require_link_of(cell: Cell, link: MotionLink, root: Path) -> None:
     """Refuse a link that was opened for another arm than the campaign's.
 
     The address may differ, and what is planted in a simulated arm; a link that does not say what
-    it was opened for is taken as it is.
+    it was opened for is used as it is.
 
     Args:
         cell: of the campaign.

@@ -1,19 +1,21 @@
-"""The motions of a campaign in order, with the ways between them, checked before they are sent."""
+"""The motions of a campaign in order, with the moves between them, checked before they are sent."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.header import motion_name
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.motion_checks import MotionChecks
 from planner import (
     FourierSeries,
+    JointLimits,
     Move,
     PiecewiseCubic,
     PlanFile,
@@ -24,9 +26,41 @@ from planner import (
 
 from .errors import MotionRefusedError
 from .plan import CampaignPlan
-from .reach import at_limit, beyond
 
 Array = NDArray[np.float64]
+
+_ROUNDED: Final = 9e-7
+"""Share of half a joint's range by which the wire rounds an arm at its limit out of it; the guard
+of every cycle and the player allow as much."""
+
+
+def at_limit(posture: Array, limits: JointLimits) -> Array:
+    """A posture (n,) [rad], brought back to a limit that only rounding took it across."""
+    within = np.clip(posture, limits.lower, limits.upper)
+    rounding = 0.5 * _ROUNDED * (limits.upper - limits.lower)
+    return np.where(np.abs(posture - within) <= rounding, within, posture)
+
+
+def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
+    """Which joint of a posture (n,) [rad] is outside its limits, in words and degrees.
+
+    Args:
+        cell: its limits.
+        posture: (n,) rad.
+        verb: what the joint does there.
+    """
+    limits, frame = cell.joint_limits, AngleFrame.of(cell)
+    posture = at_limit(posture, limits)
+    outside = np.flatnonzero((posture < limits.lower) | (posture > limits.upper))
+    if not len(outside):
+        return None
+    joint = int(outside[0])
+    ends = np.sort([frame.shown(limits.lower)[joint], frame.shown(limits.upper)[joint]])
+    return (
+        f"{cell.joint_names[joint]} {verb} {frame.shown(posture)[joint]:.6g}°, its limits are "
+        f"{ends[0]:.6g}° and {ends[1]:.6g}° ({frame.whose})"
+    )
+
 
 AT_REST_TOLERANCE = 1e-6
 """rad; a move shorter than this is not worth an interval."""
@@ -57,7 +91,7 @@ class Interval:
 
 
 def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
-    """All motions of a plan, without the ways between them."""
+    """All motions of a plan, without the moves between them."""
     settings = cell.campaign
     excitation = plan.excitation.trajectory
     return [
@@ -70,7 +104,7 @@ def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
     ]
 
 
-def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
+def with_moves(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[Interval]:
     """Put moves between: from `where` (n,) to home, from home to an excitation, and back.
 
     An excitation, and sines of any kind, may begin and end elsewhere than at home; whatever else
@@ -78,17 +112,17 @@ def with_ways(cell: Cell, intervals: Sequence[Interval], where: Array) -> list[I
     """
     home, at = cell.home, where
     joined: list[Interval] = []
-    ways: dict[bytes, Interval] = {}
+    planned: dict[bytes, Interval] = {}
 
     def go(target: Array) -> None:
         nonlocal at
         from_arm = at is where or target is where
         if np.max(np.abs(target - at)) > AT_REST_TOLERANCE:
             key = at.tobytes() + target.tobytes()
-            if key not in ways:
-                ways[key] = way(cell, at, target)
+            if key not in planned:
+                planned[key] = way(cell, at, target)
             index = sum(interval.kind == "move" for interval in joined)
-            joined.append(replace(ways[key], index=index, from_arm=from_arm))
+            joined.append(replace(planned[key], index=index, from_arm=from_arm))
         at = target
 
     for interval in intervals:
@@ -139,7 +173,7 @@ def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None
     checks = checks or MotionChecks.of(cell)
     intervals = wanted(cell, plan)
     require_sound(intervals, checks)  # before ways are planned to where they lead
-    joined = with_ways(cell, intervals, cell.home)
+    joined = with_moves(cell, intervals, cell.home)
     require_sound([interval for interval in joined if interval.kind == "move"], checks)
     require_joined(joined)
 

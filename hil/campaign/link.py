@@ -32,6 +32,7 @@ from hil.errors import ControllerFault, OperatorStopError
 
 from .motion_link import (
     END_TIMEOUT,
+    Beginning,
     Connection,
     Progress,
     Recorded,
@@ -41,8 +42,7 @@ from .motion_link import (
     unwatched,
 )
 from .motion_watch import MotionWatch, unwatched_motion
-from .progress import Counted, Sight, duration_of
-from .start_timeout import Beginning
+from .progress import PacketCounts, ProgressDisplay, duration_of
 from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
 from .stop import Stop
 
@@ -157,7 +157,7 @@ class Link:
         with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
             watching = _Watching(self, source, watch, steering)
-            taking.sight = watching.sight
+            taking.display = watching.display
             self.ring.drain()
             self.drain_packets()
             self._events()
@@ -287,7 +287,7 @@ class Link:
         )
 
     def drain_packets(self) -> NDArray[np.void] | None:
-        """Raw packets since the last call; None if they are not kept."""
+        """Raw packets since the last call; None if they are not stored."""
         if self.packets is None or not isinstance(self.transport, TappedTransport):
             return None
         self.transport.settle()
@@ -331,7 +331,7 @@ class _Taking:
         self.recorder = recorder
         self.failure: Exception | None = None
         self.began = False
-        self.sight: Sight | None = None
+        self.display: ProgressDisplay | None = None
         self._link = link
         self._overflow = link.ring.overflow
         self._packets_overflow = link.packets_overflow
@@ -345,9 +345,9 @@ class _Taking:
         lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
         lost_packets = link.packets_overflow - self._packets_overflow
         self._packets_overflow = link.packets_overflow
-        if self.sight is not None:
-            self.sight.note(events)
-            self.sight.take(records)
+        if self.display is not None:
+            self.display.note(events)
+            self.display.take(records)
         if self.failure is not None:
             recorder.note(events)
             return
@@ -368,32 +368,32 @@ class _Taking:
 
 
 class _Watching:
-    """Shows a motion to its watch and does what that wishes."""
+    """Shows a motion to its watch and does what that requests."""
 
     def __init__(
         self, link: Link, source: MotionSource, watch: MotionWatch, steering: Steering
     ) -> None:
         self._link, self._source, self._watch, self._steering = link, source, watch, steering
         drives, duration = link.session.drive_train, duration_of(source)
-        self.sight = Sight(drives, link.guard, steering, duration, self._counted())
+        self.display = ProgressDisplay(drives, link.guard, steering, duration, self._counts())
 
     def look(self, stop: Stop) -> None:
-        """Show it if that is due, and pass wishes on; returns when no hold stands any more.
+        """Show it if that is due, and pass requests on; returns when no hold stands any more.
 
         A simulated controller waits for its answer, so that a hold costs no simulated time.
         """
         while True:
-            if self.sight.due:
+            if self.display.due:
                 state, progress = self._link.session.state, progress_of(self._source)
-                self.sight.show(self._watch, state, self._counted(), *progress)
-            motion = Polite(self._link.session, self.sight.told)
+                self.display.show(self._watch, state, self._counts(), *progress)
+            motion = Polite(self._link.session, self.display.messages)
             self._steering.follow(motion)
             rests = progress_of(self._source)[1] == 0.0
             if not (self._steering.held and rests) or stop.requested:
                 return
             time.sleep(ASKED_EVERY)
 
-    def _counted(self) -> Counted:
+    def _counts(self) -> PacketCounts:
         counters = self._link.session.counters
         late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
-        return Counted(counters.answered, counters.missed, late, counters.unanswered)
+        return PacketCounts(counters.answered, counters.missed, late, counters.unanswered)

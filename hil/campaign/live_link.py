@@ -70,7 +70,7 @@ BEAT: Final = 0.05
 STALL: Final = 1.0
 """s within which the loop that supervises a motion must have turned."""
 _STARVED: Final = 0.4
-"""s between two beats that are told: the exchange may have missed them."""
+"""s between two beats that are reported: the exchange may have missed them."""
 
 
 class Heartbeat:
@@ -127,7 +127,7 @@ class Heartbeat:
             return text
         if self._stalled:
             cause = (
-                f"whatever looks at the motion (show, wish) did not return for "
+                f"whatever looks at the motion (show, request) did not return for "
                 f"{self._stalled:.1f} s, and nobody could have passed on a stop"
             )
         elif (starved := max(self._starved, self._clock() - self._last)) > _STARVED:
@@ -242,7 +242,7 @@ class LiveLink:
         Raises:
             LiveViewError: the live view cannot be served as asked for.
             CellError: the cell names no real link.
-            ControllerFault: the link cannot be opened (port taken, not permitted, no adapter), or
+            ControllerFault: the link cannot be opened (port in use, not permitted, no adapter), or
                 the system refuses a process.
         """
         return_large_arrays()
@@ -485,7 +485,7 @@ class LiveLink:
             trouble = self.view.trouble
             if self.exchange.alive:
                 trouble = (
-                    f"the exchange process still answers {END_TIMEOUT:g} s after it was told to "
+                    f"the exchange process still answers {END_TIMEOUT:g} s after it was asked to "
                     "end (an axis is open); it ends when the axes are closed"
                 )
         finally:

@@ -18,7 +18,7 @@ from hil.errors import ControllerFault
 from .errors import write_error
 from .motion_link import drives_in_force
 from .motion_watch import MotionWatch
-from .progress import Counted, Sight, duration_of, guard_in_force
+from .progress import PacketCounts, ProgressDisplay, duration_of, guard_in_force
 from .steering import NOT_BEGUN, Steering
 from .stop import Stop
 
@@ -30,7 +30,7 @@ POLL: Final = 0.02
 SLOW_DISK: Final = 1.0
 """s at once that a disk takes for a flush when something is wrong with it."""
 REST_TIMEOUT: Final = 30.0
-"""s for an arm that was told to stop to rest, and for the archive of a motion that has ended."""
+"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
 
 
 class LiveMotion:
@@ -44,7 +44,7 @@ class LiveMotion:
         self._view, self._exchange = link.view, link.exchange
         self._steering = Steering(watch, override)
         self._reader = link.reader()
-        self._told = False
+        self._stop_passed = False
 
     def run(self, source: MotionSource, spec: ArchiveSpec) -> MotionEnded:
         """See `MotionLink.run`."""
@@ -54,11 +54,11 @@ class LiveMotion:
         while self._wanted(source):
             self._require_same_session()
             self._view.forget_motion()
-            sight = self._sight(source)
+            display = self._display(source)
             self._link.heart.begin()
             try:
                 self._submit(source, spec)
-                return self._supervised(sight, spec)
+                return self._supervised(display, spec)
             except WithdrawnError:
                 continue  # it was stopped, held or slowed meanwhile, or a new session began
             finally:
@@ -66,11 +66,11 @@ class LiveMotion:
         self._link.complete("stopped", NOT_BEGUN)
         return MotionEnded("stopped", NOT_BEGUN, -1, -1)
 
-    def _supervised(self, sight: Sight, spec: ArchiveSpec) -> MotionEnded:
+    def _supervised(self, display: ProgressDisplay, spec: ArchiveSpec) -> MotionEnded:
         """How the motion that was asked for ended."""
         due = math.inf
         while True:
-            self._look(sight)
+            self._look(display)
             if (idle := self._view.not_begun()) is not None:
                 return self._give_up(idle)
             answer = self._link.archive.answer(POLL, self._link.job)
@@ -135,30 +135,30 @@ class LiveMotion:
             closed = self._link.complete("void", why)
             raise ControllerFault(f"{why}; {spec.path} is {closed.outcome}") from error
 
-    def _look(self, sight: Sight) -> None:
-        """Take in what is new, pass wishes on, and show it if that is due."""
+    def _look(self, display: ProgressDisplay) -> None:
+        """Take in what is new, pass requests on, and show it if that is due."""
         self._link.heart.turn()
-        sight.note(self._view.look())
-        if self._stop.requested and not self._told:
+        display.note(self._view.look())
+        if self._stop.requested and not self._stop_passed:
             self._exchange.stop()
-            self._told = True
+            self._stop_passed = True
         if not self._view.motion_ended:
             self._steering.follow(self._exchange)
-        if sight.due:
-            sight.take(self._reader.drain())
+        if display.due:
+            display.take(self._reader.drain())
             status = self._view.status
-            sight.show(self._watch, status.state, self._counted(), status.motion_time, status.rate)
+            display.show(self._watch, status.state, self._counts(), status.motion_time, status.rate)
 
-    def _sight(self, source: MotionSource) -> Sight:
+    def _display(self, source: MotionSource) -> ProgressDisplay:
         connection, cell = self._link.connection, self._link.cell
         drives = drives_in_force(cell, connection)
         guard = guard_in_force(cell, drives, connection.init)
         self._reader.drain()
-        return Sight(drives, guard, self._steering, duration_of(source), self._counted())
+        return ProgressDisplay(drives, guard, self._steering, duration_of(source), self._counts())
 
-    def _counted(self) -> Counted:
+    def _counts(self) -> PacketCounts:
         status = self._view.status
-        return Counted(
+        return PacketCounts(
             status.answered,
             status.missed,
             status.late,
@@ -184,7 +184,7 @@ class LiveMotion:
     def _explained(self, reason: str, closed: Closed) -> str:
         """Why a motion ended, with the cause where a process of ours did not get on."""
         if reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
-            waited = f"its disk kept it waiting for {closed.disk_waited:.1f} s"
+            waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
             return f"{reason} ({waited}: look after that disk)"
         return self._link.heart.explained(reason)
 
@@ -205,11 +205,11 @@ class LiveMotion:
             rests = "the arm was brought to rest"
             if not self._come_to_rest():
                 state = self._view.state.name
-                rests = f"the arm was told to stop, but not seen to rest ({state})"
+                rests = f"the arm was asked to stop, but was not seen at rest ({state})"
             raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
 
     def _come_to_rest(self) -> bool:
-        """Whether the motion has ended; the exchange stops it by itself, but is told to again."""
+        """Whether the motion has ended; the exchange stops it by itself, but is asked to again."""
         self._exchange.stop()
         deadline = time.monotonic() + REST_TIMEOUT
         while not self._view.motion_ended and time.monotonic() < deadline:

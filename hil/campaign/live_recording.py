@@ -17,7 +17,7 @@ from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 
 from .errors import write_error
 from .motion_link import Progress, Recorded, Watch
-from .standstill import Standstill
+from .quality import Standstill
 from .stop import Stop
 
 if TYPE_CHECKING:

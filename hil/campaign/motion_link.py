@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,38 @@ from hil.errors import ControllerFault
 
 from .motion_watch import MotionWatch, unwatched_motion
 from .stop import Stop
+
+BEGIN_TIMEOUT: Final = 60.0
+"""s within which a motion that was accepted must have begun."""
+OFF_TIMEOUT: Final = 2.0
+"""s with the drive off after which a motion that was accepted does not begin any more."""
+_WITHOUT_DRIVE: Final = frozenset(
+    (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
+)
+
+
+class Beginning:
+    """Whether a motion that was accepted may still begin.
+
+    Args:
+        now: when it was asked for [s of any monotonic clock].
+    """
+
+    def __init__(self, now: float) -> None:
+        self._asked = self._driven = now
+
+    def hopeless(self, state: State, now: float) -> str | None:
+        """Why a motion that has not begun will not begin any more, in words; None while it may."""
+        if state not in _WITHOUT_DRIVE:
+            self._driven = now
+        if now - self._driven > OFF_TIMEOUT and state is State.FAULTED:
+            return "a refusal came before the motion began"
+        if now - self._driven > OFF_TIMEOUT:
+            return "the drive went off before the motion began"
+        if now - self._asked > BEGIN_TIMEOUT:
+            return f"the motion did not begin within {BEGIN_TIMEOUT:g} s ({state.name})"
+        return None
+
 
 Array = NDArray[np.float64]
 
@@ -150,7 +182,7 @@ class Connection:
 
 
 def not_ready(state: State, waited: float) -> ControllerFault:
-    """What is told where a controller did not come so far that a motion may be asked for.
+    """What is reported where a controller did not come so far that a motion may be asked for.
 
     Args:
         state: of the session.
@@ -217,9 +249,9 @@ class MotionLink(Protocol):
             spec: its archive.
             stop: asks for a stop on the path.
             override: the largest fraction of the planned speed. The motion runs at the smaller of
-                this and the wish's, from its very first cycle.
+                this and the request's, from its very first cycle.
             watch: sees the motion, and may slow, hold and release it. Nothing begins while its
-                wish is a hold.
+                request is a hold.
 
         Raises:
             ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it

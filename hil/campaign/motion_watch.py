@@ -1,4 +1,4 @@
-"""A motion while it goes on: what is seen of it, and what the person at the machine wishes."""
+"""A motion while it goes on: what is seen of it, and what the person at the machine requests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OperatorRequest:
-    """What the person wants of the motion, until another wish.
+    """What the person wants of the motion, until another request.
 
     Attributes:
         override: fraction (0 to 1) of the planned speed.
@@ -105,18 +105,18 @@ class MotionWatch(Protocol):
         """Look; called about ten times a second."""
         ...
 
-    def wish(self) -> OperatorRequest:
-        """The latest wish."""
+    def request(self) -> OperatorRequest:
+        """The latest request."""
         ...
 
 
 class Unwatched:
-    """Nobody looks, and nobody wishes anything else than the motion as it was planned."""
+    """Nobody looks, and nobody requests anything else than the motion as it was planned."""
 
     def show(self, progress: MotionProgress) -> None:
         """Nobody looks."""
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """The motion as it was planned."""
         return OperatorRequest()
 

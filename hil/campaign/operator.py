@@ -1,4 +1,4 @@
-"""The person at a running campaign: what is shown to them, and what they wish."""
+"""The person at a running campaign: what is shown to them, and what they request."""
 
 from __future__ import annotations
 
@@ -99,9 +99,9 @@ class DryRunSummary:
 class Operator(Protocol):
     """Who watches a run.
 
-    `show` and `wish` are called from the loop that supervises the motion and must return at once:
-    no stop and no hold is passed on meanwhile. On a real link the arm is brought to rest on its
-    path when one of them takes longer than a second. One that raises costs only what it shows.
+    `show` and `request` are called from the loop that supervises the motion and must return at
+    once: no stop and no hold is passed on meanwhile. On a real link the arm is brought to rest on
+    its path when one of them takes longer than a second. One that raises costs only what it shows.
     """
 
     @property
@@ -113,8 +113,8 @@ class Operator(Protocol):
         """Show where the run stands."""
         ...
 
-    def wish(self) -> OperatorRequest:
-        """Return what the person wishes now: override and hold."""
+    def request(self) -> OperatorRequest:
+        """Return what the person requests now: override and hold."""
         ...
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
@@ -134,7 +134,7 @@ class Unattended:
         """Show nothing."""
         del status
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """Full speed."""
         return OperatorRequest()
 

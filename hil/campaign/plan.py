@@ -27,14 +27,14 @@ class PlannedMotion:
 
     Attributes:
         trajectory: the motion.
-        moves: start, moves and limits, without the motion; None where they were not kept.
+        moves: start, moves and limits, without the motion; None where they were not stored.
     """
 
     trajectory: PiecewiseCubic | FourierSeries
     moves: PlanFile | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `from_dict` restores every bit, through JSON too."""
+        """Return data; `from_dict` restores every bit, through JSON too."""
         return {"trajectory": self.trajectory.to_dict(), **moves_to_dict(self.moves)}
 
     @classmethod
@@ -48,15 +48,15 @@ class PlannedMotion:
 
 
 def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
-    """Return the entry `moves` of plain data, a plan file without its motion; none without moves.
+    """Return the entry `moves` of data, a plan file without its motion; none without moves.
 
-    The motion stands beside it, so that it is not kept twice.
+    The motion stands beside it, so that it is not stored twice.
     """
     return {} if moves is None else {"moves": replace(moves, trajectory=None).to_dict()}
 
 
 def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
-    """Return the entry `moves` of plain data, None if there is none."""
+    """Return the entry `moves` of data, None if there is none."""
     return PlanFile.from_dict(data["moves"]) if "moves" in data else None
 
 
@@ -68,7 +68,7 @@ class CampaignPlan:
         excitation: the motion to fit, and how it was found.
         validation: the motions to predict.
         moves: those of the excitation, with the limits that it was planned for; None for sines,
-            and where they were not kept.
+            and where they were not stored.
     """
 
     excitation: Excitation

@@ -31,7 +31,7 @@ REMEMBERED: Final = 8
 
 
 @dataclass(frozen=True)
-class Counted:
+class PacketCounts:
     """Fates of packets of one session up to a moment; see `drivers.events.Counters`."""
 
     answered: int = 0
@@ -43,7 +43,7 @@ class Counted:
 
 
 @dataclass(eq=False)
-class Sight:
+class ProgressDisplay:
     """What is to be seen of one motion.
 
     Attributes:
@@ -51,16 +51,16 @@ class Sight:
         guard: narrowed to the limits in force.
         steering: of the motion.
         duration: s, of the planned motion; None if unknown.
-        before: counted when the motion was asked for.
-        told: events in words, the last ones.
+        before: counts when the motion was asked for.
+        messages: events in words, the last ones.
     """
 
     drives: DriveTrain
     guard: Guard
     steering: Steering
     duration: float | None
-    before: Counted
-    told: deque[str] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    before: PacketCounts
+    messages: deque[str] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _last: NDArray[np.void] | None = None
     _due: float = -math.inf
 
@@ -72,7 +72,7 @@ class Sight:
     def note(self, events: Iterable[ExchangeEvent]) -> None:
         """Take events in."""
         for event in events:
-            self.told.append(describe(event))
+            self.messages.append(describe(event))
 
     def take(self, records: NDArray[np.void]) -> None:
         """Take cycle records in; the last one counts."""
@@ -80,7 +80,12 @@ class Sight:
             self._last = records[-1:].copy()
 
     def show(
-        self, watch: MotionWatch, state: State, counted: Counted, motion_time: float, rate: float
+        self,
+        watch: MotionWatch,
+        state: State,
+        counts: PacketCounts,
+        motion_time: float,
+        rate: float,
     ) -> None:
         """Let the watch look."""
         self._due = time.monotonic() + SHOWN_EVERY
@@ -95,12 +100,12 @@ class Sight:
             current_share = np.abs(current) / self.guard.current
         watch.show(
             MotionProgress(
-                motion_time=_told(motion_time),
+                motion_time=_number(motion_time),
                 duration=self.duration,
-                cycles=counted.answered - before.answered,
-                missed=counted.missed - before.missed,
-                late=counted.late - before.late,
-                untaken=counted.untaken - before.untaken,
+                cycles=counts.answered - before.answered,
+                missed=counts.missed - before.missed,
+                late=counts.late - before.late,
+                untaken=counts.untaken - before.untaken,
                 state=state,
                 position=position,
                 following_error=error,
@@ -108,10 +113,10 @@ class Sight:
                 current=current,
                 current_share=current_share,
                 override=self.steering.fraction,
-                rate=_told(rate),
+                rate=_number(rate),
                 held=self.steering.held,
-                latency=_latency(counted, before),
-                events=tuple(self.told),
+                latency=_latency(counts, before),
+                events=tuple(self.messages),
             )
         )
 
@@ -132,16 +137,16 @@ def duration_of(source: object) -> float | None:
     return float(duration) if isinstance(duration, int | float) else None
 
 
-def _told(value: float) -> float | None:
+def _number(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _latency(counted: Counted, before: Counted) -> Latency | None:
-    counts: Sequence[int] = counted.latencies
+def _latency(latest: PacketCounts, before: PacketCounts) -> Latency | None:
+    counts: Sequence[int] = latest.latencies
     if before.latencies:
         counts = [now - then for now, then in zip(counts, before.latencies, strict=True)]
     shares = [quantile(counts, share) for share in (0.5, 0.99, 1.0)]
-    median, p99, worst = (None if value is None else min(value, counted.worst) for value in shares)
+    median, p99, worst = (None if value is None else min(value, latest.worst) for value in shares)
     if median is None or p99 is None or worst is None:
         return None
     return Latency(median, p99, worst)

@@ -23,7 +23,45 @@ from identification.signals.noise import STANDSTILL_WINDOW
 from identification.signals.recording import stuck
 from planner import FourierSeries, PiecewiseCubic
 
-from .standstill import ARM_MOVED
+TARGET_MOVED = 1e-5
+"""rad; a target at rest does not change at all, but its rounding may."""
+ARM_MOVED = 5e-4
+"""rad; more than an encoder's noise, less than any motion makes in a second."""
+REST = 1.0
+"""s of the controller's time without motion after which the arm is at rest."""
+
+
+class Standstill:
+    """Looks at records for the last motion of target or arm. A joint not known counts as moving.
+
+    Args:
+        period: cycle of the controller, s.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._cycles = round(REST / period)
+        self._target: NDArray[np.float64] | None = None
+        self._position: NDArray[np.float64] | None = None
+        self._since = 0
+
+    def take(self, records: NDArray[np.void]) -> bool:
+        """Whether the arm has been at rest for `REST` at the end of the next records (k,)."""
+        if not len(records):
+            return False
+        for record in records:
+            target, position, cycle = record["target_position"], record["position"], record["cycle"]
+            still = (
+                self._target is not None
+                and self._position is not None
+                and cycle > self._since
+                and bool(np.all(np.abs(target - self._target) <= TARGET_MOVED))
+                and bool(np.all(np.abs(position - self._position) <= ARM_MOVED))
+            )
+            if not still:
+                self._target, self._position = target.copy(), position.copy()
+                self._since = int(cycle)
+        return int(records["cycle"][-1]) - self._since >= self._cycles
+
 
 Array = NDArray[np.float64]
 
@@ -37,7 +75,7 @@ SATURATED: Final = 0.98
 """Share of the current limit that counts as reaching it."""
 SATURATED_CYCLES: Final = 3
 """So many in a row are no noise."""
-KEPT: Final = 9
+COMPARED: Final = 9
 """Earlier repetitions that a new one is compared with."""
 FEWEST: Final = 4
 """Earlier repetitions that tell their own scatter."""
@@ -59,16 +97,16 @@ class Groups:
     """Repetitions of two kinds: each agrees with its own and with none of the others.
 
     Attributes:
-        counted: file names of those that count.
+        reference: file names of those that count.
         later: of attempts that were rejected for being unlike them.
     """
 
-    counted: tuple[str, ...]
+    reference: tuple[str, ...]
     later: tuple[str, ...]
 
     def with_one(self, name: str) -> Groups:
         """One more later attempt."""
-        return Groups(self.counted, (*self.later, name))
+        return Groups(self.reference, (*self.later, name))
 
 
 @dataclass(frozen=True)
@@ -171,7 +209,7 @@ def torn_or_slowed(
 
 
 def unrest(played: Played, cell: Cell) -> Problem | None:
-    """What is wrong with a recording of the arm at rest: the noise of its sensors is taken from it.
+    """What is wrong with a recording of the arm at rest: the noise of its sensors is read from it.
 
     Args:
         played: it, as archived.
@@ -187,19 +225,19 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
         return None
     return Problem(
         f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
-        f"still; below {allowed[joint]:.2g} rad/s it counts as standing"
+        f"still; below {allowed[joint]:.2g} rad/s it counts as at rest"
     )
 
 
 def _stuck(played: Played, cell: Cell) -> Problem | None:
-    """A joint that stands while it is told to move: no estimate is made of such a recording."""
+    """A joint that stands while it is commanded to move: nothing is estimated from such data."""
     for joint, name in enumerate(cell.joint_names):
         found = stuck(played.position[:, joint], played.commanded[:, joint])
         if found is not None:
             start, travel = found
             return Problem(
                 f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
-                f"after the begin on while it is told to move by {travel:.3g}"
+                f"after the begin on while it is commanded to move by {travel:.3g}"
             )
     return None
 
@@ -244,12 +282,12 @@ class RepetitionCheck:
 
     def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
         self._cell, self._trajectory = cell, trajectory
-        self._earlier: deque[Played] = deque(maxlen=KEPT)
-        self._differences: deque[Difference] = deque(maxlen=2 * KEPT)
+        self._earlier: deque[Played] = deque(maxlen=COMPARED)
+        self._differences: deque[Difference] = deque(maxlen=2 * COMPARED)
 
     def learn(self, archives: Sequence[Path]) -> None:
         """Take in repetitions that were found good before."""
-        for path in archives[-2 * KEPT :]:
+        for path in archives[-2 * COMPARED :]:
             self.accept(Played.of(open_archive(path, fields=FIELDS)))
 
     def accept(self, played: Played) -> None:
@@ -277,7 +315,7 @@ class RepetitionCheck:
             bound = _bounds(past, first, least, len(values))
             joint = int(np.argmax(values / bound))
             if values[joint] > bound[joint]:
-                return self._told(what, joint, float(values[joint]), float(bound[joint]))
+                return self._problem(what, joint, float(values[joint]), float(bound[joint]))
         return None
 
     @property
@@ -298,7 +336,7 @@ class RepetitionCheck:
         floor = 1e-3 * cell.drive_train.current_limit
         return Difference(apart / following_threshold(cell), off / np.maximum(size, floor))
 
-    def _told(self, what: str, joint: int, value: float, bound: float) -> Problem:
+    def _problem(self, what: str, joint: int, value: float, bound: float) -> Problem:
         name, earlier = self._cell.joint_names[joint], len(self._earlier)
         scale = "the following-error threshold" if what == "position" else "its rms current"
         return Problem(

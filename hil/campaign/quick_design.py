@@ -66,7 +66,7 @@ def quick_settings(cell: Cell) -> DesignSettings:
 def plan_around(
     cell: Cell, excitation: Excitation, checks: MotionChecks | None = None
 ) -> CampaignPlan:
-    """Return a plan with this excitation, and validation motions drawn for the cell.
+    """Return a plan with this excitation, and validation motions motion for the cell.
 
     Args:
         cell: whose `[campaign]` says how many validation motions, and from which seed.
@@ -88,7 +88,7 @@ def plan_around(
     validation = _validation_motions(cell, checks)
     return CampaignPlan(
         excitation,
-        tuple(PlannedMotion(drawn.trajectory, _moves_of(cell, drawn)) for drawn in validation),
+        tuple(PlannedMotion(motion.trajectory, _moves_of(cell, motion)) for motion in validation),
         _moves_of(cell, excitation),
     )
 
@@ -107,8 +107,8 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, 
             currents=planned(checks.currents),
         )
     except NoFeasibleMotionError as error:
-        told = forbidden(error, checks.frame)
-        raise NoExcitationError(f"no motion to test the result with: {told}") from error
+        reason = forbidden(error, checks.frame)
+        raise NoExcitationError(f"no motion to test the result with: {reason}") from error
 
 
 def _moves_of(cell: Cell, motion: Excitation | DrawnMotion) -> PlanFile | None:

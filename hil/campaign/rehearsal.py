@@ -15,16 +15,15 @@ from hil.reading import lies_there, text_of
 from hil.results.frozen import Frozen
 
 from .errors import CampaignFolderError
-from .folder import CampaignFolder
-from .read_back import read_back
+from .folder import CampaignFolder, read_back
 
 FORMAT_VERSION: Final = 1
-PLAIN: Final = "as modelled"
+AS_MODELLED: Final = "as modelled"
 EFFECTS: Final = "with what the model leaves out"
 """The two runs of a rehearsal, in words."""
 CRITERIA: Final = (
-    f"motions ({PLAIN})",
-    f"current ({PLAIN})",
+    f"motions ({AS_MODELLED})",
+    f"current ({AS_MODELLED})",
     "excitation",
     "parameters",
     "unseen motion",
@@ -134,7 +133,7 @@ class Rehearsal(Frozen):
         return self.model_copy(update={"failed_seeds": tuple(sorted(failed - {self.seed}))})
 
     @property
-    def doubt(self) -> str | None:
+    def warning(self) -> str | None:
         """What a reader of one that passed must know, in a sentence; None for nothing."""
         if not self.passed or not self.failed_seeds:
             return None
@@ -145,7 +144,7 @@ class Rehearsal(Frozen):
     def line(self) -> str:
         """How it went, in one sentence."""
         if self.passed:
-            but = "" if self.doubt is None else f"; {self.doubt}"
+            but = "" if self.warning is None else f"; {self.warning}"
             return (
                 f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot see is "
                 f"in rehearsal.json (not_seen){but}"

@@ -20,7 +20,7 @@ from .campaign import Campaign
 from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .intervals import require_runnable, wanted
 from .link import Link
-from .rehearsal import CRITERIA, EFFECTS, PLAIN, Criterion, Rehearsal
+from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 from .rehearsal_twin import Twin
 from .stop import Stop
 
@@ -244,7 +244,7 @@ def rehearse(
 
     Raises:
         MotionRefusedError: a motion breaks a limit of the cell; nothing was rehearsed.
-        OperatorStopError: it was stopped; what was recorded is kept.
+        OperatorStopError: it was stopped; what was recorded remains.
         CampaignFolderError: the folder was changed after the first archive, or meanwhile, or is
             in use.
         OutputError: the result cannot be written.
@@ -292,7 +292,7 @@ def _rehearsed(
         reporter.say(f"assumed: {sentence}")
     criteria: list[Criterion] = []
     seconds = 0.0
-    for name, where, effects in ((PLAIN, "plain", False), (EFFECTS, "effects", True)):
+    for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
         # What the model leaves out is no matter of repetition.
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = _campaign(root / where, replace(campaign, cell=cell))
@@ -338,7 +338,7 @@ def _campaign(root: Path, like: Campaign) -> Campaign:
 
 
 def _seconds(rehearsal: Campaign) -> float:
-    """Length of all motions of a plan, without the ways between them."""
+    """Length of all motions of a plan, without the moves between them."""
     return sum(one.trajectory.duration for one in wanted(rehearsal.cell, rehearsal.plan))
 
 
@@ -357,13 +357,13 @@ def _run(
     except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
             raise OperatorStopError(
-                "the rehearsal was stopped; what was recorded is kept, rehearse again to go on"
+                "the rehearsal was stopped; the recordings remain, rehearse again to go on"
             ) from error
-        failures.append(_told(error))
+        failures.append(_reason(error))
     return Ran(name, tuple(failures))
 
 
-def _told(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     if isinstance(error, MotionFailedError):
         return error.sentence
     return str(error).rstrip(".")

@@ -1,7 +1,7 @@
 """The simulated twin of a cell: an arm near the nominal one, behind the cell's own link.
 
 The twin knows of the cell what a robot would: its links, its gears, its limits. What nobody knows
-before the robot has moved is drawn: masses, inertias, rotors and friction within `SPREAD` of the
+before the robot has moved is varied: masses, inertias, rotors and friction within `SPREAD` of the
 nominal figures. A cell without `[simulation]` gets one from `[nominal]` and the defaults below.
 """
 
@@ -52,7 +52,7 @@ MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
 """s; a slower current loop would shake the simulated arm."""
 _HORIZON: Final = 4.0
-"""Faults are drawn for so many times the motion's length: settling and ways take time too."""
+"""Faults are varied for so many times the motion's length: settling and ways take time too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,11 @@ class Twin:
     """A simulated arm to rehearse on.
 
     Attributes:
-        cell: nominal, but simulated, with fewer repetitions; what was drawn is in its
+        cell: nominal, but simulated, with fewer repetitions; what was varied is in its
             `[simulation]`.
         truth: planted parameters (p,) in the order of the model.
         assumed: what the arm has by assumption, in sentences.
-        seed: of everything drawn.
+        seed: of everything varied.
     """
 
     cell: Cell
@@ -78,11 +78,11 @@ class Twin:
 
         Args:
             cell: of any robot, with or without `[simulation]`.
-            seed: of what is drawn.
+            seed: of what is varied.
             repetitions: at most so many.
         """
         rng = np.random.default_rng(seed)
-        planted = _drawn(cell, rng)
+        planted = _varied(cell, rng)
         settings, assumed = _simulation(cell, planted, seed)
         text = _with_table(cell.text, "simulation", settings)
         text = replaced_value(text, "controller", "transport", toml_value("simulated"))
@@ -134,7 +134,7 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
 
     Args:
         cell: its `max_gap` says whether a lost packet is survived at all.
-        seconds: of the controller's time that they are drawn for.
+        seconds: of the controller's time that they are varied for.
         seed: of the draw.
     """
     rng = np.random.default_rng([seed, 7])
@@ -154,21 +154,21 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
     return tuple(faults)
 
 
-def _drawn(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
+def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
     """Inertias of links, rotors and friction within the spread of the URDF and of `[nominal]`."""
     nominal = cell.nominal
     n = len(cell.joint_names)
 
-    def drawn(values: list[float]) -> list[float]:
+    def varied(values: list[float]) -> list[float]:
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, n)
         return (np.array(values) * factors).tolist()  # type: ignore[no-any-return]
 
     return {
-        "inertia_scale": drawn([1.0] * n),
-        "rotor_inertia": drawn(nominal.rotor_inertia),
-        "coulomb": drawn(nominal.coulomb),
-        "viscous": drawn(nominal.viscous),
-        "third": drawn(nominal.third or [0.0] * n),
+        "inertia_scale": varied([1.0] * n),
+        "rotor_inertia": varied(nominal.rotor_inertia),
+        "coulomb": varied(nominal.coulomb),
+        "viscous": varied(nominal.viscous),
+        "third": varied(nominal.third or [0.0] * n),
     }
 
 

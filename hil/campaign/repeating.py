@@ -62,9 +62,9 @@ def play_until_good(
 ) -> str:
     """Run a motion, judge it and enter it; again where it fails its check.
 
-    An attempt that a person held or slowed counts as failed only if the wish is still for less than
-    full speed: then the next one would go the same way. Others of them are counted apart, for a
-    script that slows the arm by rule would have it move for ever.
+    An attempt that a person held or slowed counts as failed only if the request is still for less
+    than full speed: then the next one would go the same way. Others of them are counted apart, for
+    a script that slows the arm by rule would have it move for ever.
 
     Args:
         runner: plays it.
@@ -72,7 +72,7 @@ def play_until_good(
         interval: the motion.
         number: which of its kind, from 1.
         total: of how many.
-        reporter: told of what was rejected.
+        reporter: informed of what was rejected.
         warmth: asked before each attempt, and how it was when the motion began.
 
     Returns:
@@ -99,9 +99,9 @@ def play_until_good(
         )
         if problem.against is not None:
             raise ArmChangedError(
-                str(interval), problem.sentence, problem.against.counted, problem.against.later
+                str(interval), problem.sentence, problem.against.reference, problem.against.later
             )
-        still = not problem.by_hand or watch.wish().override < 1.0
+        still = not problem.by_hand or watch.request().override < 1.0
         (reasons if still else by_hand).append(problem.sentence)
     raise RepetitionsRejectedError(
         str(interval), reasons if len(by_hand) < MOST_BY_HAND else by_hand

@@ -156,7 +156,7 @@ def _rehearsal(campaign: Campaign) -> _Found:
         return _Found(False, sentence, command)
     if not found.passed:
         return _Found(False, found.line, command)
-    but = "" if found.doubt is None else f"; {found.doubt}"
+    but = "" if found.warning is None else f"; {found.warning}"
     return _Found(True, f"passed all {len(found.criteria)} criteria{but}", "")
 
 
@@ -179,7 +179,7 @@ def _dry_run(campaign: Campaign) -> _Found:
     if found.accepted is None:
         accept = f"hil run {_quoted(folder)} --accept-dry-run"
         names = "".join(f" --accept-torque {joint}" for joint in found.against_gravity)
-        but = "".join(f"; {doubt}" for doubt in found.doubts)
+        but = "".join(f"; {warning}" for warning in found.warnings)
         words = f"done ({found.duration:.0f} s), but not accepted{but}"
         return _Found(False, words, accept + names)
     return _Found(True, f"accepted by {found.accepted.by}, {found.accepted.at}", "")
@@ -262,7 +262,7 @@ def _left_behind(folder: CampaignFolder, name: str) -> str:
         or folder.whole(parsed.kind, parsed.index) is not None
     ):
         return f"{left}; nothing is missing without it"
-    return f"{left}: taken over if it is whole, its motion run again if not"
+    return f"{left}: used if it is whole, its motion run again if not"
 
 
 def _of_no_use(entry: Entry) -> str:

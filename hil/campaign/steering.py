@@ -1,4 +1,4 @@
-"""Passing on what the person wishes of a motion."""
+"""Passing on what the person requests of a motion."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .stop import Stop
 NOT_BEGUN: Final = "it had not begun"
 """Why a motion ends that was stopped before it was asked for."""
 ASKED_EVERY: Final = 0.02
-"""s between two questions for a wish where nothing else is to be done."""
+"""s between two questions for a request where nothing else is to be done."""
 
 
 class Steered(Protocol):
-    """A motion that can be told to go slower, to rest and to go on: `Session`, the exchange."""
+    """A motion that can be messages to go slower, to rest and to go on: `Session`, the exchange."""
 
     def override(self, fraction: float) -> None:
         """Go on at this fraction of the speed."""
@@ -38,11 +38,11 @@ class Steered(Protocol):
 
 
 class Steering:
-    """Takes the wishes of one motion's watch to the motion.
+    """Takes the requests of one motion's watch to the motion.
 
     Args:
-        watch: has the wishes.
-        most: largest fraction of the planned speed, whatever is wished.
+        watch: has the requests.
+        most: largest fraction of the planned speed, whatever is requested.
 
     Attributes:
         fraction: asked of the motion last.
@@ -61,7 +61,7 @@ class Steering:
     def begin(
         self, source: MotionSource, stop: Stop, meanwhile: Callable[[], object] = lambda: None
     ) -> bool:
-        """Have a motion begin at the speed wished for; waits while a hold is wished for.
+        """Have a motion begin at the speed requested; waits while a hold is requested.
 
         Args:
             source: the motion.
@@ -74,14 +74,14 @@ class Steering:
         Raises:
             ControllerFault: it is to be slower than planned and knows no override.
         """
-        wish = self._watch.wish()
-        while wish.held and not stop.requested:
+        request = self._watch.request()
+        while request.held and not stop.requested:
             meanwhile()
             time.sleep(ASKED_EVERY)
-            wish = self._watch.wish()
+            request = self._watch.request()
         if stop.requested:
             return False
-        self.fraction = min(self._most, wish.override)
+        self.fraction = min(self._most, request.override)
         change = getattr(source, "override", None)
         if callable(change):
             change(self.fraction)
@@ -94,19 +94,19 @@ class Steering:
 
     def unchanged(self, stop: Stop) -> bool:
         """Whether a motion may begin as `begin` left it; not if it is to be slower or to rest."""
-        wish = self._watch.wish()
-        return not (stop.requested or wish.held or wish.override < self.fraction)
+        request = self._watch.request()
+        return not (stop.requested or request.held or request.override < self.fraction)
 
     def follow(self, motion: Steered) -> None:
-        """Pass on what is wished now. A motion held before it began begins at rest."""
-        wish = self._watch.wish()
-        fraction = min(self._most, wish.override)
+        """Pass on what is requested now. A motion held before it began begins at rest."""
+        request = self._watch.request()
+        fraction = min(self._most, request.override)
         if fraction != self.fraction:
             self.fraction = fraction
             motion.override(fraction)
-        if wish.held is not self.held:
-            self.held = wish.held
-            if wish.held:
+        if request.held is not self.held:
+            self.held = request.held
+            if request.held:
                 motion.hold()
             else:
                 motion.resume()
@@ -114,33 +114,33 @@ class Steering:
 
 @dataclass
 class Polite:
-    """A `Steered` whose refusals are told instead of raised, as the exchange process tells them.
+    """A `Steered` whose refusals become messages, as in the exchange process.
 
     Attributes:
         motion: what is steered.
-        told: takes the refusals in words.
+        messages: takes the refusals in words.
     """
 
     motion: Steered
-    told: deque[str]
+    messages: deque[str]
 
     def override(self, fraction: float) -> None:
         """Go on at this fraction of the speed."""
         try:
             self.motion.override(fraction)
         except RequestError as error:
-            self.told.append(str(error))
+            self.messages.append(str(error))
 
     def hold(self) -> None:
         """Rest on the path."""
         try:
             self.motion.hold()
         except RequestError as error:
-            self.told.append(str(error))
+            self.messages.append(str(error))
 
     def resume(self) -> None:
         """Go on."""
         try:
             self.motion.resume()
         except RequestError as error:
-            self.told.append(str(error))
+            self.messages.append(str(error))

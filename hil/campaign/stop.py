@@ -1,4 +1,4 @@
-"""The operator's wish to stop, as a flag that every loop looks at."""
+"""The operator's request to stop, as a flag that every loop looks at."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Ends = tuple[Array, Array]
 
 
-class Ways:
+class StraightMoves:
     """Knows the ways that were planned and checked beforehand, and plans others like them.
 
     Args:
@@ -44,7 +44,7 @@ class Ways:
         self._cell, self._checks = cell, checks
         self._known = [interval for interval in known if interval.kind == "move"]
         self._seen = None if seen is None else [*seen]
-        self._taken = 0
+        self._given = 0
 
     def unseen(self, way: Interval) -> bool:
         """Whether nobody has watched this way in the dry run.
@@ -74,8 +74,8 @@ class Ways:
             found = way(self._cell, start, end)
             require_sound([found], self._checks)
             self._known.append(found)
-        self._taken += 1
-        return replace(found, index=self._taken - 1)
+        self._given += 1
+        return replace(found, index=self._given - 1)
 
 
 def seen_in_dry_run(folder: CampaignFolder) -> list[Ends]:

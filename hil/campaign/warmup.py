@@ -30,8 +30,8 @@ from hil.reading import lies_there, text_of
 from planner import FourierSeries, PiecewiseCubic
 
 from .errors import CampaignFolderError
+from .folder import read_back
 from .operator import DriftCurve
-from .read_back import read_back
 
 Array = NDArray[np.float64]
 
@@ -40,9 +40,9 @@ DEFAULT_DRIFT: Final = 0.002
 a few per cent at most; with half a minute each and a time constant of 20 min, which is usual, the
 slope falls to it from 1 % within about 40 motions."""
 WINDOW: Final = 4
-"""Motions that a slope is taken from."""
+"""Motions that a slope is read from."""
 COLD_AFTER: Final = 600.0
-"""s without motion after which the joints are taken to have cooled down."""
+"""s without motion after which the joints are assumed to have cooled down."""
 FORMAT_VERSION: Final = 2
 """1 did not say when the joints moved last."""
 _FIELDS: Final = ("torque", "commanded_position", "position")
@@ -171,8 +171,8 @@ class WarmUp:
 
     def cooled(self) -> WarmUp:
         """A new warm-up after this one was lost in a pause."""
-        kept = (*self.earlier, *self.motions)
-        return replace(self, motions=(), outcome="going on", earlier=kept)
+        earlier = (*self.earlier, *self.motions)
+        return replace(self, motions=(), outcome="going on", earlier=earlier)
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:

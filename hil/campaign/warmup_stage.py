@@ -27,7 +27,7 @@ class WarmUpStage:
         cell: of the campaign.
         plan: of the campaign.
         plan_hash: of exactly that plan.
-        reporter: told of what is decided.
+        reporter: informed of what is decided.
         watch: shows the curve.
         simulated: whether nothing but a simulated arm can move.
 
@@ -65,7 +65,7 @@ class WarmUpStage:
         found = self._found()
         if found is None or found.outcome != "not warm":
             return None
-        return f"the arm was not warm when the repetitions began ({_told(found)})"
+        return f"the arm was not warm when the repetitions began ({_sentence(found)})"
 
     def next_motion(self) -> Interval | None:
         """What a warm-up would run next, None where none is wanted."""
@@ -107,8 +107,8 @@ class WarmUpStage:
             state = replace(self._with(state, name), moved_at=time.time())
             state.save(self._folder.warmup)
             self._watch.drift = state.curve
-            self._watch.note(_told(state))
-        self._reporter.say(_told(state))
+            self._watch.note(_sentence(state))
+        self._reporter.say(_sentence(state))
 
     def keep(self, runner: Runner, entering: Entering) -> None:
         """Warm up anew where the joints have cooled down since they moved last.
@@ -128,7 +128,7 @@ class WarmUpStage:
         found = self._found()
         if not self.threshold or found is None or not found.motions or not found.cold(began):
             return None
-        return Problem(f"{_rested(found, began)} when it began and was taken to be cold", True)
+        return Problem(f"{_rested(found, began)} when it began and was assumed to be cold", True)
 
     def moved(self) -> None:
         """A motion has ended that keeps the joints warm."""
@@ -169,7 +169,7 @@ class WarmUpStage:
             state.save(self._folder.warmup)
         if state.motions and state.cold(time.time()):
             rested = _rested(state, time.time())
-            self._reporter.say(f"{rested} and is taken to be cold: warming up anew")
+            self._reporter.say(f"{rested} and is assumed to be cold: warming up anew")
             self.pauses.append(f"{rested} during the campaign, and was warmed up anew")
             state = state.cooled()
         return state
@@ -184,7 +184,7 @@ def _rested(state: WarmUp, now: float) -> str:
     return f"the arm had rested for {(now - state.moved_at) / 60.0:.0f} min"
 
 
-def _told(state: WarmUp) -> str:
+def _sentence(state: WarmUp) -> str:
     """Where a warm-up stands, in a sentence."""
     done, change = len(state.motions), float(state.curve.change[-1])
     text = f"warm-up: friction changes by {change:.2%} a motion after {done} motions"

@@ -9,7 +9,7 @@ import numpy as np
 from drivers.errors import DriverError
 
 from .errors import CellError
-from .urdf import urdf_limits
+from .text import urdf_limits
 
 if TYPE_CHECKING:
     from .cell import Cell

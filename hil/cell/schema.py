@@ -139,7 +139,7 @@ class JointFrictionTable(Table):
         default=None, description="true or false: Coulomb and viscous friction by direction"
     )
     standstill: NonNegative | None = Field(
-        default=None, description="speed in rad/s (m/s) below which the joint counts as standing"
+        default=None, description="speed in rad/s (m/s) below which the joint counts as at rest"
     )
     zone: Literal["exclude", "linear"] | None = Field(
         default=None, description='"exclude" or "linear"'
@@ -168,7 +168,7 @@ class FrictionTable(Table):
         default=False, description="true or false: Coulomb and viscous friction by direction"
     )
     standstill: NonNegative = Field(
-        default=0.02, description="speed in rad/s (m/s) below which a joint counts as standing"
+        default=0.02, description="speed in rad/s (m/s) below which a joint counts as at rest"
     )
     zone: Literal["exclude", "linear"] = Field(
         default="exclude",

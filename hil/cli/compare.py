@@ -62,8 +62,8 @@ def compare(
         if not quiet:
             for one in findings(found):
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
-            for doubt in found.warnings:
-                typer.echo(printable(f"note: {doubt}"), err=True)
+            for warning in found.warnings:
+                typer.echo(printable(f"note: {warning}"), err=True)
             typer.echo(f"note: {caveat(found)}", err=True)
         typer.echo(printable(f"{verdict(found)}."))
     if fail_on_change and found.changed:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from hil import lines
-from hil.campaign.from_design import campaign_of_design, require_replaceable
+from hil.campaign.campaign import campaign_of_design, require_replaceable
 from hil.campaign.quick_design import quick_settings
 from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.campaign.trajectory_files import write_trajectories
@@ -255,7 +255,7 @@ def design(
         Literal["arm", "payload"],
         typer.Option(
             "--for",
-            help="arm: all parameters of the arm. payload: what it carries, the arm known, by a "
+            help="arm: all parameters of the arm. payload: only the payload, the arm known, by a "
             "motion of at most ten seconds (`hil payload`).",
         ),
     ] = "arm",

@@ -42,7 +42,7 @@ def exit_code_of(error: BaseException) -> int:
 
 
 def as_json(error: BaseException) -> dict[str, Any]:
-    """What a script is told of an error.
+    """What a script receives of an error.
 
     Returns:
         `error`: the sentence; `kind`: name of its class; `exit_code`; of an `InputError` also

@@ -15,7 +15,7 @@ import typer
 
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.announced_limits import checks_in_force, narrower_thresholds
+from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
 from hil.campaign.motion_watch import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
@@ -188,7 +188,7 @@ class _Shown:
             self._task.advance(progress.motion_time - self._done)
             self._done = progress.motion_time
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """The motion as it was planned; only Ctrl-C stops it."""
         return OperatorRequest()
 
@@ -278,7 +278,7 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
     lines.append(
         f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
-        f"limits, motor currents, floor, walls and the arm itself are kept; to {who}"
+        f"limits, motor currents, floor, walls and the arm itself are respected; to {who}"
     )
     below = narrower_thresholds(cell, link.connection)
     lines += [f"the smaller following-error threshold counts, {note}" for note in below]

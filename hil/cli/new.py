@@ -24,7 +24,7 @@ from hil.new import (
     read_init,
     with_clear_home,
 )
-from hil.whole_number import port_number
+from hil.reading import port_number
 
 PORT = 1000
 """On which a PC listens to a C4G Open, as delivered."""

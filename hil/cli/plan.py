@@ -107,7 +107,7 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     """Read via points (m, n) [rad] from a table of degrees.
 
     One row per point, values apart by commas, semicolons or blanks; what follows a # is a
-    comment; a first row without a single number is taken for names of columns and skipped.
+    comment; a first row without a single number is read as names of columns and skipped.
 
     Raises:
         InputError: a row is not one finite number per joint.

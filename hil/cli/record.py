@@ -142,7 +142,7 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
         "duration": done.records * cell.period,
         "missed": done.missed,
         "late": done.late,
-        "not_taken": done.untaken,
+        "not_accepted": done.untaken,
         "records_lost": done.records_lost,
         "events_lost": done.events_lost,
     }
@@ -154,7 +154,7 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     lost += f", {done.events_lost} events LOST" if done.events_lost else ""
     say(
         f"{path}: {seconds:.1f} s in {done.records} cycles, {done.missed} packets missed, "
-        f"{done.late} answers late, {done.untaken} not taken{lost}; "
+        f"{done.late} answers late, {done.untaken} not accepted{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 
@@ -220,7 +220,7 @@ class View:
             f"{progress.late} late",
         ]
         if progress.untaken:
-            parts.append(f"{progress.untaken} answers not taken")
+            parts.append(f"{progress.untaken} replies not accepted")
         if progress.position is not None and np.isfinite(progress.position).all():
             angles = np.degrees(self._cell.controller_angles(progress.position))
             parts.append(" ".join(f"{angle:.2f}°" for angle in angles))

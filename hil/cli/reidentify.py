@@ -208,7 +208,7 @@ def _level(one: LevelEstimate) -> dict[str, Any]:
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
             for name, value, std in zip(one.names, one.values, one.std, strict=True)
         },
-        "doubts": list(one.warnings),
+        "warnings": list(one.warnings),
     }
 
 

@@ -239,7 +239,7 @@ OwnMotion = Annotated[
     bool,
     typer.Option(
         "--own-motion",
-        help="In mode 0 the controller's own program moves the arm about, until told to end.",
+        help="In mode 0 the controller's own program moves the arm about, until it is stopped.",
     ),
 ]
 OwnSpeed = Annotated[

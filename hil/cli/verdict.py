@@ -25,7 +25,7 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
     Args:
         results: of the identification.
         json: print verdict, findings and figures as one JSON object instead.
-        quiet: print only the verdict and the doubts.
+        quiet: print only the verdict and its warnings.
     """
     if json:
         typer.echo(as_json(results))
@@ -82,7 +82,7 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
     """What is wrong, doubtful and in order, and what to do next."""
     judgement = results.judgement
     if judgement is None or quiet:
-        return [f"note: {doubt}" for doubt in results.verdict.doubts]
+        return [f"note: {warning}" for warning in results.verdict.warnings]
     said = {finding.words for finding in judgement.findings}
     lines = [
         f"{_LEVELS[level]}: {finding.words}"
@@ -91,7 +91,7 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
         if finding.level == level
     ]
     # What is known beforehand of the archives is no check of the model.
-    lines += [f"note: {doubt}" for doubt in results.verdict.doubts if doubt not in said]
+    lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in said]
     return lines + [f"next: {step}" for step in judgement.next_steps]
 
 

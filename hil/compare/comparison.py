@@ -162,9 +162,9 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
     )
     called = short_names([one.campaign for one in campaigns])
     own = tuple(
-        f"{name}: {doubt}"
+        f"{name}: {warning}"
         for name, one in zip(called, campaigns, strict=True)
-        for doubt in one.warnings
+        for warning in one.warnings
     )
     return Comparison(
         arm=gathered.arm.name,

@@ -226,7 +226,7 @@ def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Findin
         where = f"between {names[k - 1]} and {names[k]}"
         if payload.changed[k]:
             beside = "" if statement is None else ", beside what is stated,"
-            words = f"What the arm carries{beside} has changed {where}: {_what(change)}."
+            words = f"The payload{beside} has changed {where}: {_what(change)}."
             step = "State the payload in the cell file, or check the tool and its fastening."
         else:
             words = (
@@ -266,7 +266,7 @@ def _what(change: Change) -> str:
             f"its mass not significantly ({change.mass:+.2g} ± {change.mass_std:.1g} kg),"
             " but its centre or inertia"
         )
-    verb = "put on" if change.mass > 0 else "taken off"
+    verb = "put on" if change.mass > 0 else "removed"
     text = f"{abs(change.mass):.2f} ± {change.mass_std:.2g} kg {verb}"
     if np.isfinite(change.moment).all():
         centre = (round(float(c)) for c in change.moment / change.mass / _MILLIMETRE)
@@ -281,9 +281,9 @@ def _nothing(arm: ArmTrend) -> Finding:
     count = len(arm.campaigns)
     if count < 2:
         return Finding("quiet", "There is one campaign, and nothing to compare it with.")
-    carried = "No change of what it carries was found."
+    carried = "No change of its payload was found."
     if arm.payload.untested:
-        carried = f"Whether it carries the same was not tested: {arm.payload.untested}."
+        carried = f"Whether its payload is the same was not tested: {arm.payload.untested}."
     if count <= FEWEST:
         judged = f"Its axes are judged from the campaign on that has {FEWEST} before it"
         return Finding("quiet", f"{carried} {judged}; there are {count}.")
@@ -305,7 +305,7 @@ def _order_findings(arm: ArmTrend) -> list[Finding]:
     if arm.dated or len(arm.campaigns) < 2:
         return []
     words = (
-        "No campaign has a time of recording: they are taken in the order of their folders'"
+        "No campaign has a time of recording: they are used in the order of their folders'"
         f" names, from {arm.names[0]} to {arm.names[len(arm.campaigns) - 1]}."
         " If that is not the order of time, before and after mean nothing here."
     )

@@ -116,7 +116,7 @@ class Change:
         p_value: of nothing having changed.
         share: of the change of all inertial parameters that a payload explains.
         effect: RMS torque of the change, in standard deviations of the torque residual.
-        mass: of what was put on [kg], negative if taken off; NaN where it cannot be seen.
+        mass: of what was put on [kg], negative if subtracted; NaN where it cannot be seen.
         mass_std: its standard deviation [kg].
         moment: mass times centre in the last joint's frame (3,) [kg m].
         moment_std: (3,).
@@ -186,7 +186,7 @@ def pooled(states: Sequence[State]) -> State:
 
 
 def compare(onto: Projection, before: State, after: State, scatter: float = 1.0) -> Change | None:
-    """Test whether something was put on or taken off, None where blocks are too few to tell.
+    """Test whether something was put on or subtracted, None where blocks are too few to tell.
 
     Args:
         onto: the projection.
@@ -373,7 +373,7 @@ def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projec
     known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
     rows = sum(int(one.samples.sum()) for one in campaigns)
     onto = projection(model, known, np.sum(information, axis=0), rows)
-    return "nothing that is known of this arm depends on what it carries" if onto is None else onto
+    return "nothing that is known of this arm depends on its payload" if onto is None else onto
 
 
 def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:

@@ -28,7 +28,7 @@ from scipy.stats import kendalltau, theilslopes
 from scipy.stats import t as student
 
 from hil.batch.types import BatchResult, Broken, LevelEstimate
-from hil.timestamps import instant
+from hil.reading import instant
 from identification import RobotModel
 
 from .payload import PayloadTrend, payload_trend

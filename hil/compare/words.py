@@ -129,7 +129,7 @@ def _unchanged(found: Comparison) -> list[Finding]:
         words = f"Whether it carries the same was not tested: {found.payload.untested}."
         sentences.append(Finding("same", words))
     elif not found.load_changed:
-        sentences.append(Finding("same", "What it carries has not changed significantly."))
+        sentences.append(Finding("same", "The payload has not changed significantly."))
     return sentences
 
 
@@ -171,9 +171,9 @@ def to_dict(found: Comparison) -> dict[str, Any]:
         "friction_slight": found.friction_slight,
         "load_changed": found.load_changed,
         "verdict": verdict(found),
-        "told": [vars(one) for one in findings(found)],
+        "findings": [vars(one) for one in findings(found)],
         "caveat": caveat(found),
-        "doubts": list(found.warnings),
+        "warnings": list(found.warnings),
         "campaigns": [
             {
                 "name": name,

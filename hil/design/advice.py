@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import UnsafeError
-from hil.violation_text import always_so, violation_text
+from hil.motion_checks import always_so, violation_text
 from identification.excitation import (
     CollisionChecker,
     CurrentModel,
@@ -37,7 +37,7 @@ WEAK: Final = 1e4
 # Farther away [m] nothing is looked for, and nearer by such steps [m].
 _WIDEST: Final = 0.5
 _STEP: Final = 0.005
-# Share of the largest entry of a direction that an entry has at least which is told, and how many.
+# Share of the largest entry of a direction that an entry has at least to be reported, and how many.
 _CONCERNED: Final = 0.3
 _MOST_NAMES: Final = 6
 

@@ -44,7 +44,7 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     Args:
         paths: one campaign folder, or archives.
         cell: for which a motion is going to be designed.
-        reporter: is told how far it is, and of joints about whose noise nothing is known.
+        reporter: shows how far it is, and of joints about whose noise nothing is known.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.
@@ -131,7 +131,7 @@ def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:
 def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
     """Return 1 / variance of each joint's torque residual (n,).
 
-    Of a joint that stood in all archives no residual tells. It is taken to be as noisy as the
+    Of a joint that stood in all archives no residual tells. It is assumed to be as noisy as the
     others: by the median, as a share of the torque that its motors can give.
     """
     noise = noise_std.copy()
@@ -144,7 +144,7 @@ def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
         ]
         reporter.say(
             f"warning: {', '.join(names)} never moved in the earlier archives: its torque noise is "
-            "taken to be that of the others, in proportion to what its motors can give"
+            "assumed to be that of the others, in proportion to what its motors can give"
         )
     return np.asarray(noise**-2.0)
 

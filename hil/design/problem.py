@@ -10,8 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.motion_checks import collision_checker, current_model, planned
-from hil.violation_text import always_so, violation_text
+from hil.motion_checks import always_so, collision_checker, current_model, planned, violation_text
 from identification.excitation import (
     CollisionChecker,
     Constraints,
@@ -48,7 +47,7 @@ class Knowledge:
         joint_weights: 1 / variance of each joint's torque residual (n,).
         gram: information (p, p) of all that was moved, held out or not, weighted by these, as if
             sampled every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are.
-        samples: time samples in it, counted alike.
+        samples: time samples in it, of equal weight.
         repetitions: how often the new motion is going to be run.
         archives: name and SHA-256 of each file whose motion is in it.
     """
@@ -127,7 +126,7 @@ def _require_beginning(
     if too_much:
         worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
         remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
-        _refuse_beginning(cell, where, f"standing there, {violation_text(worst, frame)}", remedy)
+        _refuse_beginning(cell, where, f"at rest there, {violation_text(worst, frame)}", remedy)
 
 
 def _refuse_beginning(cell: Cell, where: str, reason: str, remedy: str) -> NoReturn:

@@ -41,7 +41,7 @@ Condition = Annotated[float, Field(ge=1.0)]
 
 
 class _Table(BaseModel):
-    """A table of the file: finite numbers, none taken from a text."""
+    """A table of the file: finite numbers, none parsed from a text."""
 
     model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
@@ -123,8 +123,8 @@ DECISIVE = ("urdf", "robot", "limits")
 def fingerprint(cell: Cell) -> dict[str, str]:
     """Return a digest of each part of a cell that a design may depend on, by the part's name.
 
-    Tables are taken as read, so that comments, order and spelling of numbers do not count. The
-    limits are those in URDF angles.
+    Tables are compared by content, so that comments, order and spelling of numbers do not count.
+    The limits are those in URDF angles.
     """
     limits = cell.joint_limits
     home = cell.file.campaign

@@ -10,8 +10,8 @@ from typing import BinaryIO, Final
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
+from hil.motion_checks import violation_text
 from hil.progress import Reporter, Task
-from hil.violation_text import violation_text
 from identification.excitation import (
     Design,
     ForeignJournalError,
@@ -60,7 +60,7 @@ def run_search(
     Args:
         cell: the robot, its limits and surroundings.
         settings: of the design.
-        reporter: is told how far the search is, and its best motion so far.
+        reporter: shows how far the search is, and its best motion so far.
         workers: processes that score motions; the result does not depend on how many.
         known: an earlier estimate, to which the motion is to add.
         journal: file that keeps what was scored, to resume from; None to keep nothing.

@@ -241,7 +241,7 @@ class DesignSettings(_Table):
 
     @model_validator(mode="after")
     def _length_is_allowed(self) -> DesignSettings:
-        """Sines last as long as they are told to: what is not allowed needs no search."""
+        """Sines last as long as they are asked to: what is not allowed needs no search."""
         if self.sines is None:
             return self
         length, constraints = self.sines.length, self.constraints
@@ -295,7 +295,7 @@ class DesignSettings(_Table):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data without what is not given."""
+        """Return data without what is not given."""
         return self.model_dump(mode="json", exclude_none=True)
 
 

@@ -85,7 +85,7 @@ def scheduling(obtained: Obtained | None, limit: int | None = None) -> Check:
 
 
 def memory_lock(obtained: Obtained | None, limit: int | None = None) -> Check:
-    """Whether memory may be kept in RAM."""
+    """Whether memory may be locked in RAM."""
     allowed = _limit(resource.RLIMIT_MEMLOCK) if limit is None else limit
     limited = "no limit" if allowed < 0 else f"memlock limit {allowed // 1024} KiB"
     why = "a page that has to be fetched from disk costs many cycles"
@@ -103,7 +103,7 @@ def memory_lock(obtained: Obtained | None, limit: int | None = None) -> Check:
 def processor_awake(obtained: Obtained | None, system: System) -> Check:
     """Whether /dev/cpu_dma_latency may be held at 0."""
     why = "halves the usual wake-up time; matters more than the programming language"
-    name = "processor kept awake"
+    name = "processor idle latency"
     if obtained is not None and obtained.cpu_awake:
         return Check(name, Status.OK, "/dev/cpu_dma_latency can be held at 0", why)
     if not system.path("/dev/cpu_dma_latency").exists():
@@ -266,7 +266,7 @@ def governor(system: System) -> Check:
 
 
 def idle_states(system: System, *, no_sleep: bool) -> Check:
-    """How long the deepest sleep in use takes to leave; no matter if processors are kept awake."""
+    """Exit latency of the deepest idle state in use; no matter if none is entered."""
     deepest, slowest = "", -1
     for cpu in cpus(system):
         for state in system.names(f"{_CPU}/{cpu}/cpuidle"):
@@ -283,9 +283,9 @@ def idle_states(system: System, *, no_sleep: bool) -> Check:
         return Check("idle states", Status.OK, found, why)
     found = f"deepest is {deepest}, {slowest} µs to wake"
     if no_sleep:
-        return Check("idle states", Status.OK, f"{found}; kept awake during an exchange", why)
+        return Check("idle states", Status.OK, f"{found}; not entered during an exchange", why)
     bad = slowest > 50
-    remedy = "see 'processor kept awake': with that right, no idle state matters"
+    remedy = "see 'processor idle latency': with that right, no idle state matters"
     return Check(
         "idle states", Status.WARN if bad else Status.OK, found, why, (f"# {remedy}",) * bad
     )

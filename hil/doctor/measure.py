@@ -22,7 +22,8 @@ from hil.progress import Reporter
 from .machine import DiskTrial, Obtained
 
 RESERVE: Final = 100e-6
-"""s of a cycle kept for what a bare measurement leaves out: session and guard (20 µs, at most 40),
+"""s of a cycle reserved for what a bare measurement leaves out: session and guard (20 µs, at most
+40),
 the packet on the wire both ways (25 µs each at 100 Mbit/s), the card's interrupt."""
 EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]) * 1e-6
 """s, bounds of the histogram's bars."""

@@ -85,7 +85,7 @@ def _answered(link: socket.socket, number: int, sent: float) -> float:
 
 
 def echo() -> None:
-    """Answer every packet on a free loopback port (printed first) until told to end."""
+    """Answer every packet on a free loopback port (printed first) until asked to end."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
         link.settimeout(5.0)

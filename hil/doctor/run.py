@@ -21,8 +21,8 @@ from .network import address_of, network_checks
 from .system import System
 
 CRITERIA: Final = (
-    f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs kept for "
-    "packet work and wire, and 99.9 % of the latencies used at most half of it"
+    f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs "
+    "reserved for packet work and wire, and 99.9 % of the latencies used at most half of it"
 )
 ENOUGH_SECONDS: Final = 60.0
 """s of measurement below which a verdict is provisional."""

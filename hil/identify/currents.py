@@ -28,8 +28,8 @@ def motor_from_joint(recording: Recording) -> Array:
 def with_torques(sources: Sources) -> Sources:
     """These sources with a torque in every recording.
 
-    Where there are currents only, the gains are taken from the nominal masses of the URDF, and a
-    doubt says so. Only what is fitted is looked at.
+    Where there are currents only, the gains are read from the nominal masses of the URDF, and a
+    warning says so. Only what is fitted is looked at.
 
     Raises:
         ArchiveError: the URDF has no masses that the currents could be compared with.
@@ -68,8 +68,8 @@ def with_torques(sources: Sources) -> Sources:
         training=tuple(source.changed(with_torque) for source in sources.training),
         held_out=tuple(source.changed(with_torque) for source in sources.held_out),
     )
-    for doubt in _warnings(sources.cell.joint_names, scale):
-        sources = sources.with_doubt(doubt)
+    for warning in _warnings(sources.cell.joint_names, scale):
+        sources = sources.with_warning(warning)
     return sources
 
 
@@ -91,7 +91,7 @@ def _warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
             f"the torque constant of {', '.join(turned)} comes out negative: where the current is "
             "positive the weight and inertia of the URDF need a negative torque. Either the sign "
             "of the current or of the axis is turned in the recording, or the URDF's masses are "
-            "wrong there; the sign was taken as found. Check it before using the torques"
+            "wrong there; the sign was used as found. Check it before using the torques"
         )
     inertial = [name for name, only in zip(names, scale.inertial, strict=True) if only]
     if inertial:

@@ -72,7 +72,7 @@ def with_noise(sources: Sources) -> tuple[Sources, str]:
                 "no standstill was recorded: the noise of the positions was measured on what "
                 f"differs between {noise.repetitions} repetitions at equal times",
             )
-    return sources, "the noise of the positions was taken from their own fast part"
+    return sources, "the noise of the positions was estimated from their own fast part"
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:

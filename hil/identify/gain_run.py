@@ -59,7 +59,7 @@ def find_gains(
     Args:
         archives: recordings as their cells say.
         loaded: further recordings, each with what the robot carried.
-        reporter: told of the progress.
+        reporter: receives the progress.
         method: see :mod:`identification.estimators.gains`.
         delay: time by which currents lag positions [s]; None takes it from the cell.
 

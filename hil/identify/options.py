@@ -16,8 +16,8 @@ Method = Literal["default", "paper"]
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
 
 ESTIMATORS: Final[dict[Estimator, str]] = {
-    "auto": "weighted least squares, drawn towards the consistent solution as far as that predicts "
-    "better (chosen by inner prediction)",
+    "auto": "weighted least squares, regularised towards the consistent solution as far as that "
+    "predicts better (chosen by inner prediction)",
     "wls": "weighted least squares (eq. 4): every joint's residual in its own noise",
     "ols": "ordinary least squares: every joint's residual alike, in N·m",
     "huber": "iteratively reweighted least squares, Huber's loss",

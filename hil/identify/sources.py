@@ -95,9 +95,9 @@ class Sources:
     tested_on: str
     in_sample: bool = False
 
-    def with_doubt(self, doubt: str) -> Sources:
+    def with_warning(self, warning: str) -> Sources:
         """These sources with one more thing a reader must know."""
-        return replace(self, warnings=(*self.warnings, doubt))
+        return replace(self, warnings=(*self.warnings, warning))
 
 
 def cell_of(archive: Archive) -> Cell:
@@ -161,9 +161,9 @@ def gather_sources(
     held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
     warnings = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     warnings += [
-        f"{archive.path.name}: {doubt}"
+        f"{archive.path.name}: {warning}"
         for archive in archives
-        for doubt in archive.header.findings.warnings
+        for warning in archive.header.findings.warnings
     ]
     warnings += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
     if in_sample:
@@ -178,8 +178,8 @@ def gather_sources(
             if every.same_motion
             else "another recording"
         )
-        training, held_out, doubt = _split(training, split)
-        warnings.append(doubt)
+        training, held_out, warning = _split(training, split)
+        warnings.append(warning)
     return replace(
         every,
         training=training,
@@ -402,11 +402,11 @@ def _split(
     cut = round(share * whole.recording.n_samples)
     first = _part(whole, "first part", 0, cut)
     last = _part(whole, "last part", cut, whole.recording.n_samples)
-    doubt = (
+    warning = (
         f"a temporal split: the first {share:.0%} of one recording were fitted, the rest of the "
         "same motion was predicted; other motions would be a harder test"
     )
-    return (first,), [last], doubt
+    return (first,), [last], warning
 
 
 def _part(whole: Source, words: str, start: int, stop: int) -> Source:

@@ -1,4 +1,4 @@
-"""An identification as plain numbers: `results.json`."""
+"""An identification as numbers: `results.json`."""
 
 from __future__ import annotations
 
@@ -362,7 +362,7 @@ def summarise(
             good=verdict.good,
             line=verdict.line,
             reasons=[*verdict.reasons],
-            doubts=[*verdict.doubts, *sources.warnings],
+            warnings=[*verdict.warnings, *sources.warnings],
         ),
         essential=essential_result(essential),
         consistency=consistency_result(model, consistency),
@@ -394,7 +394,7 @@ def _period(samples: Samples) -> float:
 
 
 def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[slice]) -> Factor:
-    """Every sample of the motion, standing joints included, as the criteria of a plan see it."""
+    """Every sample of the motion, resting joints included, as the criteria of a plan see it."""
     factor = Factor.zero(model)
     for samples, part in zip(training, rows, strict=True):
         motion = samples.motion.rows(part)._replace(direction=None)
@@ -453,7 +453,7 @@ def _n_via(via_points: Array | None) -> int | None:
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
-    """Time samples of the motion itself: those of a plan, from where it was told to move.
+    """Time samples of the motion itself: those of a plan, from where it was asked to move.
 
     Where no set-points were recorded, from the first to the last in which some joint moves.
     """

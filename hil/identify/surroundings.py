@@ -14,7 +14,7 @@ from hil.cell import Cell
 from identification.estimators.nominal_prior import NOMINAL_SHARE
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 from identification.selection.inner_prediction import DELAY, LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples

@@ -189,7 +189,7 @@ def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
         LayoutError: the definition cannot be understood, or the message does not keep it.
     """
     if message[:4] != ENCAPSULATION:
-        raise LayoutError("its messages are not plain little-endian CDR")
+        raise LayoutError("its messages are not little-endian CDR")
     walk = _Walk(_types(kind, definition), message)
     walk.fields(_short(kind), "")
     return walk.builder.build()

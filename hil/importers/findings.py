@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Findings, Samples
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]

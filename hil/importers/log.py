@@ -124,7 +124,7 @@ class _Log:
         return np.asarray((values + offset) * (factor * scale))
 
     def stamps(self, count: int) -> tuple[NDArray[np.int64], int]:
-        """The samples' stamps [ns], and what was taken off to make them storable."""
+        """The samples' stamps [ns], and what was subtracted to make them storable."""
         if self._map.sample_rate is not None:
             return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
         first, *others = self._clocks()

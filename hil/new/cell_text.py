@@ -10,22 +10,27 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
+from hil.cell import Cell, CellError
+from hil.cell.text import replaced_value, urdf_limits
 from hil.cell.unknown import UNKNOWN, WHERE
-from hil.cell.urdf import urdf_limits
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
+from hil.motion_checks import collision_checker
 from hil.reading import remedy_of, text_of
 from identification.errors import ModelError
+from identification.excitation.constraints import clearance
 from identification.model.kinematics import Chain, chain_from_urdf
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
 
 from .known import ASSUMED, Known, assumed_for_design, from_urdf
@@ -395,3 +400,39 @@ class _Writing:
         acceleration = [round(speed / 0.3, _ROUND) for speed in speeds]
         jerk = [round(speed / 0.03, _ROUND) for speed in speeds]
         return [f"acceleration_deg = {toml_value(acceleration)}", f"jerk_deg = {toml_value(jerk)}"]
+
+
+Array = NDArray[np.float64]
+
+_TURNED: Final = 3
+"""Joints away from their home at most."""
+
+
+def with_clear_home(text: str, new: NewCell, path: Path) -> str:
+    """The text of a cell file with a home that is clear of floor, walls and the arm itself.
+
+    The posture that stands there, or the first clear one of those with one, two or three joints a
+    right angle away from it. Where none is clear, or the URDF has no shapes, it stays.
+    """
+    urdf = new.urdf if new.urdf is not None else text_of(new.urdf_path)
+    cell = Cell.from_texts(text, urdf, path)
+    try:
+        checker = collision_checker(cell)
+    except CellError:
+        return text
+    limits = cell.joint_limits
+    for posture in _postures(cell.home):
+        inside = (posture > limits.lower) & (posture < limits.upper)
+        if inside.all() and clearance(checker, posture[None]) is None:
+            shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
+            return replaced_value(text, "campaign", "home_deg", toml_value(shown))
+    return text
+
+
+def _postures(home: Array) -> Iterator[Array]:
+    for count in range(_TURNED + 1):
+        for joints in combinations(range(len(home)), count):
+            for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=count):
+                posture = home.copy()
+                posture[list(joints)] += turns
+                yield posture

@@ -15,8 +15,8 @@ from drivers.drive_train import WRIST_AXES
 from drivers.errors import PacketError
 from drivers.packets import N_ARMS, InitPacket
 from hil.archive import Archive, open_archive
+from hil.cell.text import urdf_limits
 from hil.cell.unknown import UNKNOWN
-from hil.cell.urdf import urdf_limits
 from hil.errors import ArchiveError
 from hil.reading import toml_of
 
@@ -34,7 +34,7 @@ class Known:
     Attributes:
         values: numbers, lists with an entry per joint (`"?"` where one is not known), words.
         origin: of each of these fields, such as "from the URDF".
-        notes: what a person should be told.
+        notes: what a person should know.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)

@@ -179,7 +179,7 @@ def archive_page(view: ArchiveView) -> bytes:
 
 
 def _missed(view: ArchiveView) -> list[tuple[str, str]]:
-    """Where packets were missed; nothing where nobody counted them."""
+    """Where packets were missed; nothing where they were not counted them."""
     if not view.states:
         return []
     places = f"at {len(view.gaps)} place{'s' * (len(view.gaps) > 1)}"

@@ -19,7 +19,7 @@ _LEFT, _RIGHT, _TOP, _STRIP, _BOTTOM, _LINE = 0.95, 0.15, 0.75, 0.32, 0.5, 0.155
 _NAME: Final = 12
 """Letters of a joint's name that a row has room for."""
 _MOST_EVENTS: Final = 14
-"""Events told below the picture; more are only counted."""
+"""Events described below the picture; more are only counted."""
 _SHADES: Final = {
     "open": "#cfe3d6",
     "closed": "#eeeeee",
@@ -188,7 +188,7 @@ def _headline(figure: Figure, view: ArchiveView, height: float) -> None:
 
 
 def _missed(view: ArchiveView) -> str:
-    """Also where there is nothing to tell, for a person looks for it; "" where nobody counted."""
+    """Also where none were missed, for a person looks for it; "" where they were not counted."""
     if not view.states:
         return ""
     if not len(view.gaps):

@@ -25,8 +25,8 @@ from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
 from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
+from identification.excitation.constraints import sampled
 from identification.excitation.excitation import Excitation
-from identification.excitation.sampling import sampled
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from planner import Trajectory

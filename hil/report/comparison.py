@@ -43,7 +43,7 @@ def _context(found: Comparison) -> dict[str, Any]:
         "found": found,
         "letters": letters,
         "verdict": words.verdict(found),
-        "told": words.findings(found),
+        "findings": words.findings(found),
         "caveat": words.caveat(found),
         "names": words.names(found),
         "campaigns": [_campaign(found, k) for k in range(len(letters))],

@@ -324,7 +324,7 @@ def health(recorded: Sequence[RecordedResult]) -> str:
     sums = {
         "packets missed": sum(one.missed for one in recorded),
         "answers late": sum(one.late for one in recorded),
-        "answers not taken": sum(one.not_taken for one in recorded),
+        "replies not accepted": sum(one.not_accepted for one in recorded),
         "cycles not archived": sum(one.lost for one in recorded),
     }
     losses = [

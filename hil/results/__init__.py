@@ -1,4 +1,4 @@
-"""What an identification leaves behind, as plain numbers: `results.json`."""
+"""What an identification leaves behind, as numbers: `results.json`."""
 
 from .results import (
     SCHEMA_VERSION,

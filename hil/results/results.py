@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AliasChoices, Field, ValidationError, model_validator
 
 from hil.errors import InputError
 from hil.files import write_atomically
@@ -43,7 +43,7 @@ class RecordedResult(Frozen):
     """Packets that never arrived."""
     late: int
     """Answers that were late."""
-    not_taken: int
+    not_accepted: int = Field(validation_alias=AliasChoices("not_accepted", "not_taken"))
     """Answers that the controller did not take."""
     lost: int
     """Cycles that were exchanged and not archived."""
@@ -158,7 +158,7 @@ class JudgementResult(Frozen):
 
 
 class EliminationStepResult(Frozen):
-    """The model after one more parameter was taken out."""
+    """The model after one more parameter was removed."""
 
     removed: str | None
     """None for the model it all begins with."""
@@ -448,7 +448,7 @@ class VerdictResult(Frozen):
     line: str
     reasons: list[str]
     """What is wrong; empty if good."""
-    doubts: list[str]
+    warnings: list[str] = Field(validation_alias=AliasChoices("warnings", "doubts"))
     """What is not as it should be, but too small or too uncertain to say no."""
 
 
@@ -492,7 +492,7 @@ class UncertaintyResult(Frozen):
         "scatter_of_mean",
         "posterior",
     ]
-    """The route that `ParameterResult.std` was taken from."""
+    """The route that `ParameterResult.std` was read from."""
     method: str
     """How estimate and reported standard deviation were made, in words."""
     interval_factor: float

@@ -62,24 +62,24 @@ def _urgent(after_escape: re.Match[str]) -> str:
     return after_escape[1] if _is_urgent(after_escape[1]) else "\x1b"
 
 
-def after(wish: OperatorRequest, key: str, override: float) -> OperatorRequest:
-    """The wish after a key.
+def after(request: OperatorRequest, key: str, override: float) -> OperatorRequest:
+    """The request after a key.
 
     Args:
-        wish: before it.
+        request: before it.
         key: one character.
-        override: of the motion that is going on; it may be below what is wished for.
+        override: of the motion that is going on; it may be below what is requested.
     """
     action = _ACTIONS.get(key)
     if action in ("hold", "resume"):
-        return replace(wish, held=action == "hold")
+        return replace(request, held=action == "hold")
     if key in "+=" or key in "-_":
         step = STEP if key in "+=" else -STEP
         tenths = round((override + step) / STEP)
-        return replace(wish, override=min(1.0, max(LEAST, tenths * STEP)))
+        return replace(request, override=min(1.0, max(LEAST, tenths * STEP)))
     if key.isascii() and key.isdigit():
-        return replace(wish, override=(int(key) or 10) * STEP)
-    return wish
+        return replace(request, override=(int(key) or 10) * STEP)
+    return request
 
 
 def stops(key: str) -> bool:

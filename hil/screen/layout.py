@@ -35,7 +35,7 @@ def status_line(status: RunStatus, left: str = "") -> str:
             parts.append(f"override {100.0 * motion.override:.0f} %")
         parts += [f"{motion.missed} missed", f"{motion.late} late"]
         if motion.untaken:
-            parts.append(f"{motion.untaken} not taken")
+            parts.append(f"{motion.untaken} not accepted")
         if motion.latency is not None:
             parts.append(f"latency {marks.duration(motion.latency.p99)} (99 %)")
         for what, share in (
@@ -73,7 +73,7 @@ class Shown:
         title: of the run.
         joint_names: of the n joints.
         status: where the run stands; None before the first.
-        wish: the person's.
+        request: the person's.
         stopping: whether a stop was asked for.
         age: s since the status came.
         said: lines that the run said, oldest first.
@@ -85,7 +85,7 @@ class Shown:
     title: str
     joint_names: tuple[str, ...]
     status: RunStatus | None = None
-    wish: OperatorRequest = field(default_factory=OperatorRequest)
+    request: OperatorRequest = field(default_factory=OperatorRequest)
     stopping: bool = False
     age: float = 0.0
     said: tuple[str, ...] = ()
@@ -172,11 +172,11 @@ def _state(shown: Shown, width: int) -> Text:
     text = Text()
     if shown.stopping:
         text.append(" STOPPING ", style="bold red reverse").append("  ")
-    elif shown.wish.held:
+    elif shown.request.held:
         text.append(" HELD ", style="bold yellow reverse").append("  ")
     if shown.age > STALE and status is not None:
         text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
-    override = shown.wish.override if motion is None else motion.override
+    override = shown.request.override if motion is None else motion.override
     text.append(f"override {100.0 * override:.0f} %", style=_slower(override))
     if motion is not None and motion.rate is not None:
         text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")
@@ -194,7 +194,7 @@ def _health(shown: Shown, width: int) -> Text:
         return text.append("-", style="dim")
     text.append(f"{motion.cycles}")
     for count, what in (
-        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not taken")
+        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not accepted")
     ):  # fmt: skip
         if count or width >= WIDE:
             text.append(f"  {count} {what}", style="bold yellow" if count else "green")

@@ -38,7 +38,7 @@ from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
 _KNOWN_AFTER = 2.0
-"""s of motion and of waiting after which the pace of virtual time is told."""
+"""s of motion and of waiting after which the pace of virtual time is reported."""
 
 _BETWEEN = 0.6
 """s from motion to motion, as if seen once before: drives go off and on."""
@@ -275,7 +275,7 @@ class Screen:
         self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
         self._quiet = quiet
         self._stop = stop
-        self._wish = OperatorRequest()
+        self._request = OperatorRequest()
         self._shown = Shown(title, tuple(joint_names), keys=False, far_end=far_end)
         self._pace = Pace(virtual=virtual)
         self._came = time.monotonic()
@@ -314,14 +314,14 @@ class Screen:
             ScreenError: nothing is drawn any more.
         """
         self._came = time.monotonic()
-        self._pace.take(status, self._came, held=self._wish.held)
+        self._pace.take(status, self._came, held=self._request.held)
         self._shown = replace(self._shown, status=status, left=self._left(status))
         self._leave_dry_run(status)
         if self._undrawn is not None:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
 
-    def wish(self) -> OperatorRequest:
-        """What the person wishes.
+    def request(self) -> OperatorRequest:
+        """What the person requests.
 
         Raises:
             ScreenError: keys were read, and are not any more.
@@ -329,7 +329,7 @@ class Screen:
         keyboard = self._keyboard
         if keyboard is not None and keyboard.failure is not None:
             raise ScreenError(f"{type(keyboard.failure).__name__}: {keyboard.failure}")
-        return self._wish
+        return self._request
 
     def _leave_dry_run(self, status: RunStatus) -> None:
         """What the dry run was slowed to is not meant for what comes after; a hold is."""
@@ -338,8 +338,8 @@ class Screen:
         elif self._slow_phase and status.phase != "move":
             self._slow_phase = False
             with self._changing:
-                slowed = self._wish.override < 1.0
-                self._wish = replace(self._wish, override=1.0)
+                slowed = self._request.override < 1.0
+                self._request = replace(self._request, override=1.0)
             if slowed:
                 self.say("the dry run is over: the override is 100 % again")
 
@@ -381,10 +381,10 @@ class Screen:
             return
         motion = None if self._shown.status is None else self._shown.status.motion
         with self._changing:
-            override = self._wish.override
+            override = self._request.override
             if motion is not None:
                 override = min(override, motion.override)
-            self._wish = after(self._wish, key, override)
+            self._request = after(self._request, key, override)
 
     def _left(self, status: RunStatus) -> str:
         waiting = self._pace.left(status)
@@ -430,7 +430,7 @@ class Screen:
         keyboard = self._keyboard
         return replace(
             self._shown,
-            wish=self._wish,
+            request=self._request,
             stopping=self._stop.requested,
             age=time.monotonic() - self._came,
             said=tuple(list(self._said)[-NEWEST:]),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hil.view.scene import View
 
 _FIRST_PORT = 8080
-"""Where it is taken, the next one that is free."""
+"""Where it is in use, the next one that is free."""
 
 
 def require_viewer() -> None:
@@ -55,7 +55,7 @@ def show(
         cell: the arm, and what stands around it.
         open_browser: open the page too, where there is a screen.
         host: address that the page is served on.
-        port: port of the page; the next free one where it is taken.
+        port: port of the page; the next free one where it is in use.
 
     Raises:
         InputError: `viser` is not installed.

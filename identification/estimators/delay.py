@@ -8,7 +8,7 @@ One logger writes the torques of all axes, so one delay of all of them is estima
 rows at once: a profile of the residual over common delays finds the valley, Gauss-Newton steps on
 parameters and delay together, with the column :math:`-d\tau/dt`, find its floor. An axis gets a
 deviation of its own only where that is significant and predicts blocks of time that were left out
-better. Parameters and delays are estimated jointly because they can be taken for one another: a
+better. Parameters and delays are estimated jointly because they can be mistaken for one another: a
 delayed acceleration looks like viscous friction when the motion has one frequency only.
 
 The motion is read at other times, never the torque: reading noise between its samples would smooth

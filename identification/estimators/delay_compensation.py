@@ -110,7 +110,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
 
 
 def delay_sensitivity(factor: Factor, products: Array, weights: Array, values: Array) -> Array:
-    """Change of the estimated parameters per second of delay taken for the torque (p,).
+    """Change of the estimated parameters per second of delay applied to the torque (p,).
 
     A later delay compares the torque with earlier motion, which is another torque by its rate of
     change; the parameters move by the fit of that rate.
@@ -131,7 +131,7 @@ def with_uncertain_delay(
     """Return the estimate with the uncertainty of the delay in its covariance.
 
     Args:
-        estimate: made with one delay taken for certain.
+        estimate: made with one delay assumed certain.
         factor: of what was fitted.
         products: its `rate_products` (n, p, p + 1).
         variance: of the delay [s²].

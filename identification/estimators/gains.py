@@ -10,7 +10,7 @@ parameters of robots"). Two estimators on one :class:`identification.factor.gain
 
 which is bilinear and solved by Gauss-Newton, each motor weighted by its inverse noise variance;
 and *total* least squares of :math:`K_m i_m - W_m \pi - t_m = 0`, whose errors are in the columns
-of the currents, the others taken as exact (Van Huffel and Vandewalle 1991). Plain least squares of
+of the currents, the others assumed exact (Van Huffel and Vandewalle 1991). Plain least squares of
 the latter equation would shrink all gains, the more the noisier the currents.
 
 A motor's gain is determined only if the payload loads it, or if its torque shares parameters with
@@ -167,7 +167,7 @@ def _inverted(inverses: Array, covariance: Array, known: NDArray[np.bool_]) -> t
 class _Fit(NamedTuple):
     """Parameters and gains, or their inverses (p + n,); current noise (n,); the last problem.
 
-    Total least squares adds its row weights (n,) and share of the noise taken out.
+    Total least squares adds its row weights (n,) and share of the noise removed.
     """
 
     unknowns: Array

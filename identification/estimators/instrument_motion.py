@@ -1,7 +1,7 @@
 """Motion without measurement noise for instrumental variables: planned, or simulated.
 
 An instrument need not be right, only close to the motion and independent of its noise. The
-planned motion is what the controller was told, later by the lag with which each axis follows;
+planned motion is what the controller was commanded, later by the lag with which each axis follows;
 the lag is one number per axis from thousands of noisy samples, so no noise to speak of gets in.
 """
 

@@ -36,7 +36,7 @@ Weighting = Literal["ordinary", "weighted"]
 
 
 def ordinary_least_squares(model: RobotModel, factor: JointFactor) -> Estimate:
-    r"""Least squares with every joint's residual counted alike.
+    r"""Least squares with the same weight for every joint's residual.
 
     The covariance is the sandwich for white residuals whose variance differs by joint
     (White 1980), with :math:`A = \sum_j G_j`:

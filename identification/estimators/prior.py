@@ -73,22 +73,6 @@ class GaussianPrior:
         return cls.of_combinations(np.eye(len(mean)), mean, std, words)
 
     @classmethod
-    def from_covariance(cls, mean: Array, covariance: Array, words: str = "given") -> GaussianPrior:
-        """Prior with a covariance (p, p); an infinite variance makes a parameter flat.
-
-        Raises:
-            IdentificationError: what is finite of the covariance is not positive definite.
-            ShapeError: it does not fit the mean.
-        """
-        mean, covariance = np.asarray(mean, dtype=np.float64), np.asarray(covariance)
-        if covariance.shape != (len(mean), len(mean)):
-            raise ShapeError("covariance", covariance.shape, f"({len(mean)}, {len(mean)})")
-        known = np.isfinite(np.diag(covariance))
-        root = np.zeros((np.count_nonzero(known), len(mean)))
-        root[:, known] = _inverse_root(covariance[np.ix_(known, known)])
-        return cls(mean, root, words)
-
-    @classmethod
     def of_combinations(
         cls, combinations: Array, mean: Array, std: Array, words: str = "given"
     ) -> GaussianPrior:

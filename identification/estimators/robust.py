@@ -142,18 +142,6 @@ def robust_estimate(
     return _result(model, recordings, state, loss)
 
 
-def robust_weights(
-    model: RobotModel, result: RobustEstimate, samples: Samples, loss: Loss
-) -> Array:
-    """Weight of every row of a recording (m, n), zero for what is not usable: what was doubted."""
-    error = samples.torque - samples.predicted_torque(model, result.estimate.values)
-    counts = samples.usable & np.isfinite(result.estimate.noise_std)
-    scaled = np.where(counts, error, 0.0) / np.where(
-        np.isfinite(result.estimate.noise_std), result.estimate.noise_std, 1.0
-    )
-    return np.where(counts, loss.weight(scaled), 0.0)
-
-
 def _iterate(
     model: RobotModel,
     recordings: Sequence[Samples],

@@ -57,7 +57,7 @@ class Shrinkage:
         nominal = f"nominal bodies weigh {self.prior_weight:g} rows"
         if math.isinf(self.strength):
             return f"physically consistent ({nominal})"
-        return f"drawn towards the physically consistent by {self.strength:g} ({nominal})"
+        return f"regularised towards the consistent solution by {self.strength:g} ({nominal})"
 
 
 def consistent_centre(

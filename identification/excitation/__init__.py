@@ -4,12 +4,15 @@ from identification.excitation.collision.checker import CollisionChecker, Contac
 from identification.excitation.collision.workspace import Box, Wall, Workspace
 from identification.excitation.constraints import (
     KINDS,
+    SAMPLE_PERIOD,
     Constraints,
     CurrentModel,
     MotionCheck,
     Violation,
     check_motion,
     excess_by_kind,
+    midpoints,
+    sampled,
 )
 from identification.excitation.criteria import (
     Criteria,
@@ -36,8 +39,6 @@ from identification.excitation.excitation import Excitation
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Measures, Objective
 from identification.excitation.random_motion import DrawnMotion
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
-from identification.excitation.searches.design import Design
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.ledger import Progress
@@ -46,6 +47,7 @@ from identification.excitation.searches.population import Population
 from identification.excitation.searches.problem import Problem
 from identification.excitation.searches.run import (
     RESCORE_PERIOD,
+    Design,
     most_evaluations,
     search,
 )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +13,45 @@ from identification.errors import ShapeError
 from identification.excitation.collision.checker import CollisionChecker, PathContact
 from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations, rest_violations
-from identification.excitation.sampling import SAMPLE_PERIOD, sampled
 from identification.excitation.violation import KINDS, Kind, Violation, excess_by_kind
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from planner import FourierSeries, JointLimits, PiecewiseCubic
+from planner import FourierSeries, JointLimits, PiecewiseCubic, Trajectory
+
+# Sampling a planned motion for everything that looks at it sample by sample.
+#
+# Both ways are uniform in time with the longest step that divides the motion and does not exceed
+# the period asked for. Checks want both ends. Criteria want the middles of the steps: a joint
+# that rests at an end has sgn(qd) = 0 there, or, after rounding, ±1 without moving; both say
+# something about friction that no motion does, and it weighs the more the fewer the samples.
+# Judged at 8 instead of 1 ms, log det of random motions of the NS 16 changes by 0.002 with
+# middles (and not to one side), by 0.02 with ends.
+SAMPLE_PERIOD: Final = 0.008
+"""s; motions are looked at this often. A fast arm's tip moves some 4 cm meanwhile."""
+
+# A duration that is a whole number of periods but for its rounding gets no further sample.
+_ROUNDING: Final = 1e-9
+
+
+def sampled(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
+    """Return a motion at the ends of equal steps of at most `period` [s], both ends included."""
+    time = np.linspace(0.0, trajectory.duration, _steps(trajectory, period) + 1)
+    return Motion(time, *trajectory.sample(time))
+
+
+def midpoints(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
+    """Return a motion in the middle of equal steps of at most `period` [s], neither end included.
+
+    Their number is the N of the criteria.
+    """
+    steps = _steps(trajectory, period)
+    time = (np.arange(steps, dtype=np.float64) + 0.5) * (trajectory.duration / steps)
+    return Motion(time, *trajectory.sample(time))
+
+
+def _steps(trajectory: Trajectory, period: float) -> int:
+    return max(1, math.ceil(trajectory.duration / period - _ROUNDING))
+
 
 Array = NDArray[np.float64]
 
@@ -126,7 +162,7 @@ class MotionCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether every constraint is kept."""
+        """Whether every constraint is satisfied."""
         return not self.violations
 
 
@@ -138,7 +174,7 @@ class Constraints:
     compare, and a motion that is mended in one respect is not found broken in another.
 
     Attributes:
-        limits: joint limits, kept at every instant.
+        limits: joint limits, respected at every instant.
         min_duration, max_duration: of the motion [s].
         checker: floor, walls, boxes and the arm itself; None to look at none of them.
         currents: nominal torques and currents with their uncertainty; None to look at neither.

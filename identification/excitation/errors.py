@@ -80,7 +80,7 @@ class NoFeasibleMotionError(IdentificationError):
         nearest: of each kind the violation that came closest to being none.
         closest: all violations of the motion that came closest to being feasible, by their sum.
         tried: how many motions there were.
-        unexciting: how many kept every constraint, but left a parameter without excitation.
+        unexciting: how many satisfied every constraint, but left a parameter without excitation.
         stopped: whether the search was stopped before its end.
     """
 
@@ -103,7 +103,7 @@ class NoFeasibleMotionError(IdentificationError):
         super().__init__(self.sentence())
 
     def sentence(self, text_of: Callable[[Violation], str] = str) -> str:
-        """In words; `told` puts a violation into the words and units of the reader."""
+        """In words; `text_of` puts a violation into the words and units of the reader."""
         reasons = [
             f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])

@@ -57,7 +57,7 @@ class Excitation:
         return moves_through(self.via_points, self.speed, self.fly)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `from_dict` restores every bit, through JSON too."""
+        """Return data; `from_dict` restores every bit, through JSON too."""
         planned: dict[str, Any] = {}
         if self.via_points is not None and self.speed is not None:
             planned = {
@@ -115,7 +115,7 @@ def _name(value: Any) -> str:
 
 
 def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:
-    """Restore a motion of either kind from its plain data.
+    """Restore a motion of either kind from its data.
 
     Raises:
         TypeError, ValueError: the data are no motion.

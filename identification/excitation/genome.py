@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Genome(Protocol):
-    """A family of motions, each told by `n_genes` numbers from 0 to 1."""
+    """A family of motions, each given by `n_genes` numbers from 0 to 1."""
 
     @property
     def n_genes(self) -> int:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
+from identification.excitation.constraints import SAMPLE_PERIOD, midpoints
 from identification.excitation.criteria import Criteria, log10_det_and_coupling
 from identification.excitation.errors import DesignError
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel
@@ -48,7 +48,7 @@ class Objective:
 
     Attributes:
         model: the robot, with p parameters.
-        parameters: indices of the essential ones (e,): the others are taken to be zero, so that
+        parameters: indices of the essential ones (e,): the others are assumed to be zero, so that
             their columns are left out. None for all.
         joint_weights: 1 / variance of each joint's torque (n,). None leaves joints unweighted.
         earlier: Gram matrix (p, p) of earlier archives, all parameters, weighted alike, and as

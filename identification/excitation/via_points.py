@@ -22,7 +22,7 @@ from planner.batch import plan_chunk
 
 Array = NDArray[np.float64]
 
-# Draws of one via point before the last one is taken as it is.
+# Draws of one via point before the last one is used as it is.
 _DRAWS: Final = 50
 
 

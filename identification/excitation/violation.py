@@ -95,7 +95,7 @@ class Violation:
 
 
 def excess_by_kind(violations: Iterable[Violation]) -> Array:
-    """Return the largest excess of each kind of constraint, (len(KINDS),); 0 where it is kept."""
+    """Return the largest excess of each kind of constraint, (len(KINDS),); 0 where satisfied."""
     excess = np.zeros(len(KINDS))
     for violation in violations:
         kind = KINDS.index(violation.kind)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
-    """Return the friction law and its coefficients (k,) as plain text, a line per joint.
+    """Return the friction law and its coefficients (k,) as text, a line per joint.
 
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
@@ -201,5 +201,5 @@ def _numbers(values: Array) -> str:
 
 
 def _tuple(items: Iterable[str]) -> str:
-    listed = list(items)
-    return "(" + ", ".join(listed) + ("," if len(listed) == 1 else "") + ")"
+    texts = list(items)
+    return "(" + ", ".join(texts) + ("," if len(texts) == 1 else "") + ")"

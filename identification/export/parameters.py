@@ -45,7 +45,7 @@ def parameters_dict(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return everything about an estimate, of plain values that `json` can write.
+    """Return everything about an estimate, of values that `json` can write.
 
     Args:
         model: the robot.
@@ -70,8 +70,8 @@ def parameters_dict(
         "convention": CONVENTION,
         "method": estimate.method,
         "interval_factor": estimate.interval_factor,
-        "condition": _plain(estimate.condition),
-        "noise_std": _plain(estimate.noise_std),
+        "condition": _json_value(estimate.condition),
+        "noise_std": _json_value(estimate.noise_std),
         "samples": [int(count) for count in estimate.samples],
         "undetermined": list(estimate.undetermined),
         "friction_law": friction_in_words(model, estimate.values[model.friction_part]),
@@ -80,14 +80,14 @@ def parameters_dict(
                 "name": name,
                 "expression": expression,
                 "unit": unit,
-                "value": _plain(value),
-                "std": _plain(std),
+                "value": _json_value(value),
+                "std": _json_value(std),
                 "determined": name not in estimate.undetermined,
                 "essential": None if essential is None else name in essential,
             }
             for name, expression, unit, value, std in _rows(model, estimate)
         ],
-        "covariance": _plain(estimate.covariance),
+        "covariance": _json_value(estimate.covariance),
         "standard": None if consistent is None else _standard(model, consistent),
     }
 
@@ -208,7 +208,7 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
             for joint, name in enumerate(model.joint_names)
         ],
         "coupling_inertia": couplings,
-        "rotor_matrix": _plain(model.layout.rotor_matrix(consistent.standard)),
+        "rotor_matrix": _json_value(model.layout.rotor_matrix(consistent.standard)),
         "motor_friction": {term.name: value for term, value in terms if term.motor},
         "elements": dict(
             zip(
@@ -255,13 +255,13 @@ def _parts(
     return standard[layout.links].tolist(), standard[layout.rotors].tolist(), couplings
 
 
-def _plain(values: float | Array) -> Any:
+def _json_value(values: float | Array) -> Any:
     """Return floats and nested lists of them, with words for what JSON cannot write."""
     if isinstance(values, np.ndarray):
         return (
-            [_plain(value) for value in values.tolist()]
+            [_json_value(value) for value in values.tolist()]
             if values.ndim == 1
-            else [_plain(row) for row in values]
+            else [_json_value(row) for row in values]
         )
     number = float(values)
     if math.isfinite(number):

@@ -1,9 +1,9 @@
-"""Predicted torque taken apart: inertia, Coriolis and centrifugal, gravity, friction."""
+"""Predicted torque split: inertia, Coriolis and centrifugal, gravity, friction."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,67 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
+
+SPEEDS: Final = 120
+"""Points of a curve in each direction."""
+TRAVELS: Final = 60
+"""Points of a curve after a reversal."""
+# Of the presliding displacement: what is left of the change by then is less than 1 %.
+_TURNED: Final = 6.0
+
+
+class FrictionCurve(NamedTuple):
+    """Friction torque of one joint [N·m or N], offset included, coupled motors left out.
+
+    Attributes:
+        speed: (2 SPEEDS,) [rad/s or m/s], densest around zero.
+        sliding: torque (2 SPEEDS,) of a joint that slides.
+        travel: displacement since a reversal (TRAVELS,) [rad or m]; NaN where dry friction jumps.
+        turning: torque (TRAVELS,) of a joint that creeps forwards after it has gone backwards.
+    """
+
+    speed: Array
+    sliding: Array
+    travel: Array
+    turning: Array
+
+
+def friction_curve(
+    model: RobotModel, values: Array, joint: int, low: float, high: float
+) -> FrictionCurve:
+    """Return the curve of a joint, from 0, for parameters (p,) and speeds from low to high.
+
+    Args:
+        model: the robot.
+        values: its parameters.
+        joint: which.
+        low: lowest speed [rad/s or m/s], at most zero.
+        high: highest speed, at least zero.
+    """
+    law = model.friction.laws[joint]
+    table = model.friction.table(values[model.friction_part])
+    coefficients = np.array([*table[joint].values()])
+    steps = np.linspace(0.0, 1.0, SPEEDS) ** 2
+    # Never zero itself, where the direction is none: the curve has to show the jump.
+    steps[0] = 1e-6 * steps[1]
+    speed = np.concatenate([low * steps[::-1], high * steps])
+    sliding = coefficients @ law.columns(speed, law.sign(speed))
+    if law.presliding == 0.0:
+        nothing = np.full(TRAVELS, np.nan)
+        return FrictionCurve(speed, sliding, nothing, nothing)
+    travel = np.linspace(0.0, _TURNED * law.presliding, TRAVELS)
+    state = 1.0 - 2.0 * np.exp(-travel / law.presliding)
+    turning = coefficients @ law.columns(np.zeros(TRAVELS), state)
+    return FrictionCurve(speed, sliding, travel, turning)
+
+
+def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array:
+    """Measured torque (m, n) less what parameters (p,) predict without the joints' friction."""
+    without = values.copy()
+    for index, term in enumerate(model.friction.terms, model.base.rank):
+        if not term.motor:
+            without[index] = 0.0
+    return samples.torque - samples.predicted_torque(model, without)
 
 
 class TorqueParts(NamedTuple):

@@ -3,7 +3,7 @@
 - A moving link gets mass, centre of mass and the tensor about it, in the axes of the inertial
   frame it had (its ``rpy`` stays).
 - What is fixed to a moving link cannot be distinguished from it. Its inertia is contained in the
-  moving link's, so its own ``<inertial>`` is taken out, with a comment in its place.
+  moving link's, so its own ``<inertial>`` is removed, with a comment in its place.
 - A locked joint, and what it carries, stays as it was; the moving link gets what is left of the
   identified inertia. Where that is no possible body, the locked links are treated as fixed ones.
 - The base and what is fixed to it keep theirs: no torque depends on it.
@@ -84,7 +84,7 @@ def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Arr
         The links (n, 10), and the locked joints that keep what they carry: those of the base too.
     """
     left = inertial.copy()
-    kept: set[str] = set()
+    removed: set[str] = set()
     for carrier in {one.carrier for one in locked}:
         carried = [one for one in locked if one.carrier == carrier]
         if carrier >= 0:
@@ -92,8 +92,8 @@ def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Arr
             if not margin(rest) > 0.0:
                 continue
             left[carrier] = rest
-        kept.update(one.joint for one in carried)
-    return left, frozenset(kept)
+        removed.update(one.joint for one in carried)
+    return left, frozenset(removed)
 
 
 _N_LINK: Final = len(LINK_SYMBOLS)
@@ -148,9 +148,9 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
     inertial = standard[model.layout.links]
     coefficients = _friction(model, friction)
     _refuse_impossible(model, standard, inertial, coefficients)
-    bodies, kept = without_locked(inertial, locked_bodies(urdf, model))
+    bodies, removed = without_locked(inertial, locked_bodies(urdf, model))
     source = XmlSource(urdf)
-    tree = _Tree(source.root, model, kept)
+    tree = _Tree(source.root, model, removed)
     edits: list[Edit] = []
     for joint, parameters in zip(model.joint_names, bodies, strict=True):
         link = tree.link_of(joint)
@@ -177,9 +177,9 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
 
 
 class _Tree:
-    """Links and joints of a description by name; locked joints not in `kept` count as fixed."""
+    """Links and joints of a description by name; locked joints not in `removed` count as fixed."""
 
-    def __init__(self, root: Element, model: RobotModel, kept: Collection[str]) -> None:
+    def __init__(self, root: Element, model: RobotModel, removed: Collection[str]) -> None:
         self.links = {e.attributes.get("name", ""): e for e in root.children if e.name == "link"}
         # Not every <joint> is one: a transmission has elements of that name, deeper down.
         self.joints = {e.attributes.get("name", ""): e for e in root.children if e.name == "joint"}
@@ -191,11 +191,11 @@ class _Tree:
             if joint.attributes.get("type") == "fixed":
                 self._rigid.append(joint)
             elif name in model.locked:
-                self._rigid += [] if name in kept else [joint]
+                self._rigid += [] if name in removed else [joint]
             elif name not in model.joint_names:
                 raise WriteBackError(
                     f"joint {name!r} moves in the description but not in the model: the inertia"
-                    " of what it carries is not known by itself"
+                    " of its payload is not known by itself"
                 )
 
     def link_of(self, joint: str) -> Element:

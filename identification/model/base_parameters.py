@@ -27,15 +27,15 @@ _UNSPEAKABLE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Which standard parameters are kept, and what is grouped into each.
+    """Which standard parameters are independent, and what is grouped into each.
 
     Attributes:
-        names: names of the kept parameters, shape (b,): each stands for its group.
-        pivots: indices of the kept standard parameters, rising, shape (b,).
+        names: names of the independent parameters, shape (b,): each stands for its group.
+        pivots: indices of the independent standard parameters, rising, shape (b,).
         grouping: ``base_values = grouping @ standard_values``, shape (b, s).
         standard_names: names of all standard parameters, shape (s,).
-        smallest_pivot: how much of a kept column the columns kept before it leave unexplained,
-            as a share of the longest column of its unit; the smallest over all kept.
+        smallest_pivot: how much of an independent column those before it leave unexplained, as a
+            share of the longest column of its unit; the smallest over all of them.
         largest_dropped: the same, the largest over all dropped: zero but for rounding.
         shares: the same of each standard parameter, shape (s,).
     """
@@ -55,7 +55,7 @@ class BaseParameters:
 
     @property
     def gap(self) -> float:
-        """How clear the rank decision is: smallest kept over largest dropped share."""
+        """How clear the rank decision is: smallest independent over largest dropped share."""
         return self.smallest_pivot / max(self.largest_dropped, np.finfo(np.float64).tiny)
 
     @property
@@ -65,21 +65,21 @@ class BaseParameters:
         return tuple(n for n, gone in zip(self.standard_names, absent, strict=True) if gone)
 
     def explanation(self) -> str:
-        """Return the rank decision in words: how many are kept, how clearly, what would change it.
+        """Return the rank decision in words: how many are independent, how clearly.
 
-        Shares are of the longest column of the same unit, after what the columns kept before it
+        Shares are of the longest column of the same unit, after what those before it
         explain; a parameter is dropped below :data:`TOLERANCE`.
         """
         dropped = len(self.standard_names) - self.rank - len(self.unobservable)
         text = (
-            f"{self.rank} of {len(self.standard_names)} standard parameters are kept,"
+            f"{self.rank} of {len(self.standard_names)} standard parameters are independent,"
             f" {dropped} are grouped into them, {len(self.unobservable)} act on no torque."
         )
         if dropped + len(self.unobservable) == 0:
             return f"{text} Nothing had to be decided."
         weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         text += (
-            f" The weakest kept one, {weakest}, leaves {self.smallest_pivot:.1e} of its column"
+            f" The weakest of them, {weakest}, leaves {self.smallest_pivot:.1e} of its column"
             f" unexplained, the strongest dropped one {self.largest_dropped:.1e}; the threshold is"
             f" {TOLERANCE:g}."
         )
@@ -87,7 +87,7 @@ class BaseParameters:
             return (
                 f"{text} That is close: small lengths or angles of the robot description, meant as"
                 f" zero or not, decide whether {weakest} is a parameter of its own. Check them; a"
-                " parameter that is kept but hardly acts is named where data do not determine it."
+                " parameter that hardly acts is named where data do not determine it."
             )
         if self.largest_dropped < _EXACT:
             return (
@@ -163,7 +163,7 @@ def share_left(columns: Array, basis: Array) -> Array:
 
 
 def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the kept indices, and per column the length that earlier kept ones leave of it."""
+    """Return the indices, and per column the length that earlier independent ones leave of it."""
     basis = np.zeros_like(columns)
     pivots: list[int] = []
     shares = np.zeros(columns.shape[1])

@@ -297,7 +297,7 @@ class FrictionLaw:
         viscous: ``f1 v``.
         third: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none.
         offset: constant ``fo``, also the zero error of a torque or current measurement.
-        standstill: speed [rad/s, m/s] below which a joint counts as standing. Stiction can take
+        standstill: speed [rad/s, m/s] below which a joint counts as at rest. Stiction can take
             any value there; see `zone`.
         stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
             friction is larger at low speed; none without it.
@@ -542,7 +542,7 @@ class JointFriction:
 
     @property
     def standstill(self) -> Array:
-        """Speed per joint (n,) [rad/s or m/s] below which it counts as standing."""
+        """Speed per joint (n,) [rad/s or m/s] below which it counts as at rest."""
         return np.array([law.standstill for law in self.laws])
 
     @property

@@ -84,19 +84,6 @@ def margin(inertial: Array) -> Array:
     return np.asarray(np.linalg.eigvalsh(pseudo_inertia(inertial))[..., 0])
 
 
-def divergence(inertial: Array, reference: Array) -> Array:
-    """Return the log-det divergence (...) of consistent parameters (..., 10) from a reference.
-
-    ``tr(J0^-1 J) - log det(J0^-1 J) - 4``: zero if equal, else positive, the same in all frames
-    and units, infinite where J is not positive definite (Lee, Wensing and Park 2020).
-    """
-    ratio = np.linalg.solve(pseudo_inertia(reference), pseudo_inertia(inertial))
-    sign, logarithm = np.linalg.slogdet(ratio)
-    possible = (sign > 0.0) & (margin(inertial) > 0.0)
-    value = np.trace(ratio, axis1=-2, axis2=-1) - logarithm - 4.0
-    return np.where(possible, value, np.inf)
-
-
 def body(inertial: Array) -> Body:
     """Return mass, centre of mass and the tensor about it, of inertial parameters (10,).
 

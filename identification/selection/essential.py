@@ -1,6 +1,6 @@
 """Essential parameters: those that a motion needs, chosen by backward elimination.
 
-One parameter after the other is taken out, the one known worst first: of the largest relative
+One parameter after the other is removed, the one known worst first: of the largest relative
 standard deviation (Pham and Gautier 1991). The usual rule stops when the relative standard
 deviations left differ by less than a factor of 30. It knows nothing about prediction: on a real
 UR10 it gives away the offset of a wrist axis, whose error then rises from 7 to 16 %. Here every
@@ -70,7 +70,7 @@ class CutRule:
 
 @dataclass(frozen=True, eq=False)
 class EliminationStep:
-    """The model after one more parameter was taken out.
+    """The model after one more parameter was removed.
 
     Attributes:
         removed: the parameter, None for the model it all begins with.

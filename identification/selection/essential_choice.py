@@ -120,12 +120,12 @@ def _blind(
         return None
     first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
     chosen = eliminate(model, first, last, weights=weights, rule=rule).estimate.names
-    kept = np.array([model.parameter_names.index(name) for name in chosen], dtype=np.intp)
+    columns = np.array([model.parameter_names.index(name) for name in chosen], dtype=np.intp)
     values = np.zeros(model.n_parameters)
-    values[kept] = solve(training.restricted(kept).total.weighted(weights)).values
+    values[columns] = solve(training.restricted(columns).total.weighted(weights)).values
     unseen = _joined(held_out).total
     return BlindChoice(
-        left=len(kept),
+        left=len(columns),
         essential=relative_error(unseen, values),
         full=relative_error(unseen, solve(training.total.weighted(weights)).values),
     )

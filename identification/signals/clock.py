@@ -1,4 +1,4 @@
-"""The clock of a recording: what its time stamps are, and when the samples were taken.
+"""The clock of a recording: what its time stamps are, and when the samples were measured.
 
 A logger stamps a sample when it comes to it. The robot takes its samples by a clock of its own,
 mostly an even one, so that uneven stamps are either right or the logger's lateness. The positions
@@ -183,7 +183,7 @@ def _steps_by_phase(time: Array, step: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """When the samples of a recording were taken, m rows.
+    """When the samples of a recording were measured, m rows.
 
     Attributes:
         time: of the samples (m,) [s].

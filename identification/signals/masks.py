@@ -169,7 +169,7 @@ def mask_rows(
 
 
 def long_rests(time: Array, still: Rows) -> Rows:
-    """Rows (m, n) within a run of standing rows (m, n) that lasts longer than `LONGEST_HALT`."""
+    """Rows (m, n) within a run of resting rows (m, n) that lasts longer than `LONGEST_HALT`."""
     resting = np.zeros_like(still)
     for joint, column in enumerate(still.T):
         for start, stop in _runs(column):

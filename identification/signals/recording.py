@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 Check = Literal["shape", "finite", "clock", "stuck", "joints", "torque"]
 
-# A joint is not held still to the last bit of its encoder while it is told to move this far.
+# A joint is not held still to the last bit of its encoder while it is commanded to move this far.
 STUCK_MOVEMENT: Final = 0.02  # rad or m
 LONGEST_PAUSE: Final = 600.0
 """s without a sample. What is reckoned in stretches of time takes memory for empty ones, too."""
@@ -267,7 +267,7 @@ class Recording:
 
 
 def stuck(position: Array, command: Array) -> tuple[int, float] | None:
-    """Where a joint stays the same to the last bit while it is told to move.
+    """Where a joint stays the same to the last bit while it is commanded to move.
 
     Args:
         position: readings (m,) [rad or m].

@@ -214,7 +214,7 @@ def prepare(
     torque_limit: Array | None = None,
     current_limit: Array | None = None,
 ) -> Samples:
-    """Samples of a recording for a model; of its torque, that of a known payload is taken off.
+    """Samples of a recording for a model; of its torque, that of a known payload is subtracted.
 
     Args:
         recording: with torque; joints in the model's order.

@@ -10,9 +10,10 @@ residual's own mean :math:`\bar r`. White residuals of variance :math:`\sigma^2`
 :math:`s^2 = \sigma^2 / m` over m rows. Real ones are coloured and hold the errors of the model, so
 that their means hardly shrink. Here s is the root mean square of :math:`\bar e` where the fitted
 part is predicted by inner folds: each stretch of time from parameters of the others
-(:mod:`identification.selection.inner_prediction`). It is taken about zero, because the prediction
-is without bias only as far as the model is right; and it holds the uncertainty of the folds'
-parameters, so that intervals are rather too wide than too narrow where the fitted part is short.
+(:mod:`identification.selection.inner_prediction`). It is computed about zero, because the
+prediction is without bias only as far as the model is right; and it holds the uncertainty of the
+folds' parameters, so that intervals are rather too wide than too narrow where the fitted part is
+short.
 
 Rows count at rest and at reversals too, but not where motion or torque are not known: beside gaps
 and ends, and saturated. Nothing held out is read to make an interval.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
@@ -26,7 +27,6 @@ from identification.signals.samples import Samples
 from identification.signals.spectrum import noiseless_above
 from identification.validation.causes import Causes, find_causes
 from identification.validation.findings.finding import Finding
-from identification.validation.gravity_direction import GravityDirection, find_gravity
 from identification.validation.inertia_ratio import InertiaRatio
 from identification.validation.nominal_scale import NominalScale
 from identification.validation.plausibility import Implausible, implausibilities
@@ -38,11 +38,199 @@ from identification.validation.prediction import (
     residual,
     slow_error,
 )
-from identification.validation.repeatability import Repeatability, repeatability
 from identification.validation.residual_checks import ResidualChecks, check_residuals
 from identification.validation.thresholds import Thresholds
 
+# Whether recordings make more sense with gravity pulling another way than declared.
+#
+# An arm on a wall, on a ceiling or on a tilted base, described as upright, spoils every axis
+# that gravity loads, and looks like many wrong torque constants at once.
 Array = NDArray[np.float64]
+
+_STANDARD: Final = 9.81  # m/s²
+_PASSES: Final = 2
+
+
+@dataclass(frozen=True, eq=False)
+class GravityDirection:
+    """The direction of gravity that fits the recordings best.
+
+    Attributes:
+        declared: gravity of the model (3,) [m/s²].
+        best: gravity that fits the training motion best, of the same size (3,) [m/s²].
+        ratio: squared error on unseen motion under `best` over that under `declared`: the
+            geometric mean over the joints that moved.
+    """
+
+    declared: Array
+    best: Array
+    ratio: float
+
+    def off(self, ratio: float, degrees: float) -> bool:
+        """Whether the declared direction is wrong: less error elsewhere, and not just beside it."""
+        return self.ratio < ratio and float(np.degrees(self.angle)) > degrees
+
+    @property
+    def angle(self) -> float:
+        """Between the two [rad]; zero where none is declared."""
+        size = float(np.linalg.norm(self.declared) * np.linalg.norm(self.best))
+        if size == 0.0:
+            return 0.0
+        return float(np.arccos(np.clip(self.declared @ self.best / size, -1.0, 1.0)))
+
+
+def find_gravity(
+    model: RobotModel, training: StandardGram, held_out: StandardGram
+) -> GravityDirection:
+    """Fit the training motion under all directions of gravity, and predict the held-out one.
+
+    The best of six directions along the base's axes and the declared one is refined.
+    """
+    size = float(np.linalg.norm(model.gravity)) or _STANDARD
+    starts = [model.gravity, *(size * sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]
+    first = min(starts, key=lambda gravity: _misfit(training, gravity))
+    if not np.any(first):
+        return GravityDirection(model.gravity, model.gravity, 1.0)
+    across = np.linalg.svd(first[None, :])[2][1:]
+
+    def pulled(tilt: Array) -> Array:
+        direction = first / size + tilt @ across
+        return np.asarray(size * direction / np.linalg.norm(direction))
+
+    found = scipy.optimize.minimize(
+        lambda tilt: _misfit(training, pulled(tilt)),
+        np.zeros(2),
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": [[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]],
+            "xatol": 1e-3,
+            "fatol": 1e-3,
+            "maxfev": 80,
+        },
+    )
+    best = pulled(found.x)
+    as_is, other = (_unseen(training, held_out, gravity) for gravity in (model.gravity, best))
+    counts = held_out.rows > 0
+    change = np.log(np.maximum(other, 1e-300)) - np.log(np.maximum(as_is, 1e-300))
+    ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
+    return GravityDirection(model.gravity, best, ratio)
+
+
+def _fitted(gram: Array, rows: Array) -> Array:
+    """Parameters under one gravity, each joint weighted by its own residual."""
+    errors = gram[:, -1, -1]
+    values = np.zeros(gram.shape[1] - 1)
+    for _ in range(_PASSES):
+        weights = np.where(rows > 0, rows / np.maximum(errors, 1e-12 * gram[:, -1, -1] + 1e-300), 0)
+        values = solve(gram, weights)
+        errors = squared_errors(gram, values)
+    return values
+
+
+def _misfit(training: StandardGram, gravity: Array) -> float:
+    """Twice the negative logarithm of the likelihood, noise variances concentrated out."""
+    gram = training.under(gravity)
+    errors = squared_errors(gram, _fitted(gram, training.rows))
+    floor = 1e-12 * gram[:, -1, -1] + 1e-300
+    return float(training.rows @ np.log(np.maximum(errors, floor)))
+
+
+def _unseen(training: StandardGram, held_out: StandardGram, gravity: Array) -> Array:
+    values = _fitted(training.under(gravity), training.rows)
+    gram = held_out.under(gravity)
+    return np.maximum(squared_errors(gram, values), 1e-12 * gram[:, -1, -1])
+
+
+@dataclass(frozen=True, eq=False)
+class Repeatability:
+    """Residual of R repetitions of one motion, split in two.
+
+    Attributes:
+        noise: standard deviation between repetitions at equal times (n,) [N·m or N]: no model
+            can predict it. NaN for a joint that never moves twice at the same time.
+        systematic: root mean square of what all repetitions have in common (n,) [N·m or N]: what
+            the model gets wrong. Zero where noise can explain it.
+        repetitions: R.
+    """
+
+    noise: Array
+    systematic: Array
+    repetitions: int
+
+
+def repeatability(
+    model: RobotModel,
+    values: Array,
+    recordings: Iterable[Samples],
+    bandwidth: float | None = None,
+) -> Repeatability:
+    """Split the residual of repetitions of one motion; samples are read once, one at a time.
+
+    Times are compared to the nearest sampling interval since each recording's origin; on a
+    controller's clock that is exact.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        recordings: two repetitions or more.
+        bandwidth: of a low-pass on the residual [Hz]; None for none.
+
+    Raises:
+        IdentificationError: fewer than two repetitions, or no row that two of them share.
+    """
+    moments = _Moments(model.n_joints)
+    step = 0.0
+    for samples in recordings:
+        if step == 0.0:
+            step = float(np.median(np.diff(samples.motion.time)))
+        index = np.rint((samples.motion.time - samples.origin) / step).astype(np.int64)
+        usable = samples.usable & (index >= 0)[:, None]
+        moments.add(index, usable, residual(model, values, samples, bandwidth))
+    return moments.split()
+
+
+class _Moments:
+    """Mean and spread over repetitions at each time and joint (Welford's updates)."""
+
+    def __init__(self, n_joints: int) -> None:
+        self.count = np.zeros((0, n_joints))
+        self.mean = np.zeros((0, n_joints))
+        self.spread = np.zeros((0, n_joints))
+        self.repetitions = 0
+
+    def add(self, index: NDArray[np.int64], usable: NDArray[np.bool_], values: Array) -> None:
+        missing = max(0, int(index[-1]) + 1 - len(self.count))
+        for name in ("count", "mean", "spread"):
+            setattr(self, name, np.pad(getattr(self, name), ((0, missing), (0, 0))))
+        rows, joints = np.nonzero(usable)
+        at = index[rows], joints
+        self.count[at] += 1.0
+        change = values[rows, joints] - self.mean[at]
+        self.mean[at] += change / self.count[at]
+        self.spread[at] += change * (values[rows, joints] - self.mean[at])
+        self.repetitions += 1
+
+    def split(self) -> Repeatability:
+        shared = self.count >= 2.0
+        rows = np.count_nonzero(shared, axis=0)
+        if self.repetitions < 2 or not rows.any():
+            raise IdentificationError(
+                "what repeats cannot be distinguished from noise: it takes two repetitions in which"
+                f" joints move at the same times, here are {self.repetitions} with"
+                f" {rows.tolist()} common rows per joint"
+            )
+        freedom = np.where(shared, self.count - 1.0, 0.0).sum(axis=0)
+        freedom[rows == 0], rows = np.nan, np.where(rows == 0, np.nan, rows)
+        noise = np.where(shared, self.spread, 0.0).sum(axis=0) / freedom
+        # The mean over repetitions still holds its share of the noise.
+        common = self.mean**2 - noise / np.maximum(self.count, 1.0)
+        systematic = np.where(shared, common, 0.0).sum(axis=0) / rows
+        return Repeatability(
+            noise=np.sqrt(noise),
+            systematic=np.sqrt(np.maximum(systematic, 0.0)),
+            repetitions=self.repetitions,
+        )
+
 
 # A joint's error is beyond that of the fit if its power is this many times larger.
 _GROWN: Final = 4.0
@@ -301,7 +489,7 @@ def gather(
         result: from the training recordings.
         training: as many recordings as the result has.
         same_motion: whether these are repetitions of one motion; only then can what repeats be
-            told from noise.
+            distinguished from noise.
         held_out: motions that were not used for fitting.
         nominal: parameters (p,) of the nominal model.
         surroundings: what is known of the cell beside its model.

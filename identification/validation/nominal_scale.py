@@ -34,7 +34,7 @@ _WIDEST: Final = 0.5  # a tolerance, as a share of the scale, above which an axi
 _LINKS_APART: Final = 0.05
 _SURE: Final = 2.0  # standard deviations
 # No arm's links are wrong by that much in a description in use: it is a unit, or torques of the
-# motors taken for those of the joints (gears turn 30 to 200 times).
+# motors mistaken for those of the joints (gears turn 30 to 200 times).
 _IMPOSSIBLE: Final = 10.0
 _OTHER_UNIT: Final = 3.0
 
@@ -68,7 +68,8 @@ class NominalScale:
         """Factor by which most axes are off alike: 1 where they are not.
 
         Of a single axis a factor this large may be a nominal torque that is next to nothing beside
-        friction; of most axes it is a unit, or torques of the motors taken for those of the joints.
+        friction; of most axes it is a unit, or torques of the motors mistaken for those of the
+        joints.
         """
         known = np.isfinite(self.scale) & (self.scale > 0.0)
         if np.count_nonzero(known) < 2:
@@ -109,7 +110,7 @@ class NominalScale:
             f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
         ]
         names = [self.joint_names[j] for j in off]
-        step = f"check torque constant and gear ratio of {joined(names)}, what it carries"
+        step = f"check torque constant and gear ratio of {joined(names)}, and the payload"
         if common != 1.0:
             step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
         return [

@@ -81,7 +81,7 @@ def implausibilities(
 
 
 def _is_negative(estimate: Estimate, direction: Array, sigmas: float) -> bool:
-    """Whether direction · parameters is below zero beyond doubt."""
+    """Whether direction · parameters is below zero significantly."""
     known = np.isfinite(np.diag(estimate.covariance))
     if np.any(direction[~known]):
         return False

@@ -159,7 +159,7 @@ class SlowError(NamedTuple):
         error: what is left.
         friction_change: share by which each joint's friction torque would have to be larger than
             predicted (n,), of any size.
-        apart: what would be left if all of that change were taken off.
+        apart: what would be left if all of that change were subtracted.
     """
 
     error: PredictionError

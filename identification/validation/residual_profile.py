@@ -21,7 +21,7 @@ from identification.validation.residual_blocks import (
 Array = NDArray[np.float64]
 
 BINS: Final = 12
-# Chance that a joint without any such error is taken for one with it, over all its bins.
+# Chance that a joint without any such error is mistaken for one with it, over all its bins.
 CHANCE: Final = 0.001
 
 
@@ -47,7 +47,7 @@ class Profile:
     def rms(self) -> Array:
         """Root mean square over the samples of what the bins explain (n,) [N·m or N].
 
-        The standard errors are taken off, so that noise alone gives about zero.
+        The standard errors are subtracted, so that noise alone gives about zero.
         """
         seen = np.isfinite(self.bins.mean)
         rows = np.where(seen, self.bins.rows, 0.0)

@@ -60,7 +60,7 @@ class Thresholds:
         outlying_power: share of the squared residual they must make. Planted spikes: more than
             0.9. The heavy tails of a sound recording (UR10, its last wrist axis): 0.5.
         pattern: share of the torque that a pattern of the residual (over speed, position or
-            motor angle) must make, besides standing out of noise, to be worth a word.
+            motor angle) must make, besides exceeding the noise, to be worth a word.
         ripple: torque ripple, as a share of the axis's torque, that is worth more than being
             mentioned. Healthy drives have 1 to 2 %.
         pattern_of_residual: share of the residual's RMS that it must make as well: what is a

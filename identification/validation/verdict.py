@@ -59,10 +59,10 @@ class Verdict:
         good: whether the model may be used.
         line: one sentence: whether it predicts unseen motion well, and by how much.
         reasons: what is wrong, in words; empty if good.
-        doubts: what is not as it should be, but too small or too uncertain to say no.
+        warnings: what is not as it should be, but too small or too uncertain to say no.
         strengths: what was checked and found in order.
         next_steps: what to do: first about what explains errors, then about the reasons. About
-            other doubts only where there is no reason, since what is wrong makes doubts of its
+            other warnings only where there is no reason, since what is wrong makes warnings of its
             own; about mere errors only where nothing was found that explains them.
         findings: every check with its outcome.
     """
@@ -70,7 +70,7 @@ class Verdict:
     good: bool
     line: str
     reasons: tuple[str, ...]
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     strengths: tuple[str, ...] = ()
     next_steps: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -106,7 +106,7 @@ def judge(
         good=not wrong,
         line=line,
         reasons=tuple(finding.words for finding in wrong),
-        doubts=tuple(finding.words for finding in doubtful),
+        warnings=tuple(finding.words for finding in doubtful),
         strengths=tuple(finding.words for finding in findings if finding.level == "good"),
         next_steps=_steps(wrong, doubtful),
         findings=findings,

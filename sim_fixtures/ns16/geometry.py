@@ -2,7 +2,7 @@
 
 Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Link frame i has the axes of DH frame i but
 stands at O_{i-1}, a point of the link's own joint axis, because the parameters of the paper's
-Table 2 are taken about that point.
+Table 2 are about that point.
 
 Table 2 fixes a_1, a_2, a_3, d_4 and the twists alpha_2 ... alpha_5. It leaves open the sign of
 alpha_1 (a mirror image of the arm has the same table), d_1, d_6, every zero position and every

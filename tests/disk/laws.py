@@ -163,7 +163,7 @@ def _as_before(
     before, now = truth.loose.estimate.pooled, found.estimate.pooled
     if _alike(before.values, now.values):
         return
-    said = [*found.results.notes, *found.results.verdict.doubts]
+    said = [*found.results.notes, *found.results.verdict.warnings]
     if not any(path.name in text for path in harmed for text in said):
         yield f"{what}: another estimate, and nothing is said of {harmed[0].name}"
     yield from _within(before.values, before.std, now.values, now.std, what)

@@ -130,7 +130,7 @@ def test_a_disk_that_hangs_for_longer_stops_the_arm_on_its_path_and_is_named(
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     disk.do_wrong()
     assert ended.status == 4
-    words = r"dryrun_000_a1\.mcap\) was stopped: .*\(its disk kept it waiting for [67]\.\d s"
+    words = r"dryrun_000_a1\.mcap\) was stopped: .*\(it waited for its disk for [67]\.\d s"
     assert re.search(words, " ".join(ended.said.split())), ended.said
     assert ended.arm["ended"], "open mode was left, and the session ended"
     dry_run = open_archive(campaign.folder.archives / "dryrun_000_a1.mcap")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.transports.base import TransportError
-from drivers.transports.can.lock import BusLock
+from drivers.transports.can.transport import BusLock
 
 
 @pytest.fixture(autouse=True)

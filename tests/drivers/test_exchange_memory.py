@@ -28,7 +28,7 @@ from drivers.exchange import (
     event_log,
     motion_transfer,
 )
-from drivers.exchange.digest import Digest
+from drivers.exchange.serving import Digest
 from drivers.record import CycleRing, cycle_dtype
 from drivers.states import State
 from tests.drivers.rig import Cruise, N, still

@@ -469,7 +469,7 @@ class TestStops:
             events = run_to_the_end(exchange, controller)
             controller.assert_stopped_on_its_path(PERIOD)
             assert the(MotionEnded, events).outcome == "stopped"
-            assert "told to terminate" in the(Leaving, events).reason
+            assert "asked to terminate" in the(Leaving, events).reason
             assert exchange.wait(30.0) == 0
 
     def test_by_the_end_of_the_session(self):

@@ -200,7 +200,7 @@ class TestASilentSupervisor:
         offered, consent = object(), bench.serving._archive.quiet
         bench.step()
         bench.serving._offered = offered
-        bench.serving._inbox.taken = bench.control.program_offered = 1
+        bench.serving._inbox.identity = bench.control.program_offered = 1
         monkeypatch.setattr(bench.serving._inbox, "answer", lambda refusal: None)
         for _ in range(round(2.0 * STALE / STEP)):
             bench.clock.time += STEP

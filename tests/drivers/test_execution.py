@@ -160,7 +160,7 @@ class TestStop:
         assert not execution.held
         assert execution.hold() is None
         assert not execution.held
-        assert execution.resume() == "the motion was told to stop"
+        assert execution.resume() == "the motion is being stopped"
 
 
 class TestHold:

@@ -290,33 +290,33 @@ class TestLosses:
     def test_answers_lost_add_up_over_a_hundred_cycles(self, after, stopped):
         machine = moving()
         machine.cycle = 50
-        machine.note_answers(MAX_GAP, MAX_GAP)
+        machine.note_lost(MAX_GAP, MAX_GAP)
         assert machine.stop_reason is None
         machine.cycle += after
-        machine.note_answers(1, MAX_GAP)
+        machine.note_lost(1, MAX_GAP)
         assert (machine.stop_reason is not None) == stopped
         assert machine.counters.unanswered == MAX_GAP + 1
         assert machine.events == [AnswersLost(MAX_GAP, 50), AnswersLost(1, 50 + after)]
 
     def test_too_many_at_once_stop_it_and_the_reason_says_how_many(self):
         machine = moving()
-        machine.note_answers(MAX_GAP + 1, MAX_GAP)
+        machine.note_lost(MAX_GAP + 1, MAX_GAP)
         assert machine.stop_reason == "3 answers were lost in 100 cycles"
 
     def test_none_lost_is_nothing_to_tell(self):
         machine = moving()
-        machine.note_answers(0, MAX_GAP)
+        machine.note_lost(0, MAX_GAP)
         machine.note_gap(0, 0, MAX_GAP)
         assert not machine.events
         assert (machine.counters.unanswered, machine.counters.missed) == (0, 0)
 
     def test_those_of_the_last_interval_do_not_count_in_the_next(self):
         machine = moving()
-        machine.note_answers(MAX_GAP, MAX_GAP)
+        machine.note_lost(MAX_GAP, MAX_GAP)
         for what in (Input.CLOSED, Input.OPEN):
             machine.take(what)
         machine.execution = requested(Cruise())
-        machine.note_answers(1, MAX_GAP)
+        machine.note_lost(1, MAX_GAP)
         assert machine.stop_reason is None
 
     def test_packets_missed_in_a_row(self):
@@ -332,7 +332,7 @@ class TestLosses:
     def test_only_a_motion_in_open_mode_is_stopped(self, note):
         def lose(machine: Machine) -> Machine:
             if note == "answers":
-                machine.note_answers(9, MAX_GAP)
+                machine.note_lost(9, MAX_GAP)
             else:
                 machine.note_gap(9, 9, MAX_GAP)
             return machine

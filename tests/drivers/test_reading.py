@@ -9,7 +9,7 @@ from drivers import Mode
 from drivers.packets import DRIVE_ON, LAST_NUMBER
 from drivers.reading import Reader
 from drivers.replies import D1, safe_answer
-from drivers.sequence import Sequence
+from drivers.session import Sequence
 from tests.drivers.rig import START, Rig, all_drive_off
 
 HALF = LAST_NUMBER // 2

@@ -300,7 +300,7 @@ class TestResume:
         rig.cycle(5)
         rig.session.stop()
         rig.cycle(1)
-        with pytest.raises(RequestError, match="told to stop"):
+        with pytest.raises(RequestError, match="is being stopped"):
             rig.session.resume()
 
 

@@ -139,7 +139,7 @@ class TestRefused:
         rig = running(Overridable(np.tile(START, (20, 1))))
         rig.session.stop()
         rig.cycle()
-        with pytest.raises(RequestError, match="told to stop"):
+        with pytest.raises(RequestError, match="is being stopped"):
             rig.session.override(0.5)
 
     def test_by_the_source_itself_and_the_motion_goes_on(self):

@@ -50,7 +50,7 @@ def main() -> int:
                 for _ in range(3):
                     told.write(json.dumps({"accepted": screen.accept_dry_run(summary)}) + "\n")
             while not stop.requested and time.monotonic() < until:
-                wish = screen.wish()
+                wish = screen.request()
                 screen.show(status(wish))
                 if wish != last:
                     last = wish

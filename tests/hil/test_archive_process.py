@@ -192,7 +192,7 @@ def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
     assert (done.late, done.untaken) == (7, 2)
     kept = whole(path).outcome
     assert kept is not None
-    assert (kept.late_answers, kept.answers_not_taken) == (7, 2)
+    assert (kept.late_replies, kept.replies_not_accepted) == (7, 2)
 
 
 def test_a_motion_that_was_never_asked_for_leaves_a_void_archive(rig: Rig) -> None:

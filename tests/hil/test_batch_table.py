@@ -105,7 +105,7 @@ def test_a_row_says_where_it_comes_from(folder: Path) -> None:
     assert row["archive_sha256"] == "ab" * 32
     assert (row["settings"], row["code"], row["estimator"]) == ("settings", "c0de", "wls")
     assert re.search(r"\bhil \d", row["software"])
-    assert row["doubts"] == "stood still at first; two gaps"
+    assert row["warnings"] == "stood still at first; two gaps"
     assert row["arm"] == "NS 16-digest" or row["arm"].endswith("-digest")
 
 

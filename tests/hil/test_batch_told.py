@@ -80,7 +80,7 @@ def test_doubts_of_import_and_of_torque_constants_stand_with_every_estimate(
     assert f"note: {told}" in ran.output
     with (tmp_path / "out" / "parameters.csv").open(newline="") as file:
         doubts = {
-            (row["level"], Path(row["campaign"]).name): row["doubts"]
+            (row["level"], Path(row["campaign"]).name): row["warnings"]
             for row in csv.DictReader(file)
         }
     assert all(ASSUMED in text for text in doubts.values())
@@ -115,7 +115,7 @@ def test_what_is_to_be_looked_into_is_told_even_quietly() -> None:
     arm = trend_of(lambda k, random: replace(steady(k, random), load=Load(2.0 * k)), 2)
     calm = trend_of(steady, 2)
     (line,) = alarm_lines(Trends((calm, arm), (), "wls", 4))
-    assert line.startswith("arm: What the arm carries has changed")
+    assert line.startswith("arm: The payload has changed")
 
 
 def summary_of(name: str, *doubts: str) -> Summary:

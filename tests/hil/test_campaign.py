@@ -29,7 +29,7 @@ from hil.campaign import (
     Stop,
 )
 from hil.campaign import campaign as campaign_module
-from hil.campaign.intervals import Interval, hold, require_sound, wanted, with_ways
+from hil.campaign.intervals import Interval, hold, require_sound, wanted, with_moves
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, InputError
 from hil.motion_checks import MotionChecks
@@ -403,7 +403,7 @@ def test_only_where_the_way_from_the_arm_is_not_free_is_it_to_be_jogged(
     cell: Cell, plan: CampaignPlan
 ) -> None:
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
-    ways = with_ways(cell, wanted(cell, plan), low)
+    ways = with_moves(cell, wanted(cell, plan), low)
     assert [way.from_arm for way in ways if way.kind == "move"] == [True, True]
     buried = MotionChecks.of(
         Cell.from_texts(cell.text.replace("floor = 0.0", "floor = 0.3"), cell.urdf, cell.path)

@@ -16,7 +16,7 @@ import hil.cli.rehearse
 import hil.cli.report
 import hil.cli.status
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.from_design import campaign_of_design
+from hil.campaign.campaign import campaign_of_design
 from hil.cli import app
 from hil.design import DesignResult
 from tests.hil.fast_cell import fast_cell
@@ -119,7 +119,7 @@ def test_status_names_what_is_torn_rejected_and_next(
         notes = campaign.status().notes
     assert notes == (
         "a run or a rehearsal is at work on it now",
-        "excitation_001_a1.mcap was left by a run that was killed: taken over if it is whole, its "
+        "excitation_001_a1.mcap was left by a run that was killed: used if it is whole, its "
         "motion run again if not",
         "excitation_000_a1.mcap is rejected: a jam",
     )

@@ -16,8 +16,7 @@ import pytest
 import hil
 from hil import Campaign, Cell
 from hil.campaign import MotionRefusedError, NotRehearsedError
-from hil.campaign.intervals import way
-from hil.campaign.reach import at_limit
+from hil.campaign.intervals import at_limit, way
 from hil.motion_checks import MotionChecks
 from hil.move import straight_way
 from hil.testing import faulty_link

@@ -104,7 +104,7 @@ def test_currents_that_home_itself_needs_are_told_before_any_motion_is_tried(cel
     weak = Cell.from_texts(
         replaced_value(cell.text, "drive_train", "current_limit", limits), cell.urdf, cell.path
     )
-    words = r"begin at home: standing there, current of motor of joint_2: [\d.]+ A, at most 0\.08 A"
+    words = r"begin at home: at rest there, current of motor of joint_2: [\d.]+ A, at most 0\.08 A"
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))

@@ -24,9 +24,9 @@ from hil.plots.design_picture import POSTURES, FrontView, blocks, draw_design
 from hil.plots.joints import broken
 from hil.plots.posture_strip import SIDE, TOP, Strip, covered, outlines, posture_times, swept
 from identification.excitation import correlation, information
+from identification.excitation.constraints import sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.excitation import Excitation
-from identification.excitation.sampling import sampled
 from identification.factor.factor import Factor
 from planner import FourierSeries, Trajectory, plan
 from sim_fixtures.ns16 import CELL_PATH

@@ -21,7 +21,7 @@ class Failing:
         if self.fails:
             raise RuntimeError("no picture")
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         return self.answer
 
     def accept_dry_run(self, _: object) -> bool:
@@ -36,7 +36,7 @@ def test_a_screen_that_shows_nothing_is_still_asked_for_wishes() -> None:
         watch.note("good")
     assert operator.shown == 1
     operator.answer = OperatorRequest(0.4, held=True)
-    assert watch.wish() == OperatorRequest(0.4, held=True)
+    assert watch.request() == OperatorRequest(0.4, held=True)
     assert not stop.requested
     assert len(watch.troubles) == 1
     assert "no picture" in watch.troubles[0]
@@ -46,12 +46,12 @@ def test_a_wish_that_is_none_leaves_the_last_and_is_asked_for_anew() -> None:
     operator, stop = Failing(), Stop()
     watch = RunWatch(operator, stop)
     operator.answer = OperatorRequest(0.4)
-    watch.wish()
+    watch.request()
     operator.answer = None  # type: ignore[assignment]
-    assert watch.wish() == OperatorRequest(0.4)
+    assert watch.request() == OperatorRequest(0.4)
     operator.answer = OperatorRequest(0.3)
-    assert watch.wish() == OperatorRequest(0.3)
-    assert "None is no wish" in watch.troubles[0]
+    assert watch.request() == OperatorRequest(0.3)
+    assert "None is no OperatorRequest" in watch.troubles[0]
     assert not stop.requested
 
 
@@ -59,9 +59,9 @@ def test_a_hold_that_nobody_can_release_becomes_a_stop() -> None:
     operator, stop = Failing(), Stop()
     watch = RunWatch(operator, stop)
     operator.answer = OperatorRequest(held=True)
-    watch.wish()
+    watch.request()
     assert not stop.requested
     operator.answer = None  # type: ignore[assignment]
-    assert watch.wish().held
+    assert watch.request().held
     assert stop.requested
     assert "the run was stopped" in watch.troubles[0]

@@ -261,7 +261,7 @@ def test_names_in_a_urdf_cannot_break_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("good", "word"), [(True, "good"), (False, "NOT GOOD")])
 def test_provenance_has_digests_and_the_verdict(tmp_path: Path, good: bool, word: str) -> None:
-    verdict = VerdictResult(good=good, line="why", reasons=[], doubts=[])
+    verdict = VerdictResult(good=good, line="why", reasons=[], warnings=[])
     results = make_results(verdict=verdict.model_dump())
     (tmp_path / "a.mcap").write_bytes(b"abc")
     found = provenance_of(results, [tmp_path / "a.mcap"])

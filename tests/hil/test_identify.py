@@ -125,7 +125,7 @@ def test_a_torn_repetition_is_used_up_to_its_last_whole_chunk_and_named(
     moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
     moved[2].write_bytes(moved[2].read_bytes()[: moved[2].stat().st_size // 2])
     found = identify_archives(moved, Silent())
-    doubts = " ".join(found.results.verdict.doubts)
+    doubts = " ".join(found.results.verdict.warnings)
     assert moved[2].name in doubts
     assert "could be read" in doubts
 
@@ -154,7 +154,7 @@ def test_archives_of_different_robots_are_not_mixed(campaign: Campaign, tmp_path
 def test_without_repetitions_the_result_says_what_was_not_looked_for(campaign: Campaign) -> None:
     one = [campaign.folder.completed("excitation")[0], *campaign.folder.completed("validation")]
     found = identify_archives(one, Silent())
-    assert any("cannot be distinguished from noise" in doubt for doubt in found.verdict.doubts)
+    assert any("cannot be distinguished from noise" in doubt for doubt in found.verdict.warnings)
 
 
 def test_a_stretch_at_rest_is_no_test_of_a_model(campaign: Campaign) -> None:
@@ -222,7 +222,7 @@ def test_joints_in_another_order_than_the_urdfs_are_refused_by_name(tmp_path: Pa
 
 def test_a_single_recording_is_split_and_the_split_is_called_what_it_is(tmp_path: Path) -> None:
     found = identify_archives([imported(tmp_path / "one.mcap")], Silent())
-    assert any("temporal split" in doubt for doubt in found.results.verdict.doubts)
+    assert any("temporal split" in doubt for doubt in found.results.verdict.warnings)
     assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
     assert "unseen" not in found.verdict.line.split(":")[0]
 

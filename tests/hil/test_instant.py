@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.timestamps import instant
+from hil.reading import instant
 
 
 @given(

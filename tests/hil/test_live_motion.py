@@ -46,7 +46,7 @@ class Person:
         self._rested += progress.held and progress.rate == 0.0
         self._stop.requested = self._rested >= 6
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         time = (self.seen[-1].motion_time or 0.0) if self.seen else 0.0
         first, second = time > 0.5 and self._rested < 3, time > 1.2
         return OperatorRequest(0.5 if time > 0.2 else 1.0, held=first or second)
@@ -137,7 +137,7 @@ class Pressed:
 
     def show(self, progress: MotionProgress) -> None: ...
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         return self.now
 
 
@@ -217,7 +217,7 @@ def test_a_watch_that_hangs_brings_the_arm_to_rest(tmp_path: Path) -> None:
         assert way.duration > 4.0
         ended = send(way, cell, link, tmp_path / "a.mcap", stop=Stop(), watch=Hangs())
         assert ended.outcome == "stopped"
-        assert "looks at the motion (show, wish) did not return for" in ended.reason
+        assert "looks at the motion (show, request) did not return for" in ended.reason
     archive = open_archive(tmp_path / "a.mcap")
     sent = archive.columns["commanded_position"]
     sent = sent[np.isfinite(sent).all(axis=1)]

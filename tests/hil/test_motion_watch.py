@@ -34,7 +34,7 @@ class Person:
         self.seen.append(progress)
         self._time = progress.motion_time or 0.0
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         return self._script(self._time)
 
 

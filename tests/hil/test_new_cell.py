@@ -21,8 +21,8 @@ from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
+from hil.cell.text import urdf_limits
 from hil.cell.unknown import UnknownFieldsError
-from hil.cell.urdf import urdf_limits
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError

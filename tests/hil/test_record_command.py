@@ -283,7 +283,7 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     assert summary["cycles"] == archive.n_samples
     assert archive.outcome is not None
     assert archive.outcome.entries["late_answers"] == str(summary["late"])
-    assert archive.outcome.entries["answers_not_taken"] == str(summary["not_taken"])
+    assert archive.outcome.entries["answers_not_taken"] == str(summary["not_accepted"])
     cycles = archive.columns["cycle"]
     assert archive.n_samples + archive.columns["gap"][1:].sum() == cycles[-1] - cycles[0] + 1
     assert np.isnan(archive.columns["commanded_position"]).all()

@@ -48,7 +48,7 @@ def make_results(**changes: Any) -> Results:
                        "planned": _criteria(88.12, 118.4), "executed": _criteria(87.63, 119.2)},
         "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
                       "prior": "nominal parameters to 10 %", "condition": 26.4,
-                      "grouping": "40 of 66 standard parameters are kept."},
+                      "grouping": "40 of 66 standard parameters are independent."},
         "endogeneity": {"sentence": "Nothing says that noise has biased least squares.",
                         "biased": False, "statistic": 1.2, "p_value": 0.33,
                         "degrees_of_freedom": [6, 33], "noise": [0.001] * 6, "shifted": [],
@@ -80,7 +80,7 @@ def make_results(**changes: Any) -> Results:
             "good": True, "line": "The model predicts unseen motion to 1.5 % of the torque.",
             "reasons": ["Held-out error is 1.3 times the residual of the fit (allowed: 2).",
                         "52 of 58 parameters lie within two standard deviations of the truth."],
-            "doubts": ["f2_1 is not distinct from zero."],
+            "warnings": ["f2_1 is not distinct from zero."],
         },
     }
     plain = json.loads(json.dumps(fields | changes, default=lambda a: np.asarray(a).tolist()))
@@ -100,7 +100,7 @@ def real_recording() -> Results:
         parameters=[p.model_dump() | unknown for p in whole.parameters],
         uncertainty=whole.uncertainty.model_dump() | none | {"reported": "least_squares"},
         validation=[whole.validation[0].model_dump()],
-        verdict={"good": False, "line": "Off by 24 %.", "reasons": [], "doubts": []},
+        verdict={"good": False, "line": "Off by 24 %.", "reasons": [], "warnings": []},
     )
 
 
@@ -216,7 +216,7 @@ def test_the_verdict_comes_before_everything_else(html: str) -> None:
 
 @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
 def test_the_verdict_is_a_word_and_a_symbol_not_only_a_colour(good: bool, word: str) -> None:
-    verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "doubts": []}
+    verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
     text = render_report(make_results(verdict=verdict), make_series())
     card = text[text.index('<section class="verdict') :].split("</section>")[0]
     assert Page(card).text == f"{word} So it is. because"

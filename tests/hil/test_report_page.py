@@ -29,7 +29,7 @@ def conduct(**changes: Any) -> dict[str, Any]:
     """A campaign of two repetitions, one of them run twice, after a warm-up of three motions."""
     archive = {
         "kind": "excitation", "when": "2026-03-01T08:00:00+00:00", "seconds": 9.7, "cycles": 4870,
-        "missed": 0, "late": 0, "not_taken": 0, "lost": 0, "outcome": "completed", "why": "",
+        "missed": 0, "late": 0, "not_accepted": 0, "lost": 0, "outcome": "completed", "why": "",
     }  # fmt: skip
     return {
         "steps": [

@@ -66,7 +66,7 @@ class Person:
     def show(self, status: RunStatus) -> None:
         self.seen.append(status)
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         return self.requests(self.seen[-1])
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
@@ -298,7 +298,7 @@ def test_torques_of_a_right_cell_are_not_doubted(make: Make) -> None:
     assert campaign.run(dry_run_only=True).against_gravity == ()
     found = DryRun.load(campaign.folder)
     assert found is not None
-    assert (found.doubts, found.gravity_not_seen) == ((), ())
+    assert (found.warnings, found.gravity_not_seen) == ((), ())
 
 
 def test_a_torque_is_judged_by_the_weight_beside_friction_and_not_without_any() -> None:

@@ -32,8 +32,8 @@ from hil.campaign import (
     NotRehearsedError,
     quality_entry,
 )
-from hil.campaign.announced_limits import checks_in_force
 from hil.campaign.conduct import conduct_of
+from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
 from hil.campaign.execution_result import RunResult
@@ -76,7 +76,7 @@ class Person:
     def show(self, status: RunStatus) -> None:
         self.status = status
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         return OperatorRequest() if self.status is None else self.requests(self.status)
 
     def accept_dry_run(self, summary: DryRunSummary) -> bool:
@@ -559,7 +559,7 @@ def test_an_arm_that_is_changed_in_mid_campaign_stops_it_and_outvotes_nobody(mak
     with pytest.raises(ArmChangedError) as changed:
         run_pushed(campaign, Drag(int(third.columns["cycle"][0]) - 1, load=0.05))
     assert changed.value.exit_code == 5
-    assert changed.value.counted == ("excitation_000_a1.mcap", "excitation_001_a1.mcap")
+    assert changed.value.reference == ("excitation_000_a1.mcap", "excitation_001_a1.mcap")
     assert changed.value.later == tuple(f"excitation_002_a{k}.mcap" for k in (1, 2, 3))
     for part in ("excitation_001_a1.mcap", "excitation_002_a3.mcap", "current of shoulder"):
         assert part in str(changed.value)

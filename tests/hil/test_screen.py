@@ -82,7 +82,7 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
     text = "\n".join(screen)
     for words in (
         "ns16-october", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
-        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not taken",
+        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not accepted",
         "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 %", "warm below 2 %",
         "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
         "h hold", "space resume", "s stop", "+ - override",
@@ -241,8 +241,8 @@ def test_escape_holds_and_takes_nothing_away_from_what_comes_with_it(sent: str, 
     for key in typed(sent):
         screen.press(key)
     assert stop.requested is (means == "stop")
-    assert screen.wish().held or stop.requested
-    assert screen.wish().override == 1.0
+    assert screen.request().held or stop.requested
+    assert screen.request().override == 1.0
 
 
 def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
@@ -251,12 +251,12 @@ def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
         screen.show(RunStatus(phase, 1, 1, 1.0))
         screen.press("1")
         screen.press("h")
-    assert screen.wish() == OperatorRequest(0.1, held=True)
+    assert screen.request() == OperatorRequest(0.1, held=True)
     screen.show(RunStatus("warm-up", 1, 1, 1.0))
-    assert screen.wish() == OperatorRequest(1.0, held=True)
+    assert screen.request() == OperatorRequest(1.0, held=True)
     screen.press("5")
     screen.show(RunStatus("repetition", 1, 4, 1.0))
-    assert screen.wish().override == 0.5
+    assert screen.request().override == 0.5
 
 
 def test_the_override_of_a_dry_run_is_lowered_from_what_it_is() -> None:
@@ -264,7 +264,7 @@ def test_the_override_of_a_dry_run_is_lowered_from_what_it_is() -> None:
     screen = Screen(NAMES, Stop(), quiet=True)
     screen.show(status(override=0.2))
     screen.press("-")
-    assert screen.wish().override == pytest.approx(0.1)
+    assert screen.request().override == pytest.approx(0.1)
 
 
 # --- a real terminal -------------------------------------------------------------------------
@@ -499,7 +499,7 @@ def test_keys_that_are_not_read_any_more_are_told(what: str) -> None:
     os.close(near)
     assert not keyboard.attached
     with pytest.raises(ScreenError, match=r"no key|terminal is gone"):
-        screen.wish()
+        screen.request()
 
 
 def broken(_: str) -> None:
@@ -516,7 +516,7 @@ def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
             while time.monotonic() < until:
                 screen.show(status())
                 time.sleep(0.01)
-        assert screen.wish() == OperatorRequest()
+        assert screen.request() == OperatorRequest()
 
 
 # --- no terminal -----------------------------------------------------------------------------
@@ -529,7 +529,7 @@ def test_without_a_terminal_there_are_lines_and_nobody_accepts() -> None:
         screen.say("first [things] first")
         screen.show(status())
         await_text(out, "repetition 7 of 30")
-        assert screen.wish() == OperatorRequest()
+        assert screen.request() == OperatorRequest()
     assert out.getvalue().splitlines()[0] == "first [things] first"
     assert "\x1b" not in out.getvalue()
     assert out.getvalue().count("repetition 7 of 30") == 1  # not ten a second

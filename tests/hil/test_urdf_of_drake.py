@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from hil.campaign.folder import MESH, MISSING, checksums
-from hil.cell.urdf import urdf_limits
+from hil.cell.text import urdf_limits
 from hil.importers.findings import urdf_limits as limits_of_an_import
 from sim_fixtures.plant import build_model
 from tests.hil.new_cells import TWO_JOINTS

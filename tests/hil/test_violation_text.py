@@ -12,8 +12,7 @@ from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
 from hil.design.advice import NoExcitationError, no_excitation
-from hil.motion_checks import MotionChecks, collision_checker
-from hil.violation_text import always_so, violation_text
+from hil.motion_checks import MotionChecks, always_so, collision_checker, violation_text
 from identification.excitation import CollisionChecker, NoFeasibleMotionError, Violation, Workspace
 from sim_fixtures.ns16 import CELL_PATH
 

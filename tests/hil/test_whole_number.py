@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.whole_number import port_number, whole_number
+from hil.reading import port_number, whole_number
 
 
 @given(st.integers(0, 10**18 - 1))

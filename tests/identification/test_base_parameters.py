@@ -120,7 +120,7 @@ def test_expressions_read_like_the_table(model: RobotModel) -> None:
 
 def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
     text = model.base.explanation()
-    assert text.startswith("40 of 66 standard parameters are kept, 16 are grouped")
+    assert text.startswith("40 of 66 standard parameters are independent, 16 are grouped")
     assert "10 act on no torque" in text
     assert "1e-05" in text
     assert "the decision is clear" in text
@@ -149,4 +149,6 @@ def test_an_arm_without_choice_needs_no_decision() -> None:
         '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
     )
     base = RobotModel.from_urdf(slider, rotor_inertia=False).base
-    assert base.explanation().startswith("1 of 10 standard parameters are kept, 0 are grouped")
+    assert base.explanation().startswith(
+        "1 of 10 standard parameters are independent, 0 are grouped"
+    )

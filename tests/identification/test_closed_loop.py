@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, Motion, RobotModel
-from identification.estimators.closed_loop import JointServo, simulated_motion
 from identification.model.coupling import Coupling
 from identification.model.elements import TorsionSpring
 from identification.model.payload import Payload
+from tests.identification.closed_loop import JointServo, simulated_motion
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from identification import Factor, Motion, RobotModel
+from identification.excitation.constraints import midpoints
 from identification.excitation.criteria import (
     Criteria,
     condition_number,
@@ -21,7 +22,6 @@ from identification.excitation.criteria import (
     log10_det_and_coupling,
 )
 from identification.excitation.objective import Objective
-from identification.excitation.sampling import midpoints
 from planner import JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 

@@ -25,7 +25,7 @@ from identification.excitation import (
 from identification.excitation.collision import checker as checker_module
 from identification.excitation.collision.bodies import link_bodies
 from identification.excitation.collision.checker import joint_poses
-from identification.excitation.sampling import sampled
+from identification.excitation.constraints import sampled
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text

@@ -19,10 +19,10 @@ from identification.excitation.constraints import (
     Violation,
     check_motion,
     excess_by_kind,
+    sampled,
 )
 from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations
-from identification.excitation.sampling import sampled
 from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
 
 # Two links of 1 m that swing in a vertical plane: known to every textbook.

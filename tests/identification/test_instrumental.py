@@ -13,7 +13,6 @@ from scipy.signal import lfilter
 
 from identification.errors import IdentificationError, ShapeError
 from identification.estimators import instrument_motion
-from identification.estimators.closed_loop import JointServo, simulated_motion, standard_parameters
 from identification.estimators.instrument_motion import planned_motion, same_plan
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
@@ -29,6 +28,7 @@ from identification.signals.samples import Samples
 from identification.signals.smoothing import fit_smoothing_spline
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.closed_loop import JointServo, simulated_motion, standard_parameters
 
 Array = NDArray[np.float64]
 

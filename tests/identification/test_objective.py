@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification import Factor, Motion, RobotModel, ShapeError
+from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.criteria import coupling_index, information, log10_det
 from identification.excitation.errors import DesignError
 from identification.excitation.objective import Objective
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from planner import FourierSeries, JointLimits, plan
 from planner.remote import load, pack
 

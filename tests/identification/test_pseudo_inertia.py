@@ -12,7 +12,6 @@ from identification.model.pseudo_inertia import (
     Body,
     NoMassError,
     body,
-    divergence,
     inertial_from_pseudo,
     inertial_parameters,
     margin,
@@ -95,26 +94,3 @@ def test_body_and_parameters_are_those_of_pinocchio(seed: int) -> None:
 def test_a_body_without_mass_has_no_centre() -> None:
     with pytest.raises(NoMassError):
         body(np.zeros(10))
-
-
-@given(seeds, seeds)
-def test_divergence_is_zero_for_equals_and_positive_otherwise(one: int, other: int) -> None:
-    a, b = (of_points(*point_masses(seed)) for seed in (one, other))
-    assert divergence(a, a) == pytest.approx(0.0, abs=1e-9)
-    assert divergence(a, b) > 0.0 or one == other
-
-
-@given(seeds, seeds)
-def test_divergence_depends_neither_on_the_frame_nor_on_the_units(one: int, other: int) -> None:
-    rng = np.random.default_rng(one)
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    shift = rng.normal(size=3)
-    bodies = [point_masses(one), point_masses(other)]
-    here = [of_points(*b) for b in bodies]
-    there = [of_points(7.0 * m, 3.0 * (p @ turn.T + shift)) for m, p in bodies]
-    assert divergence(*here) == pytest.approx(float(divergence(*there)), rel=1e-6, abs=1e-8)
-
-
-def test_what_is_not_consistent_is_infinitely_far() -> None:
-    inertial = of_points(*point_masses(1))
-    assert divergence(-inertial, inertial) == np.inf

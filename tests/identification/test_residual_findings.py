@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from identification.validation.findings.residual import over_motor_angle, over_time
-from identification.validation.friction_drift import FrictionDrift
 from identification.validation.residual_blocks import BlockMean
-from identification.validation.residual_checks import HARMONICS, Ripple
+from identification.validation.residual_checks import HARMONICS, FrictionDrift, Ripple
 from identification.validation.thresholds import Thresholds
 
 NAMES = ("shoulder", "elbow")

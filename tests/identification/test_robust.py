@@ -16,7 +16,7 @@ from hil.importers import Robot, import_rosbag2
 from hil.recordings import open_recording
 from identification.errors import IdentificationError
 from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
-from identification.estimators.robust import robust_estimate, robust_weights
+from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -214,21 +214,6 @@ def test_95_percent_intervals_cover_90_to_99_percent_with_gross_errors_and_colou
         result = robust_estimate(MODEL, [recording(error, motion)], loss).estimate
         inside.append(np.abs(result.values - truth()) < result.interval_factor * result.std)
     assert 0.90 <= np.mean(inside) <= 0.99
-
-
-def test_what_was_doubted_can_be_seen_row_by_row() -> None:
-    motion, rng = a_motion(4.0), np.random.default_rng(5)
-    samples = recording(gaussian(rng, motion), motion)
-    samples.torque[300:310, 0] += 200.0
-    samples.usable[305, 0] = False
-    samples.torque[305, 0] = np.nan
-    result = robust_estimate(MODEL, [samples], Tukey())
-    weights = robust_weights(MODEL, result, samples, Tukey())
-    hit = samples.usable[300:310, 0]
-    assert hit.any()
-    assert weights[300:310, 0].max() == 0.0
-    assert np.median(weights[samples.usable]) > 0.8
-    assert not weights[~samples.usable].any()
 
 
 def test_exact_data_come_back_and_do_not_divide_by_zero() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.export.friction_curve import friction_curve, friction_torque
-from identification.export.torque_parts import torque_parts
+from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.model.elements import TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from identification import ModelError, RobotModel
-from identification.model.urdf_faults import urdf_fault
+from identification.model.kinematics import urdf_fault
 
 LINKS = '<link name="a"/><link name="b"/>'
 JOINT = (

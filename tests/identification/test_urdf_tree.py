@@ -9,7 +9,7 @@ import pytest
 from identification import ModelError, RobotModel
 from identification.excitation import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 from tests.identification.test_urdf_text import ARM, HINGE, SHAPE, arm
 
 DRAKE = 'xmlns="http://drake.mit.edu"'

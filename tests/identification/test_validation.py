@@ -14,6 +14,7 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
+from identification.validation.evidence import repeatability
 from identification.validation.prediction import (
     PredictionError,
     for_figure,
@@ -22,7 +23,6 @@ from identification.validation.prediction import (
     residual,
     slow_error,
 )
-from identification.validation.repeatability import repeatability
 
 Array = NDArray[np.float64]
 

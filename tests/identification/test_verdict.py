@@ -18,10 +18,9 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, Causes, Fault, Kind
-from identification.validation.evidence import Evidence, Surroundings, gather
+from identification.validation.evidence import Evidence, Repeatability, Surroundings, gather
 from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
-from identification.validation.repeatability import Repeatability
 from identification.validation.verdict import Thresholds, Verdict, judge
 from sim_fixtures.ns16 import urdf_text
 
@@ -368,7 +367,7 @@ def test_each_kind_of_cause_has_a_statement_and_a_step(kind: Kind) -> None:
 def test_a_cause_of_little_error_is_doubtful() -> None:
     verdict = judge(AXES, evidence_with(causes=caused("gain", 1, ratio=0.85)))
     assert verdict.good
-    assert any("torque of two is 1.01" in doubt for doubt in verdict.doubts)
+    assert any("torque of two is 1.01" in doubt for doubt in verdict.warnings)
 
 
 def test_a_model_that_does_not_beat_the_mean_torque_is_not_good() -> None:
@@ -397,7 +396,7 @@ def test_the_controllers_own_model_is_compared_with() -> None:
     better = evidence_with(surroundings=Surroundings(controller=an_error(0.02)))
     verdict = judge(AXES, better)
     assert verdict.good
-    assert any("controller's own dynamic model predicts better" in d for d in verdict.doubts)
+    assert any("controller's own dynamic model predicts better" in d for d in verdict.warnings)
 
 
 def test_saturation_and_poor_excitation_are_said() -> None:
@@ -408,8 +407,8 @@ def test_saturation_and_poor_excitation_are_said() -> None:
             estimate=an_estimate(condition=450.0),
         ),
     )
-    assert any("two in 4.0% of its samples" in doubt for doubt in verdict.doubts)
-    assert any("excites the parameters poorly" in doubt for doubt in verdict.doubts)
+    assert any("two in 4.0% of its samples" in doubt for doubt in verdict.warnings)
+    assert any("excites the parameters poorly" in doubt for doubt in verdict.warnings)
 
 
 def test_what_is_only_doubtful_does_not_turn_the_verdict_but_is_said() -> None:
@@ -422,9 +421,9 @@ def test_what_is_only_doubtful_does_not_turn_the_verdict_but_is_said() -> None:
         ),
     )
     assert verdict.good
-    assert "I2m is negative" in verdict.doubts
-    assert any("of one 5.0 times" in doubt for doubt in verdict.doubts)
-    assert any("friction of two was 5% lower" in doubt for doubt in verdict.doubts)
+    assert "I2m is negative" in verdict.warnings
+    assert any("of one 5.0 times" in doubt for doubt in verdict.warnings)
+    assert any("friction of two was 5% lower" in doubt for doubt in verdict.warnings)
 
 
 def slowly_off(*shares: float) -> dict[str, object]:
@@ -445,7 +444,7 @@ def test_payloads_are_asked_for_only_where_gravity_loads_the_axis() -> None:
 
 def test_what_sound_models_reach_is_no_warning() -> None:
     verdict = judge(AXES, evidence_with(**slowly_off(0.019, 0.0)))
-    assert not any("noise does not explain" in doubt for doubt in verdict.doubts)
+    assert not any("noise does not explain" in doubt for doubt in verdict.warnings)
     assert "beyond what noise explains 1.9% at worst" in verdict.line
     verdict = judge(AXES, evidence_with(**slowly_off(0.0, 0.0)))
     assert "beyond" not in verdict.line
@@ -490,7 +489,7 @@ def test_axes_with_the_same_step_share_one_line() -> None:
 
 def test_an_undetermined_direction_is_information() -> None:
     verdict = judge(AXES, evidence_with(causes=Causes((), None, undecided=(0,))))
-    assert verdict.good and not any("direction" in doubt for doubt in verdict.doubts)
+    assert verdict.good and not any("direction" in doubt for doubt in verdict.warnings)
     (finding,) = (one for one in verdict.findings if one.level == "information")
     assert finding.words.startswith("the data do not determine the direction of one:")
 

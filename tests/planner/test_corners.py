@@ -16,13 +16,13 @@ from planner.corners import (
     Solver,
     fly_by,
     fly_within,
+    is_supported,
     join,
+    passing,
     ranked,
 )
 from planner.errors import UnsupportedSolver
-from planner.passing import passing
 from planner.segments import StraightSegment
-from planner.solver import is_supported
 
 CUT = {"velocity": 0.99, "acceleration": 0.98, "jerk": 0.98}
 
@@ -192,8 +192,8 @@ def test_a_distance_of_nothing_is_a_stop(six_axis_limits, random_points):
 
 
 def test_no_corner_is_planned_with_an_unknown_solver(six_axis_limits, random_points, monkeypatch):
-    monkeypatch.setattr("planner.solver._VERSION", "0.20.1")
-    monkeypatch.setattr("planner.solver._SUPPORTED", False)
+    monkeypatch.setattr("planner.corners._VERSION", "0.20.1")
+    monkeypatch.setattr("planner.corners._SUPPORTED", False)
     segments = corner(random_points(3, 3), six_axis_limits)
     with pytest.raises(UnsupportedSolver, match=r"0\.20\.1.*0\.19"):
         fly_by(*segments, six_axis_limits, 0.5)

@@ -21,8 +21,8 @@ def test_the_example_runs_to_its_last_target(page):
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     names: dict = {}
     exec(code, names)
-    assert [event.target_id for event in names["told"]] == [1, 2, 3, 4]
-    assert names["told"][-1].kind is EventKind.MOTION_ENDED
+    assert [event.target_id for event in names["events"]] == [1, 2, 3, 4]
+    assert names["events"][-1].kind is EventKind.MOTION_ENDED
     np.testing.assert_array_equal(names["set_points"][-1], [0.0, 0.0])
     assert not any(np.allclose(q, [1.0, 0.5], atol=1e-4) for q in names["set_points"])  # flown by
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from planner import PiecewiseCubic, plan
-from planner.passing import passing
+from planner.corners import passing
 
 numbers = st.floats(-3.0, 3.0)
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from drivers.execution import MotionExecution
 from drivers.guard import Guard, GuardLimits
 from planner import InvalidSetting, PiecewiseCubic, TrajectoryPlayer, plan
-from planner.stop import slowing_bounds, within
-from planner.time_law import ramp
+from planner.time_law import ramp, slowing_bounds, within
 
 PERIOD = 0.002
 

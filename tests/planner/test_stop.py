@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from planner import JointLimits, plan
 from planner.piecewise_cubic import Extrema
-from planner.stop import slowing_bounds, within
-from planner.time_law import RateBounds, ramp
+from planner.time_law import RateBounds, ramp, slowing_bounds, within
 
 rates = st.floats(-1.0, 2.0).map(lambda exponent: 10.0**exponent)
 joints = st.lists(st.tuples(rates, rates, rates), min_size=1, max_size=4)

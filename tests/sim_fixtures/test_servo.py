@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sim_fixtures import PlantTruth, ServoSettings, SettingError, SimulatedDrive, ns16
-from sim_fixtures.nominal_model import NominalModel
-from sim_fixtures.servo import INERTIA_CYCLES, CurrentLoop, Servo
+from sim_fixtures.servo import INERTIA_CYCLES, CurrentLoop, NominalModel, Servo
 
 GRAVITY = (0.0, 0.0, -9.81)
 POSTURE = [0.2, -1.2, 2.5, 0.3, 1.0, 0.2]

@@ -37,7 +37,7 @@ class Person:
         """See `Operator`."""
         del status
 
-    def wish(self) -> OperatorRequest:
+    def request(self) -> OperatorRequest:
         """See `Operator`; a hold ends when it was asked after often enough."""
         cycle = self._cycle()
         while self._overrides and self._overrides[0].at <= cycle:

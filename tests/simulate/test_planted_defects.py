@@ -15,7 +15,7 @@ import pytest
 
 from drivers.exchange.receive_queue import Intake
 from drivers.guard import Guard
-from drivers.sequence import Sequence
+from drivers.session import Sequence
 from drivers.state_machine import Machine
 from hil.archive.recorder import Recorder
 from hil.campaign.execution_runner import Runner

@@ -23,7 +23,6 @@ from drivers.packets import (
     is_init,
     next_number,
 )
-from drivers.transports.can.assembler import SetAssembler
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.classic import ClassicCodec
 from drivers.transports.can.errors import CanAxesError, CanModeError
@@ -45,6 +44,57 @@ from drivers.transports.can.reply_fields import (
 )
 from drivers.transports.can.segments import SegmentAssembler, Segmenter
 from drivers.transports.can.slow import NEVER, Ages, SlowSender, SlowStore
+
+LATE: Final = 3
+"""Cycles by which a frame may come after one of a later cycle without starting a new set."""
+
+
+class SetAssembler:
+    """Collects one frame of each identifier with the same cycle number.
+
+    A frame of another cycle starts a new set; the incomplete one before it is given up and
+    counted as "torn". A frame that comes once more changes nothing, and one of up to three cycles
+    earlier is ignored. Numbers repeat, so a set must also be complete within `span`.
+
+    Args:
+        ids: identifiers of a whole set.
+        modulus: the numbers count up modulo this.
+        span: s between the first and the last frame of a set, by their time of arrival.
+        discarded: where "torn" is counted.
+    """
+
+    def __init__(
+        self, ids: Sequence[int], modulus: int, span: float, discarded: Counter[str]
+    ) -> None:
+        self._ids = tuple(ids)
+        self._modulus = modulus
+        self._span = span
+        self._discarded = discarded
+        self._number = -1
+        self._began = 0.0
+        self._parts: dict[int, bytes] = {}
+        self._done = True
+
+    def add(self, frame_id: int, number: int, data: bytes, time: float) -> list[bytes] | None:
+        """Take a frame; all payloads in the order of `ids`, if that completes the set."""
+        timely = abs(time - self._began) <= self._span
+        if not timely or number != self._number or self._parts.get(frame_id, data) != data:
+            if timely and self._number >= 0 and self._is_late(number):
+                return None
+            if not self._done:
+                self._discarded["torn"] += 1
+            self._number, self._began, self._parts, self._done = number, time, {}, False
+        if self._done:
+            return None
+        self._parts[frame_id] = data
+        if len(self._parts) < len(self._ids):
+            return None
+        self._done = True
+        return [self._parts[frame_id] for frame_id in self._ids]
+
+    def _is_late(self, number: int) -> bool:
+        return 1 <= (self._number - number) % self._modulus <= LATE
+
 
 REMEMBERED: Final = 16
 """Packets that either end remembers, for answers that come late."""

@@ -16,7 +16,7 @@ from drivers.transports.can.bus import failing_as_closed, to_frame, to_message
 from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, Frame
 
 SEND_PATIENCE: Final = 0.05
-"""s that a full send queue is waited for; what is not taken by then is lost."""
+"""s that a full send queue is waited for; what is not accepted by then is lost."""
 SEGMENT_PATIENCE: Final = 0.5
 """s for a segment: many come at once, and nothing moves yet."""
 LOOKS: Final = 1000

@@ -21,7 +21,7 @@ _PREFIX: Final = 2
 ABANDONED: Final = 1.0
 """s after which a transfer that stands still is given up."""
 REPEAT: Final = 0.1
-"""s within which a frame of a finished transfer is taken for a duplicate."""
+"""s within which a frame of a finished transfer counts as a duplicate."""
 
 
 class Segmenter:

@@ -1,4 +1,4 @@
-"""How the errors and the worst known parameter change as parameters are taken out."""
+"""How the errors and the worst known parameter change as parameters are removed."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ PARTS: Final = (
 
 
 def split_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
-    """Predicted torque of each joint taken apart, and the measured one behind it."""
+    """Predicted torque of each joint split, and the measured one behind it."""
     if series.example_time.size == 0 or series.example_gravity.size == 0:
         return []
     time = _from_zero(series.example_time)

@@ -13,11 +13,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.compare.trend import ArmTrend, AxisTrend, ParameterTrend, Watched
+from hil.reading import instant
 from hil.report import numbers
 from hil.report.figures.canvas import TICK_SIZE, headed, plot_panel, ruled
 from hil.report.figures.palette import BAND, FIRST, MUTED, OUTSIDE_3, SECOND
 from hil.report.figures.svg import Panel, drawing, label, to_panel
-from hil.timestamps import instant
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import CollisionModelError, MissingMeshError
 from identification.model.kinematics import FARTHEST
-from identification.model.urdf_tree import urdf_tree
+from identification.model.urdf_text import urdf_tree
 
 _SHAPES: Final = ("box", "cylinder", "sphere", "mesh")
 

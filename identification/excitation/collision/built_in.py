@@ -22,7 +22,7 @@ STILL: Final = 0.002
 SLACK: Final = 0.005
 _N_POSTURES = 200
 _SEED = 20140901
-# Ranges below this [rad, m] are taken for ranges that nobody gave.
+# Ranges below this [rad, m] count as ranges that nobody gave.
 _NO_RANGE = 1e-6
 
 

@@ -24,7 +24,7 @@ __all__ = ["CollisionChecker", "Contact", "PathContact", "joint_poses"]
 
 Array = NDArray[np.float64]
 
-# How much deeper [m] than the contact that is told another one may be.
+# How much deeper [m] than the contact that is reported another one may be.
 _DEPTH_RESOLUTION: Final = 0.005
 # Of the samples of a motion every so manieth is looked at, if no point of the arm leaves the
 # straight line between two such by more than _BULGE [m].
@@ -75,7 +75,7 @@ class CollisionChecker:
 
     Links that share a joint are never checked against each other, nor is the base against what
     it stands among. Two shapes of the arm, two joints apart at most, that are too close in every
-    one of 200 random postures, and closer than 5 cm, are taken to be built that way (a wrist) and
+    one of 200 random postures, and closer than 5 cm, are assumed to be built that way (a wrist) and
     left out too, as is a shape of the first link that is as close to an obstacle in all of them
     (a foot that turns in the floor). `built_in` lists both. One of the two links next to the
     mounting that never keeps the margin of a floor or wall, but does not always touch it, keeps

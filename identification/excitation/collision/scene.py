@@ -55,7 +55,7 @@ class Path(NamedTuple):
 
 
 class Scene:
-    """The bodies of an arm and of its workspace, in pairs that are to be kept apart.
+    """The bodies of an arm and of its workspace, in pairs that are to be clear of each other.
 
     Attributes:
         margin: least distance [m] of each pair.

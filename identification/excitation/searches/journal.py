@@ -1,6 +1,6 @@
 """What a search has scored so far, kept so that an interrupted search goes on where it was.
 
-Nothing but scores is kept. A resumed search is the same search run once more: it asks for the
+Nothing but scores is stored. A resumed search is the same search run once more: it asks for the
 same genes in the same order, and takes from the journal what is there. The last bit of its
 result is therefore that of a search nobody interrupted.
 
@@ -40,7 +40,7 @@ _DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin
 
 
 def digest(value: object) -> str:
-    """Return the SHA-256 of what a value is made of: dataclasses, arrays and plain data.
+    """Return the SHA-256 of what a value is made of: dataclasses, arrays and data.
 
     Other objects take part through their own `__reduce__`.
 

@@ -48,7 +48,7 @@ class Ledger:
 
     Args:
         population: scores what the journal does not know.
-        journal: where scores are looked up and kept.
+        journal: where scores are looked up and stored.
         entered: called after each lot of motions.
         scored: called with a number of motions whenever so many more of a lot are scored.
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.constraints import Constraints
+from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Objective
-from identification.excitation.sampling import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.searches.scores import Scores, unplanned
 from identification.excitation.violation import Violation, excess_by_kind
 from planner import FourierSeries, PiecewiseCubic, PlannerError
@@ -21,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Finds the scores of motions told by genes.
+    """Finds the scores of motions given by genes.
 
     Attributes:
         genome: what genes mean.
@@ -80,5 +79,5 @@ class Problem:
 
 
 def unplannable(error: PlannerError) -> Violation:
-    """Return how it is told that there is no motion."""
+    """Return how it is reported that there is no motion."""
     return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)

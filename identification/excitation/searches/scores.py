@@ -24,7 +24,7 @@ class Scores(NamedTuple):
         log10_det: (m,) log10 of det / N^p; -inf without excitation or without a motion.
         coupling_index: (m,) I_c; inf without excitation or without a motion.
         duration: (m,) [s]; nan where there is no motion.
-        excess: (m, n_kinds) largest excess of each of `KINDS`, 0 where it is kept; inf of the
+        excess: (m, n_kinds) largest excess of each of `KINDS`, 0 where it is satisfied; inf of the
             first one, "planning", without a motion: anything that moves is nearer to feasible.
     """
 

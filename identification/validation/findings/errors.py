@@ -115,7 +115,7 @@ def explained(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> It
     for axis, name in enumerate(names):
         if share[axis] <= limit.explained:
             yield Finding(
-                "against a constant",
+                "variance explained (R²)",
                 "wrong",
                 f"on {name} the model is no better than a constant, the mean of its torque",
                 _NOT_COVERED
@@ -125,7 +125,7 @@ def explained(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> It
             )
         elif share[axis] < limit.little_explained:
             yield Finding(
-                "against a constant",
+                "variance explained (R²)",
                 "doubtful",
                 f"the model explains only {share[axis]:.0%} of what varies in the torque of {name}",
                 faster,
@@ -134,7 +134,7 @@ def explained(names: Sequence[str], evidence: Evidence, limit: Thresholds) -> It
     worst = int(np.nanargmin(share))
     if share[worst] >= limit.little_explained:
         yield Finding(
-            "against a constant",
+            "variance explained (R²)",
             "good",
             f"the model explains {_at_least(share[worst])} of what varies in the torque of each"
             f" axis (least: {names[worst]})",

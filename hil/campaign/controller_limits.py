@@ -16,7 +16,7 @@ from .motion_link import Connection, drives_in_force
 Array = NDArray[np.float64]
 
 
-def announced_by(cell: Cell, connection: Connection) -> AnnouncedLimits | None:
+def controller_limits(cell: Cell, connection: Connection) -> AnnouncedLimits | None:
     """The limits of the cell's arm in the controller's init packet; None before there is one."""
     if connection.init is None:
         return None
@@ -40,17 +40,17 @@ def checks_in_force(
     if connection.adopted:
         gears = drives_in_force(cell, connection).motor_from_joint
         checks = replace(checks, currents=replace(checks.currents, motor_from_joint=gears))
-    announced = announced_by(cell, connection)
-    return checks if announced is None else checks.within(announced.current)
+    limits = controller_limits(cell, connection)
+    return checks if limits is None else checks.within(limits.current)
 
 
 def narrower_currents(cell: Cell, connection: Connection) -> tuple[str, ...]:
     """Current limits of the controller below the cell's, in words joint by joint."""
-    announced = announced_by(cell, connection)
-    if announced is None:
+    limits = controller_limits(cell, connection)
+    if limits is None:
         return ()
     ours = np.array(cell.drive_table.current_limit)
-    return _below(cell, announced.current, ours, "A")
+    return _below(cell, limits.current, ours, "A")
 
 
 def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
@@ -58,11 +58,11 @@ def narrower_thresholds(cell: Cell, connection: Connection) -> tuple[str, ...]:
 
     No model tells how far a servo lags behind, so that no motion can be checked against them.
     """
-    announced = announced_by(cell, connection)
-    if announced is None:
+    limits = controller_limits(cell, connection)
+    if limits is None:
         return ()
     ours = np.array(cell.drive_table.following_error)
-    return _below(cell, announced.following_error, ours, "motor revolutions")
+    return _below(cell, limits.following_error, ours, "motor revolutions")
 
 
 def _below(cell: Cell, theirs: Array, ours: Array, unit: str) -> tuple[str, ...]:

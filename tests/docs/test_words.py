@@ -1,0 +1,98 @@
+"""Words that people read are those of robotics, control and Python."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.docs.typed import ROOT
+from tests.house import PACKAGES
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+MODULES = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
+TEMPLATES = sorted((ROOT / "hil" / "report" / "templates").glob("*.j2"))
+IDIOMS = re.compile(
+    r"\b(kept|told|taken|announced|standing|wish|wish(es|ed)|doubts?|strangers?|sight|ways|plain"
+    r"|what it carries|against a constant|turning round|hardly told|gone on with"
+    r"|nobody counted|counted alike|taken as read)\b",
+    re.IGNORECASE,
+)
+NEVER = re.compile(r"\b(told|wish|wish(es|ed)|doubts?|strangers?|sight|announced)\b", re.IGNORECASE)
+LITERAL = {
+    "text/plain": "media type of an attachment",
+    "plain": "name of the rehearsal and the study without unmodelled effects, and of their folders",
+    "doubts": "key of files that earlier versions wrote",
+}
+INDEX = re.compile(r"pypi\.org|pythonhosted|index-url|conda\.anaconda|registry\.npmjs")
+MOST_TERMS = 60
+
+
+def docstrings(tree: ast.AST) -> set[int]:
+    """Identities of the constants that are statements of their own."""
+    return {
+        id(node.value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+
+
+def texts(module: Path) -> Iterator[tuple[int, str, bool]]:
+    """Line and value of each string, and whether it is a docstring."""
+    tree = ast.parse(module.read_text("utf-8"))
+    inner = docstrings(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value, id(node) in inner
+
+
+def prose(page: Path) -> Iterator[tuple[int, str]]:
+    """Lines of a page without code; fenced blocks are emptied."""
+    fenced = False
+    for number, line in enumerate(page.read_text("utf-8").splitlines(), 1):
+        fence = line.lstrip().startswith("```")
+        fenced ^= fence
+        if not (fence or fenced):
+            yield number, re.sub(r"`[^`]*`", "", line)
+
+
+def found(where: Path, lines: Iterator[tuple[int, str]], pattern: re.Pattern[str]) -> list[str]:
+    name = where.relative_to(ROOT)
+    return [f"{name}:{k}: {text[:80]!r}" for k, text in lines if pattern.search(text)]
+
+
+class TestWords:
+    def test_messages_have_no_idioms(self) -> None:
+        """Each string that is no docstring; `LITERAL` has the exceptions."""
+        wrong: list[str] = []
+        for module in MODULES:
+            said = ((k, text) for k, text, inner in texts(module) if not inner)
+            wrong += found(module, ((k, text) for k, text in said if text not in LITERAL), IDIOMS)
+        assert not wrong, "\n".join(wrong)
+
+    def test_docstrings_have_none_of_the_worst(self) -> None:
+        wrong: list[str] = []
+        for module in MODULES:
+            wrong += found(module, ((k, t) for k, t, inner in texts(module) if inner), NEVER)
+        assert not wrong, "\n".join(wrong)
+
+    @pytest.mark.parametrize("page", [*PAGES, *TEMPLATES], ids=lambda page: page.name)
+    def test_pages_have_no_idioms(self, page: Path) -> None:
+        wrong = found(page, prose(page), IDIOMS)
+        assert not wrong, "\n".join(wrong)
+
+    @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+    def test_pages_have_no_address_of_a_package_index(self, page: Path) -> None:
+        """A package is named; where it comes from is the reader's choice."""
+        assert not INDEX.search(page.read_text("utf-8"))
+
+
+class TestGlossary:
+    def test_is_one_page_in_alphabetical_order(self) -> None:
+        rows = (ROOT / "docs" / "glossary.md").read_text("utf-8").split("|---|---|\n")[1]
+        terms = [row.split("|")[1].strip() for row in rows.strip().splitlines()]
+        assert terms == sorted(terms, key=str.lower)
+        assert len(terms) == len(set(terms)) <= MOST_TERMS
