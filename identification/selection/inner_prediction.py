@@ -258,26 +258,7 @@ def choose_settings(
     first = now
     now, choices = _sweep(trial, first, questions)
     if "low-pass" in questions:
-        # Looked for from the beginning: a narrow bandwidth of the motion or a long presliding
-        # displacement, once chosen, would stand in for a part of it.
-        possible = low_passes(first.model, first.preprocessing)
-        if possible:
-            some = [replace(first, preprocessing=one) for one in possible]
-            filtered, behind = _sweep(trial, trial.best(some), questions)
-            # The residual's least is flat; prediction with what was chosen beside it is sharper.
-            filtered = trial.decide("", _widths(filtered), share=0.0).settings
-            # All joints come through the same channel: the largest errors are not to decide alone.
-            found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
-            if found.choice.chosen and filtered.preprocessing.torque_shape.causal:
-                # What its lag alone predicts as well is a delay.
-                late = trial.decide("", _lags(now, filtered), share=0.0).settings
-                delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
-                both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
-                if delay.choice.chosen and not both.choice.chosen:
-                    now, choices, found = late, [*choices, delay.choice], both
-            if found.choice.chosen:
-                now, choices = filtered, behind
-            choices = [*choices, found.choice]
+        now, choices = _with_low_pass(trial, first, now, choices, questions, low_passes)
     # Models with other columns are compared, each with a centre of its own: now it needs one, too.
     trial.renew_centres()
     if "friction" in questions:
@@ -295,6 +276,40 @@ def choose_settings(
     if not math.isfinite(trial.errors(now).overall):
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+def _with_low_pass(
+    trial: _Trial,
+    first: Settings,
+    now: Settings,
+    choices: list[Choice],
+    questions: Collection[Question],
+    low_passes: LowPasses,
+) -> tuple[Settings, list[Choice]]:
+    """Add a low-pass of the torque, or a delay in its place, where that predicts better.
+
+    Looked for from the `first` settings: a narrow bandwidth of the motion or a long presliding
+    displacement, chosen `now`, would stand in for a part of it.
+    """
+    possible = low_passes(first.model, first.preprocessing)
+    if not possible:
+        return now, choices
+    some = [replace(first, preprocessing=one) for one in possible]
+    filtered, behind = _sweep(trial, trial.best(some), questions)
+    # The residual's least is flat; prediction with what was chosen beside it is sharper.
+    filtered = trial.decide("", _widths(filtered), share=0.0).settings
+    # All joints come through the same channel: the largest errors are not to decide alone.
+    found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+    if found.choice.chosen and filtered.preprocessing.torque_shape.causal:
+        # What its lag alone predicts as well is a delay.
+        late = trial.decide("", _lags(now, filtered), share=0.0).settings
+        delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
+        both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+        if delay.choice.chosen and not both.choice.chosen:
+            return late, [*choices, delay.choice, both.choice]
+    if found.choice.chosen:
+        return filtered, [*behind, found.choice]
+    return now, [*choices, found.choice]
 
 
 class _Decision(NamedTuple):
