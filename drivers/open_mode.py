@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drivers.arm_wire import ArmWire
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
-from drivers.errors import FirstSetPointUnknown, GuardError, MotionUnknown
+from drivers.errors import AxisLeft, FirstSetPointUnknown, GuardError, MotionUnknown
 from drivers.execution import Execution, MotionExecution
 from drivers.guard import Guard
 from drivers.packets import Mode
@@ -148,10 +148,11 @@ class PositionMode(OpenMode):
         self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
     ) -> None:
         super().__init__(guard, wire, frame)
+        self._mode = mode
         self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
-        self._kept = np.ones(len(self._still), dtype=np.bool_)
+        self._kept = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
@@ -170,7 +171,7 @@ class PositionMode(OpenMode):
         self._sent = target
         self._taken.begin(target)
         self.lost = 0
-        self._kept[...] = True
+        self._kept[...] = self._wire.opened
         self._rest(commanded)
 
     def require_start(self, cycle: int) -> None:
@@ -198,6 +199,7 @@ class PositionMode(OpenMode):
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
+        self._require_closed_still(motor, cycle)
         self._step = step = motor - self._sent
         np.subtract(position, self.held, out=commanded[1])
         commanded[1] /= self._guard.period
@@ -209,6 +211,15 @@ class PositionMode(OpenMode):
         self.held = position
         self._sent = motor
         self._taken.add(motor)
+
+    def _require_closed_still(self, motor: Array, cycle: int) -> None:
+        """Axes that stay closed are where the controller holds them, wrist couplings included."""
+        opened = self._wire.opened
+        if opened.all():
+            return
+        off = np.abs(motor - self._wire.raw[TARGET]) > self._guard.limits.standstill
+        if (off & ~opened).any():
+            raise AxisLeft(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
 
     def _check_taken(self, cycle: int, where: Joints | None = None) -> None:
         """Whether the controller takes the set-points sent.
@@ -261,7 +272,9 @@ class PositionMode(OpenMode):
             raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=kept
         )
         self._check_taken(cycle, kept)
-        if kept.all():  # a source that ends in mid-motion would leave a jump to rest
+        if np.array_equal(
+            kept, self._wire.opened
+        ):  # a source that ends in mid-motion would leave a jump to rest
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
         self._taken.add(self._sent)
         self._step = self._still

@@ -105,6 +105,8 @@ class Session:
             differ from the cell's but are not far off, and accept further open axes, instead of
             refusing to move.
         other_axes: (arm, axis), both from 1, that may be open although the cell has no such joint.
+        only_axis: the joint, from 1, whose axis alone the controller opens; the others have to
+            stay closed. None where it opens all.
 
     Attributes:
         deadline: when silence becomes a fault, on the clock of `now`. Each packet that is answered
@@ -127,6 +129,7 @@ class Session:
         silence_timeout: float = 1.0,
         accept_init: bool = False,
         other_axes: Collection[tuple[int, int]] = (),
+        only_axis: int | None = None,
     ) -> None:
         n = drive_train.n_joints
         if not n == guard.limits.n_joints == ring.n_joints:
@@ -141,6 +144,11 @@ class Session:
             raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
         if not 1 <= arm <= N_ARMS:
             raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
+        if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
+            raise ValueError(
+                f"only axis {only_axis} of {n} in mode {mode} is not served: one axis alone is "
+                "moved in modes 1, 4 and 5"
+            )
         self.deadline = math.inf
         self._tally = Tally()
         self.counters: Counters = self._tally.counters
@@ -155,6 +163,7 @@ class Session:
         self._silence_timeout = silence_timeout
         self._accept_init = accept_init
         self._other_axes = frozenset(other_axes)
+        self._only_axis = only_axis
         self._machine = Machine(self.counters)
         self._sequence = Sequence()
         self._policy: ReplyPolicy | None = None
@@ -308,7 +317,7 @@ class Session:
             self._machine.forget_request()
         self._machine.take(Input.INIT)
         arm = (self._drive_train, self._guard, self._arm, self._mode)
-        options = (self._accept_init, self._other_axes, self._max_gap)
+        options = (self._accept_init, self._other_axes, self._max_gap, self._only_axis)
         self._policy = policy = ReplyPolicy(init, *arm, *options)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0
