@@ -152,6 +152,9 @@ class PositionMode(OpenMode):
         self._taken = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
+        self._velocity = self._still
+        self._slots = wire.joint_slots[wire.opened]
+        self._answer = frame.floats[self._slots].copy()
         self._kept = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
@@ -190,12 +193,16 @@ class PositionMode(OpenMode):
         """The motion's next set-point, or the last one where nothing moves."""
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
-        self._check_taken(cycle)
+        stopping = execution is not None and execution.outcome == "stopped"
+        self._check_taken(cycle, stopping=stopping)
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
         assert isinstance(execution, MotionExecution)
+        if self._taken.again:
+            self._repeat(commanded)
+            return
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
@@ -211,6 +218,15 @@ class PositionMode(OpenMode):
         self.held = position
         self._sent = motor
         self._taken.add(motor)
+        self._answer = frame[self._slots].copy()
+        self._velocity = commanded[1].copy()
+
+    def _repeat(self, commanded: Array) -> None:
+        """The answer sent last once more: the controller holds the target before it."""
+        self._frame.floats[self._slots] = self._answer
+        self._taken.repeat()
+        commanded[0] = self.held
+        commanded[1] = self._velocity
 
     def _require_closed_still(self, motor: Array, cycle: int) -> None:
         """Axes that stay closed are where the controller holds them, wrist couplings included."""
@@ -221,15 +237,19 @@ class PositionMode(OpenMode):
         if (off & ~opened).any():
             raise AxisLeft(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
 
-    def _check_taken(self, cycle: int, where: Joints | None = None) -> None:
+    def _check_taken(
+        self, cycle: int, where: Joints | None = None, *, stopping: bool = False
+    ) -> None:
         """Whether the controller takes the set-points sent.
 
         An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
         """
-        lost = self._taken.check(self._wire.raw[TARGET], self.missed, cycle, where)
-        age = self._wire.age
-        # The answer to the packet may have been taken all the same if the target is older.
-        self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0
+        target, age = self._wire.raw[TARGET], self._wire.age
+        lost = self._taken.check(target, self.missed, cycle, where, stopping=stopping)
+        if age is not None and age[TARGET].any():
+            # The answer to the packet may have been taken all the same if the target is older.
+            lost, self._taken.again = 0, False
+        self.lost = lost
 
     def _write_feed_forward(
         self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
