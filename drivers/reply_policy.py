@@ -8,8 +8,8 @@ the same conditions, from the set-point held. While axes are open, moving or not
 and current are watched, and that the controller takes the set-points: the target received (D1) is
 within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of the last
 carried on by as many steps as packets were missed, and within 25 % of the last. An older one than
-the last is an answer lost, which is counted and reported; more than `max_gap` of them in 100 cycles
-bring a motion to rest on its path.
+the last is an answer lost, which is counted and reported; the last set-point is sent again until it
+was taken, and more than `max_gap` of them in 100 cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,

@@ -262,7 +262,7 @@ def _no_leap(stretch: Stretch) -> Iterator[str]:
     leaps = (away > allowed[:, np.newaxis]).any(axis=1) & ~free
     if leaps.any():
         row = int(np.argmax(leaps))
-        yield f"a set-point is {away[row].max():.4g} from the one that the target is (row {row + 1})"
+        yield f"a set-point is {away[row].max():.4g} from the target (row {row + 1})"
 
 
 def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]:
