@@ -252,8 +252,9 @@ class Conduct:
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
-            if np.array_equal(q, self.sent[-1]) and a[1].any():
-                self._again(a, r[0])
+            if np.array_equal(a, self.answered) and a[1].any():
+                assert np.array_equal(q, self.sent[-1]), "sent again, and recorded otherwise"
+                self._again(r[0])
                 return
             step = motor - self.motor
             # Positions are compared in float64; both carry the rounding of their making.
@@ -281,9 +282,8 @@ class Conduct:
         behind = back[0] > self.limits.standstill
         return int(back.argmin(axis=0)[behind].max(initial=0))
 
-    def _again(self, a: np.ndarray, target: np.ndarray) -> None:
+    def _again(self, target: np.ndarray) -> None:
         """A set-point that the controller has not taken: the motion waits."""
-        assert (a == self.answered).all(), "sent again, and otherwise"
         lag = self._lag(target)
         assert lag > self.lag, "sent again although it was taken"
         self.lost += 1 if self.repeats else lag - self.lag
