@@ -20,6 +20,7 @@ class ArmWire:
 
     Attributes:
         joint_slots: (n,) slot of each joint.
+        opened: (n,) joints that are to be open; only these are written into a frame.
         raw: (8, n) D1..D5, extra1..3 of the packet read last, in wire units.
         age: (8, n) cycles since each of them was sent; None where all came with this packet.
         n_axes: slots in a packet.
@@ -28,7 +29,9 @@ class ArmWire:
         PacketError: the init packet's axis map is impossible or lacks one of the joints.
     """
 
-    def __init__(self, drive_train: DriveTrain, init: InitPacket, arm: int) -> None:
+    def __init__(
+        self, drive_train: DriveTrain, init: InitPacket, arm: int, only_axis: int | None = None
+    ) -> None:
         n = drive_train.n_joints
         slot_of = {axis.axis: axis.slot for axis in init.open_axes() if axis.arm == arm}
         missing = [joint + 1 for joint in range(n) if joint not in slot_of]
@@ -44,6 +47,13 @@ class ArmWire:
         self._pick: slice | NDArray[np.intp] = (
             slice(first, first + n) if contiguous else self.joint_slots
         )
+        self.opened = np.ones(n, dtype=np.bool_)
+        self._written: slice | NDArray[np.intp] = slice(None)
+        self._slots = self._pick
+        if only_axis is not None:
+            self._written = np.array([only_axis - 1])
+            self.opened[...] = np.arange(n) == self._written
+            self._slots = self.joint_slots[self._written]
         self._to_joint = TURN * drive_train.joint_from_motor.T
         self._to_motor = drive_train.motor_from_joint.T / TURN
         self._motor_offset = drive_train.motor_offset
@@ -92,14 +102,9 @@ class ArmWire:
 
     def put(self, frame: Floats, column: int, values: Array) -> None:
         """Put values (n,) into one column of a frame."""
-        frame[self._pick, column] = values
+        frame[self._slots, column] = values[self._written]
 
     def write(self, frame: Floats, position: Array, step: Array) -> None:
         """Put set-points (n,) in motor revolutions, per cycle, into a frame's D1 and D2."""
-        blocks = frame[self._pick] if isinstance(self._pick, slice) else None
-        if blocks is not None:
-            blocks[:, D1] = position
-            blocks[:, D1 + 1] = step
-        else:
-            frame[self._pick, D1] = position
-            frame[self._pick, D1 + 1] = step
+        self.put(frame, D1, position)
+        self.put(frame, D1 + 1, step)

@@ -11,99 +11,15 @@ from numpy.typing import NDArray
 from drivers.arm_wire import ArmWire
 from drivers.checks import require
 from drivers.correction_guard import CorrectionGuard
-from drivers.errors import FirstSetPointUnknown, GuardError, MotionNotCarriedOn, MotionUnknown
+from drivers.errors import AxisLeft, FirstSetPointUnknown, GuardError, MotionUnknown
 from drivers.execution import Execution, MotionExecution
-from drivers.guard import FIRST_FRACTION, Guard
+from drivers.guard import Guard
 from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.replies import D1, D2, D4, D5, ReplyFrame
+from drivers.set_points import SentSetPoints
 
-# Whether the controller takes our set-points: its target held against those sent last.
-#
-# While answers are lost the controller has to make do without; when it then hears the next one,
-# the arm is asked to leap by all that was lost. Unlike a packet that never arrived, a lost
-# answer shows nowhere but in the target that the controller reports. A packet that never arrived
-# is no answer either: a controller that carries its target on meanwhile reports one ahead of
-# those sent.
 Array = NDArray[np.float64]
-
-LEAP_FRACTION: Final = 0.25
-"""Share of the following-error threshold allowed between target and set-point sent last."""
-
-
-class SentSetPoints:
-    """The set-points sent last, in motor revolutions.
-
-    Args:
-        guard: whose following-error threshold and standstill apply.
-        depth: how many of them the target received may be.
-    """
-
-    def __init__(self, guard: Guard, depth: int) -> None:
-        n = guard.limits.n_joints
-        self._guard = guard
-        self._depth = depth
-        # One more than allowed, so that one too many can be counted.
-        self._sent = np.zeros((depth + 1, n))
-        self._back = np.arange(depth + 1)
-        self._ahead = np.arange(1.0, depth)[:, None]
-        self._newest = 0
-        self._lag = 0
-        self._every = np.ones(n, dtype=np.bool_)
-
-    def begin(self, target: Array) -> None:
-        """The first set-point (n,) was sent, the target received."""
-        self._sent[...] = target
-        self._lag = 0
-
-    def add(self, target: Array) -> None:
-        """The next set-point (n,) was sent."""
-        self._newest = newest = (self._newest + 1) % len(self._sent)
-        self._sent[newest] = target
-
-    def check(
-        self, target: Array, missed: int, cycle: int, where: NDArray[np.bool_] | None = None
-    ) -> int:
-        """Each joint's target has to be one of the set-points sent last, or the last carried on.
-
-        Args:
-            target: (n,) D1 received, motor revolutions.
-            missed: packets before this one that were not answered: for so many steps, but less
-                than `depth`, the controller may have carried on.
-            cycle: for the error.
-            where: (n,) which joints; None for all.
-
-        Returns:
-            How many answers more than in the cycle before were not accepted. What a joint at
-            standstill moves in a cycle hides one.
-
-        Raises:
-            NotFinite, MotionNotCarriedOn: a target further than `FIRST_FRACTION` of the
-                following-error threshold from all of them, or than `LEAP_FRACTION` from the last.
-        """
-        sent, standstill = self._sent, self._guard.limits.standstill
-        newest = sent[self._newest]
-        # As always: the set-point sent last. All else may take its time.
-        if np.abs(target - newest).max() <= standstill:
-            # Where hardly anything moves, a target reported late looks the same.
-            if self._lag and np.abs(newest - sent[self._newest - 1]).max() > standstill:
-                self._lag = 0
-            return 0
-        rows = sent[(self._newest - self._back) % len(sent)]
-        carried = newest + self._ahead[:missed] * (newest - rows[1])
-        late, ahead = np.abs(rows - target), np.abs(carried - target)
-        where = self._every if where is None else where
-        nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
-        threshold = self._guard.following_error
-        require(where, nearest, FIRST_FRACTION * threshold, MotionNotCarriedOn, cycle)
-        require(where, late[0], LEAP_FRACTION * threshold, MotionNotCarriedOn, cycle)
-        behind = where & (late[0] > standstill)
-        behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
-        lag = int(late.argmin(axis=0)[behind].max(initial=0))
-        more, self._lag = max(0, lag - self._lag), lag
-        return more
-
-
 Joints = NDArray[np.bool_]
 
 # Rows of `ArmWire.raw`.
@@ -232,10 +148,14 @@ class PositionMode(OpenMode):
         self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
     ) -> None:
         super().__init__(guard, wire, frame)
+        self._mode = mode
         self._history = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
-        self._continuing = np.ones(len(self._still), dtype=np.bool_)
+        self._velocity = self._still
+        self._slots = wire.joint_slots[wire.opened]
+        self._answer = frame.floats[self._slots].copy()
+        self._continuing = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
@@ -254,7 +174,7 @@ class PositionMode(OpenMode):
         self._sent = target
         self._history.begin(target)
         self.lost = 0
-        self._continuing[...] = True
+        self._continuing[...] = self._wire.opened
         self._rest(commanded)
 
     def require_start(self, cycle: int) -> None:
@@ -273,15 +193,20 @@ class PositionMode(OpenMode):
         """The motion's next set-point, or the last one where nothing moves."""
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
-        self._check_accepted(cycle)
+        stopping = execution is not None and execution.outcome == "stopped"
+        self._check_accepted(cycle, stopping=stopping)
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
             self._rest(commanded)
             return
         assert isinstance(execution, MotionExecution)
+        if self._history.again:
+            self._repeat(commanded)
+            return
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
+        self._require_closed_still(motor, cycle)
         self._step = step = motor - self._sent
         np.subtract(position, self.held, out=commanded[1])
         commanded[1] /= self._guard.period
@@ -293,16 +218,38 @@ class PositionMode(OpenMode):
         self.held = position
         self._sent = motor
         self._history.add(motor)
+        self._answer = frame[self._slots].copy()
+        self._velocity = commanded[1].copy()
 
-    def _check_accepted(self, cycle: int, where: Joints | None = None) -> None:
-        """Whether the controller takes the set-points sent.
+    def _repeat(self, commanded: Array) -> None:
+        """The answer sent last once more: the controller holds the target before it."""
+        self._frame.floats[self._slots] = self._answer
+        self._history.repeat()
+        commanded[0] = self.held
+        commanded[1] = self._velocity
+
+    def _require_closed_still(self, motor: Array, cycle: int) -> None:
+        """Axes that stay closed are where the controller holds them, wrist couplings included."""
+        opened = self._wire.opened
+        if opened.all():
+            return
+        off = np.abs(motor - self._wire.raw[TARGET]) > self._guard.limits.standstill
+        if (off & ~opened).any():
+            raise AxisLeft(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
+
+    def _check_accepted(
+        self, cycle: int, where: Joints | None = None, *, stopping: bool = False
+    ) -> None:
+        """Whether the controller accepts the set-points sent.
 
         An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
         """
-        lost = self._history.check(self._wire.raw[TARGET], self.missed, cycle, where)
-        age = self._wire.age
-        # The answer to the packet may have been taken all the same if the target is older.
-        self.lost = lost if lost and (age is None or not age[TARGET].any()) else 0
+        target, age = self._wire.raw[TARGET], self._wire.age
+        lost = self._history.check(target, self.missed, cycle, where, stopping=stopping)
+        if age is not None and age[TARGET].any():
+            # The answer to the packet may have been accepted all the same if the target is older.
+            lost, self._history.again = 0, False
+        self.lost = lost
 
     def _write_feed_forward(
         self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
@@ -345,7 +292,8 @@ class PositionMode(OpenMode):
             raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=continuing
         )
         self._check_accepted(cycle, continuing)
-        if continuing.all():  # a source that ends in mid-motion would leave a jump to rest
+        if np.array_equal(continuing, self._wire.opened):
+            # A source that ends in mid-motion would leave a jump to rest.
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
         self._history.add(self._sent)
         self._step = self._still

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from drivers.replies import SafeAnswer, Words, safe_answer
-from drivers.states import HOLDABLE, KNOWN_MODES, OPEN_MODES, Input, read_input
+from drivers.states import CLOSED_MODES, HOLDABLE, KNOWN_MODES, OPEN_MODES, Input, read_input
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +21,11 @@ class Reading:
         answer: the safe answer.
         status: status byte of the arm.
         modes: (n,) mode of each joint.
-        ready: (n,) joints in the mode wanted.
+        ready: (n,) joints in the mode wanted; closed ones where they are to stay closed.
         held: (n,) joints in an open mode whose safe answer is the target received.
         powered: some wanted axis is in an open mode and the drive is on.
         any_open: some wanted axis is in an open mode.
-        strayed: first joint in an open mode that is not the one wanted, or None.
+        strayed: first joint in an open mode that is not wanted of it, or None.
         others: slots given back their target in an open mode that are no joint of the arm.
     """
 
@@ -56,12 +56,19 @@ class Reader:
         arms: arm of each slot, from 1; None if unknown: any drive that is on counts.
         arm: the arm that is moved, from 1.
         mode: the open mode wanted.
+        opened: (n,) which axes are to be open; None for all.
     """
 
     def __init__(
-        self, slots: NDArray[np.intp], arms: tuple[int, ...] | None, arm: int, mode: int
+        self,
+        slots: NDArray[np.intp],
+        arms: tuple[int, ...] | None,
+        arm: int,
+        mode: int,
+        opened: NDArray[np.bool_] | None = None,
     ) -> None:
         self._slots = slots
+        self._opened = np.ones(len(slots), dtype=np.bool_) if opened is None else opened
         self._arms = arms
         self._arm = arm
         self._mode = mode
@@ -80,12 +87,13 @@ class Reader:
         wanted = modes[self._slots]
         drive_on = (DRIVE_ON in status) if self._arms is None else status[self._arm - 1] == DRIVE_ON
         is_open = np.isin(wanted, list(OPEN_MODES))
-        ready = wanted == self._mode
+        closed = ~self._opened & np.isin(wanted, list(CLOSED_MODES))
+        ready = closed | (self._opened & (wanted == self._mode))
         strayed = np.flatnonzero(is_open & ~ready)
         answer = safe_answer(status, modes, self._arms)
         joints = set(self._slots.tolist())
         return Reading(
-            input=read_input(drive_on, modes.tolist(), wanted.tolist(), self._mode),
+            input=read_input(drive_on, modes.tolist(), wanted[~closed].tolist(), self._mode),
             answer=answer,
             status=status[self._arm - 1],
             modes=wanted,

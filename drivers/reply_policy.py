@@ -8,8 +8,8 @@ the same conditions, from the set-point held. While axes are open, moving or not
 and current are watched, and that the controller takes the set-points: the target received (D1) is
 within 10 % of the following-error threshold of one of the last `max_gap` + 1 sent, or of the last
 carried on by as many steps as packets were missed, and within 25 % of the last. An older one than
-the last is an answer lost, which is counted and reported; more than `max_gap` of them in 100 cycles
-bring a motion to rest on its path.
+the last is an answer lost, which is counted and reported; the last set-point is sent again until it
+was taken, and more than `max_gap` of them in 100 cycles bring a motion to rest on its path.
 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
@@ -88,6 +88,7 @@ class ReplyPolicy:
         accept: adopt the controller's gear ratios, calibration and coupling where they differ.
         other_axes: (arm, axis), from 1, that may be open although they are no joints.
         max_gap: of the set-points sent last the target received may be any of one more.
+        only_axis: the only joint, from 1, that is to be open; None for all.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class ReplyPolicy:
         accept: bool,
         other_axes: frozenset[tuple[int, int]],
         max_gap: int,
+        only_axis: int | None = None,
     ) -> None:
         self.init = init
         self.init_check = compare(drive_train, guard.period, init, arm, accept, other_axes)
@@ -116,9 +118,9 @@ class ReplyPolicy:
         if self.unusable is not None:
             self.reader = _reader_without_joints(init, arm, mode)
             return
-        self.wire = ArmWire(self.init_check.drive_train, init, arm)
+        self.wire = wire = ArmWire(self.init_check.drive_train, init, arm, only_axis)
         arms = tuple(axis.arm for axis in init.open_axes())
-        self.reader = Reader(self.wire.joint_slots, arms, arm, mode)
+        self.reader = Reader(wire.joint_slots, arms, arm, mode, wire.opened)
         kind = CorrectionMode if mode in CORRECTION_MODES else PositionMode
         self._open_mode = kind(guard, self.wire, self._frame, mode, max_gap)
         axes = slice(0, drive_train.n_joints)

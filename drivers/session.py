@@ -29,10 +29,10 @@ controller has to report closed axes first, and a new motion has to be requested
 
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
-answered packet, whatever was missed; more than `max_gap` missed in a row, stale ones among them,
-bring it to rest on its path, if the controller carried it on. A packet that comes `PAUSE_CYCLES`
-later by the clock than its number accounts for gets a further set-point only if
-the arm moves as it was commanded to. What is watched meanwhile, and when
+answered packet, whatever was missed, and waits where an answer was not taken; more than `max_gap`
+missed in a row, stale ones among them, bring it to rest on its path, if the controller carried it
+on. A packet that comes `PAUSE_CYCLES` later by the clock than its number accounts for gets a
+further set-point only if the arm moves as it was commanded to. What is watched meanwhile, and when
 open mode is left, stands at the head of `drivers.reply_policy`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
@@ -205,6 +205,8 @@ class Session:
             differ from the cell's but are not far off, and accept further open axes, instead of
             refusing to move.
         other_axes: (arm, axis), both from 1, that may be open although the cell has no such joint.
+        only_axis: the joint, from 1, whose axis alone the controller opens; the others have to
+            stay closed. None where it opens all.
 
     Attributes:
         deadline: when silence becomes a fault, on the clock of `now`. Each packet that is answered
@@ -227,6 +229,7 @@ class Session:
         silence_timeout: float = 1.0,
         accept_init: bool = False,
         other_axes: Collection[tuple[int, int]] = (),
+        only_axis: int | None = None,
     ) -> None:
         n = drive_train.n_joints
         if not n == guard.limits.n_joints == ring.n_joints:
@@ -241,6 +244,11 @@ class Session:
             raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
         if not 1 <= arm <= N_ARMS:
             raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
+        if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
+            raise ValueError(
+                f"only axis {only_axis} of {n} in mode {mode} is not served: one axis alone is "
+                "moved in modes 1, 4 and 5"
+            )
         self.deadline = math.inf
         self._tally = Tally()
         self.counters: Counters = self._tally.counters
@@ -255,6 +263,7 @@ class Session:
         self._silence_timeout = silence_timeout
         self._accept_init = accept_init
         self._other_axes = frozenset(other_axes)
+        self._only_axis = only_axis
         self._machine = Machine(self.counters)
         self._sequence = Sequence()
         self._policy: ReplyPolicy | None = None
@@ -408,7 +417,7 @@ class Session:
             self._machine.forget_request()
         self._machine.take(Input.INIT)
         arm = (self._drive_train, self._guard, self._arm, self._mode)
-        options = (self._accept_init, self._other_axes, self._max_gap)
+        options = (self._accept_init, self._other_axes, self._max_gap, self._only_axis)
         self._policy = policy = ReplyPolicy(init, *arm, *options)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self._machine.cycle = 0

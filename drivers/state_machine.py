@@ -22,6 +22,7 @@ from drivers.events import (
 )
 from drivers.execution import Execution
 from drivers.motion_source import Array
+from drivers.packets import Mode
 from drivers.reading import Reading
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
@@ -195,7 +196,8 @@ class Machine:
         if execution.started and self.state is State.OPEN and reading.input is not Input.OPEN:
             joint = int(np.argmin(reading.ready))
         if joint is not None:
-            raise AxisLeft(joint, int(reading.modes[joint]), mode, self.cycle)
+            found = int(reading.modes[joint])
+            raise AxisLeft(joint, found, Mode.CLOSED if found == mode else mode, self.cycle)
 
     def begin_motion(self, position: Array) -> None:
         """The first set-point of the motion is `position`, (n,) rad.

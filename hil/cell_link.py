@@ -14,7 +14,11 @@ from hil.simulation import simulated_link
 
 @contextmanager
 def cell_link(
-    cell: Cell, *, accept_init: bool = False, live: LiveView | None = None
+    cell: Cell,
+    *,
+    accept_init: bool = False,
+    only_axis: int | None = None,
+    live: LiveView | None = None,
 ) -> Iterator[MotionLink]:
     """Open the cell's own link; leaving it brings the arm to rest and ends the connection.
 
@@ -25,6 +29,7 @@ def cell_link(
         cell: names the link.
         accept_init: use the controller's gear ratios, calibration and coupling where they differ
             from the cell's.
+        only_axis: the axis, from 1, that alone is to be open; None for all.
         live: lets viewers look at what is recorded, in real time.
 
     Raises:
@@ -33,9 +38,9 @@ def cell_link(
     """
     if cell.controller.transport == "simulated":
         require_watchable(cell, live)
-        yield simulated_link(cell)
+        yield simulated_link(cell, only_axis=only_axis)
         return
-    with LiveLink.open(cell, accept_init=accept_init, live=live) as link:
+    with LiveLink.open(cell, accept_init=accept_init, only_axis=only_axis, live=live) as link:
         yield link
 
 

@@ -102,6 +102,23 @@ def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
     Raises:
         InputError: there is no such joint.
     """
+    target = start.copy()
+    index = joint_index(cell, joint, "--joint")
+    target[index] += np.radians(degrees) * AngleFrame.of(cell).sign[index]
+    return target
+
+
+def joint_index(cell: Cell, joint: str, field: str) -> int:
+    """Index, from 0, of a joint given by its name, or its number from 1.
+
+    Args:
+        cell: whose arm.
+        joint: which.
+        field: where it was typed.
+
+    Raises:
+        InputError: there is no such joint.
+    """
     names = cell.joint_names
     numbers = {str(number): index for index, number in enumerate(range(1, len(names) + 1))}
     index = numbers.get(joint, names.index(joint) if joint in names else None)
@@ -109,12 +126,36 @@ def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
         raise InputError(
             None,
             f"{joint!r} is no joint",
-            field="--joint",
+            field=field,
             remedy=f"name one of {', '.join(names)}",
         )
-    target = start.copy()
-    target[index] += np.radians(degrees) * AngleFrame.of(cell).sign[index]
-    return target
+    return index
+
+
+def axis_alone(cell: Cell, joint: str | None) -> int:
+    """Number, from 1, of the axis that moves a joint by itself.
+
+    Args:
+        cell: whose arm.
+        joint: see `joint_index`; None where none is named.
+
+    Raises:
+        InputError: no joint is named, or a wrist coupling turns further motors with it.
+    """
+    if joint is None:
+        raise InputError(
+            None, "which axis is open?", field="--only-axis", remedy="give --joint and --by"
+        )
+    index = joint_index(cell, joint, "--joint")
+    motors = np.flatnonzero(cell.drive_train.motor_from_joint[:, index]) + 1
+    if motors.tolist() != [index + 1]:
+        raise InputError(
+            None,
+            f"joint {index + 1} moves by the motors of axes {', '.join(map(str, motors))}",
+            field="--only-axis",
+            remedy="move another joint first, or open all axes",
+        )
+    return index + 1
 
 
 def straight_way(

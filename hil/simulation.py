@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,7 @@ def simulated_link(
     drive: SimulatedDrive | None = None,
     truth: PlantTruth | None = None,
     instead_of_hardware: bool = False,
+    only_axis: int | None = None,
 ) -> Link:
     """A link in virtual time to a simulated controller of this cell; one seed is one run.
 
@@ -44,6 +46,7 @@ def simulated_link(
         drive: what the robot really has, where it shall differ from the cell's drive train.
         truth: what is planted in the plant, where it shall differ from the cell's.
         instead_of_hardware: simulate a cell that names a real link as well.
+        only_axis: the axis, from 1, that alone is opened and moved; None for all.
 
     Raises:
         CellError: the cell is one of real hardware.
@@ -56,8 +59,12 @@ def simulated_link(
             "a cell of real hardware is not simulated",
             'write "simulated" to try it without',
         )
-    controller = simulated_controller(cell, effects=effects, drive=drive, truth=truth)
-    return Link.over(SimulatedTransport(controller), cell, finish=controller.finish)
+    settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
+    controller = simulated_controller(
+        cell, effects=effects, drive=drive, truth=truth, settings=settings
+    )
+    transport = SimulatedTransport(controller)
+    return Link.over(transport, cell, finish=controller.finish, only_axis=only_axis)
 
 
 def simulated_controller(

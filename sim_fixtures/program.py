@@ -19,6 +19,7 @@ from enum import IntEnum, auto
 from math import ceil
 from typing import NamedTuple
 
+from sim_fixtures.errors import SettingError
 from sim_fixtures.settings import ControllerSettings
 
 
@@ -99,10 +100,11 @@ class LoopProgram:
         phase: the present one.
         powered: whether the drive is on (status DRIVE_ON).
         braked: whether the brakes are closed.
+        wanted_axes: which axes the program opens, (n,).
         listening: whether targets of open axes are read from the PC.
         open_axes: which axes stand in open mode in the packet of this cycle, (n,).
         reason: why the drive was last lost or the session ended, in words; "" if neither.
-        intervals: how often all axes have been open.
+        intervals: how often all of these have been open.
         openings_lost: openings in a row that ended because replies were missing, or by 508.
         gave_up: the session ends because there were too many of these.
         pause_mode: mode of every axis in phase PAUSED.
@@ -111,6 +113,10 @@ class LoopProgram:
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
         self._settings = settings
         self._n_axes = n_axes
+        only = settings.only_axis
+        if only is not None and only > n_axes:
+            raise SettingError("only_axis", only, f"1..{n_axes}")
+        self.wanted_axes = [only in (None, axis + 1) for axis in range(n_axes)]
         self._start = COLD_START if settings.cold_start else WARM_START
         self._age = 0
         self._missed = 0
@@ -206,13 +212,14 @@ class LoopProgram:
             self._gone.clear()
             self._open_due_axes()
         elif phase not in STILL_OPEN:
-            self.open_axes = [phase is Phase.OPEN] * self._n_axes
+            self.open_axes = [phase is Phase.OPEN and wanted for wanted in self.wanted_axes]
 
     def _open_due_axes(self) -> None:
         """Open one axis after the other."""
-        stagger = self._settings.opening_stagger
+        stagger, wanted = self._settings.opening_stagger, self.wanted_axes
         self.open_axes = [
-            self._age >= i * stagger and i not in self._gone for i in range(self._n_axes)
+            wanted[axis] and axis not in self._gone and self._age >= sum(wanted[:axis]) * stagger
+            for axis in range(self._n_axes)
         ]
 
     def _close_due_axes(self) -> None:
@@ -248,7 +255,7 @@ class LoopProgram:
             self.openings_lost = 0
             self._enter(Phase.CLOSING)
         elif self.phase is Phase.OPENING:
-            if all(self.open_axes):
+            if self.open_axes == self.wanted_axes:
                 self.intervals += 1
                 self._enter(Phase.OPEN)
             else:

@@ -84,6 +84,7 @@ class ControllerSettings:
         drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase.
             `closed_cycles` passes before every opening.
         opening_stagger: cycles between one axis entering open mode and the next.
+        only_axis: number, from 1, of the only axis that the program opens; None for all.
         closing_stagger: cycles between one axis leaving open mode and the next.
         missed_replies: replies missing in a row that end open mode.
         lost_openings: openings in a row that were lost to missing replies and end the session;
@@ -123,6 +124,7 @@ class ControllerSettings:
     closed_cycles: int = 20
     closing_cycles: int = 5
     opening_stagger: int = 3
+    only_axis: int | None = None
     closing_stagger: int = 0
     missed_replies: int = 1
     lost_openings: int | None = None
@@ -166,6 +168,8 @@ class ControllerSettings:
                 _require(self, field.name, 1.0)
         if self.lost_openings is not None:
             _require(self, "lost_openings", 1.0)
+        if self.only_axis is not None:
+            _require(self, "only_axis", 1.0)
         _require(self, "ramp_time", 0.0, exclusive=True)
         _require(self, "own_speed", 0.0, 1.0, exclusive=True)
         self._check_choices()

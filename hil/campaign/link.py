@@ -90,6 +90,7 @@ class Link:
         finish: Callable[[], None] = lambda: None,
         *,
         accept_init: bool = False,
+        only_axis: int | None = None,
     ) -> Link:
         """A link to the simulated controller of `cell` over `transport`.
 
@@ -107,7 +108,7 @@ class Link:
             cell.drive_train,
             guard,
             ring,
-            **cell.session_settings(accept_init=accept_init),
+            **cell.session_settings(accept_init=accept_init, only_axis=only_axis),
         )
         if not cell.controller.packets:
             return cls(transport, session, ring, guard, finish, cell=cell)

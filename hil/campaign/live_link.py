@@ -223,6 +223,7 @@ class LiveLink:
         *,
         transport: TransportSpec | None = None,
         accept_init: bool = False,
+        only_axis: int | None = None,
         realtime: RealTimeSettings | None = None,
         finish: Callable[[], None] = lambda: None,
         live: LiveView | None = None,
@@ -235,6 +236,7 @@ class LiveLink:
             cell: the cell.
             transport: in place of the cell's own.
             accept_init: use the controller's figures where they differ from the cell's.
+            only_axis: the axis, from 1, that alone is to be open; None for all.
             realtime: what the exchange asks of the system.
             finish: asks the far end to end the session.
             live: lets viewers look at what is recorded.
@@ -252,7 +254,7 @@ class LiveLink:
             drive_train=cell.drive_train,
             guard_limits=cell.guard_limits,
             period=cell.period,
-            session=cell.session_settings(accept_init=accept_init),
+            session=cell.session_settings(accept_init=accept_init, only_axis=only_axis),
             realtime=realtime or RealTimeSettings(),
             preload=("planner",),
             packets=CAPACITY if cell.controller.packets else 0,

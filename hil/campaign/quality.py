@@ -65,7 +65,8 @@ class Standstill:
 
 Array = NDArray[np.float64]
 
-FIELDS: Final = ("cycle", "gap", "position", "target_current", "commanded_position")
+_SENT: Final = ("commanded_position", "commanded_velocity")
+FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)
 """Columns of an archive that are looked at."""
 MISSED_SHARE: Final = 0.01
 """Of all cycles: more missed packets than that, and the recording is too torn."""
@@ -133,6 +134,8 @@ class Problem:
 class Played:
     """The part of an archive in which the arm was commanded; row k is set-point k.
 
+    One that was sent again because the controller had not taken it is there once.
+
     Attributes:
         position: (m, n) measured [rad].
         current: (m, n) [A].
@@ -154,16 +157,20 @@ class Played:
         Raises:
             ArchiveError: it is no archive of a motion of ours.
         """
-        columns = archive.recorded("commanded_position", "target_current", "gap")
+        columns = archive.recorded(*_SENT, "target_current", "gap")
         began = [event.time for event in archive.events if event.name == MotionStarted.__name__]
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         if began:
             rows &= columns["stamp"] >= round(began[-1] * 1e9)
+        missed = int(columns["gap"][rows].sum())
+        position, velocity = (columns[name] for name in _SENT)
+        same = (np.diff(position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+        rows &= ~(same & (velocity != 0.0).any(axis=1))
         return cls(
             position=columns["position"][rows],
             current=columns["target_current"][rows],
-            commanded=columns["commanded_position"][rows],
-            missed=int(columns["gap"][rows].sum()),
+            commanded=position[rows],
+            missed=missed,
         )
 
 

@@ -259,9 +259,11 @@ class Cell:
         """Whether nothing but a simulated controller on this computer can be at the far end."""
         return link.only_simulated(self)
 
-    def session_settings(self, *, accept_init: bool = False) -> dict[str, Any]:
+    def session_settings(
+        self, *, accept_init: bool = False, only_axis: int | None = None
+    ) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
-        return link.session_settings(self, accept_init=accept_init)
+        return link.session_settings(self, accept_init=accept_init, only_axis=only_axis)
 
     @property
     def workspace(self) -> Workspace:

@@ -79,7 +79,9 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def session_settings(cell: Cell, *, accept_init: bool = False) -> dict[str, Any]:
+def session_settings(
+    cell: Cell, *, accept_init: bool = False, only_axis: int | None = None
+) -> dict[str, Any]:
     """Keyword arguments of `drivers.Session`."""
     table, campaign = cell.controller, cell.file.campaign
     settings: dict[str, Any] = {
@@ -89,6 +91,8 @@ def session_settings(cell: Cell, *, accept_init: bool = False) -> dict[str, Any]
         "accept_init": accept_init,
         "other_axes": frozenset(table.other_axes),
     }
+    if only_axis is not None:
+        settings["only_axis"] = only_axis
     if campaign is not None:
         settings["settle_cycles"] = max(1, round(campaign.settle_s / cell.period))
     return settings

@@ -23,7 +23,7 @@ from hil.cli.arguments import JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.lines import say
-from hil.move import THERE, Way, posture, send, straight_way, turned
+from hil.move import THERE, Way, axis_alone, posture, send, straight_way, turned
 from hil.progress import Task
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
@@ -89,6 +89,14 @@ def move(
             "from the cell's; the archive says so.",
         ),
     ] = False,
+    only_axis: Annotated[
+        bool,
+        typer.Option(
+            "--only-axis",
+            help="With --joint: the controller's program opens the axis of that joint only, and "
+            "the others have to stay closed.",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Move the arm on a straight way in joint space, slowly, and archive it.
@@ -112,11 +120,12 @@ def move(
         )
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
+    axis = axis_alone(cell, joint) if only_axis else None
     start_of = None
     if campaign is not None:
         start_of = campaign.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
     wanted = None if to is None else posture(cell, to, start_of)
-    with _reserved(campaign), cell_link(cell, accept_init=accept_init) as link:
+    with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
         link.connection.say = partial(say, err=True)
         if yes and not link.only_simulated:
             _require_slow(cell, speed)

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import json as json_format
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
+from hil.report import csv_tables
 from hil.results import Results
 
 
 def report(
     campaign: CampaignArgument,
+    csv: Annotated[
+        Path | None,
+        typer.Option(help="Folder for every table of the results as CSV.", show_default=False),
+    ] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -24,6 +32,9 @@ def report(
     """
     opened = Campaign.open(campaign)
     page = opened.report(reporter=make_reporter(quiet=quiet or json))
+    if csv is not None:
+        make_folder(csv)
+        write_together(csv, csv_tables(Results.load(opened.folder.results)))
     if not json:
         typer.echo(page)
         return

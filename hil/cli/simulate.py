@@ -16,6 +16,7 @@ from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption
 from hil.errors import InputError
+from hil.move import joint_index
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import printable
@@ -199,6 +200,10 @@ Mode = Annotated[
 Stagger = Annotated[
     int, typer.Option(min=0, help="Cycles between one axis entering open mode and the next.")
 ]
+OnlyAxis = Annotated[
+    int | None,
+    typer.Option("--only-axis", min=1, help="Open this axis only; the others stay closed."),
+]
 Missed = Annotated[
     int, typer.Option(min=1, help="Missing replies in a row that end open mode (real: unknown).")
 ]
@@ -290,6 +295,7 @@ def simulate(
     cycle: Cycle = None,
     mode: Mode = None,
     stagger: Stagger = 3,
+    only_axis: OnlyAxis = None,
     missed: Missed = 1,
     patience: Patience = 0.0,
     while_silent: WhileSilent = "hold",
@@ -306,11 +312,14 @@ def simulate(
 ) -> None:
     """Serve one session; `HELP` is what a person reads."""
     loaded = Cell.load(cell)
+    if only_axis is not None:
+        joint_index(loaded, str(only_axis), "--only-axis")
     settings = _settings(
         controller_settings(loaded, effects=effects),
         period=loaded.period if cycle is None else cycle / 1000.0,
         open_mode=loaded.controller.mode if mode is None else mode,
         opening_stagger=stagger,
+        only_axis=only_axis,
         missed_replies=missed,
         lost_openings=LOST_OPENINGS,
         reopening_time=REOPENING,

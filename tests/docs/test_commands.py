@@ -56,6 +56,7 @@ NOT_TYPED = {
     "hil design cell.toml --method b -o runs/b": "half a minute; a short one needs other settings",
     "hil doctor cell.toml --duration 14400": "four hours",
     "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
+    "hil move copy.toml": "needs a controller; tests/hil/test_move.py types it",
     "hil record": "waits for a controller; tests/hil/test_record_command.py runs it",
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",

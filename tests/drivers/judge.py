@@ -64,6 +64,8 @@ class Conduct:
     motors: list[np.ndarray] = field(default_factory=list)
     max_gap: int = 2
     lag: int = 0
+    repeats: int = 0
+    answered: np.ndarray | None = None
     lost: int = 0
     exiting: bool = False
     kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
@@ -242,7 +244,7 @@ class Conduct:
             for slot in self.slots:
                 assert answer.axes[slot] == received.axes[slot].keep(1), "first: target, at rest"
             self.sent = [q, q, q, q]
-            self.motors, self.lag, self.lost = [], 0, 0
+            self.motors, self.lag, self.lost, self.repeats = [], 0, 0, 0
         else:
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
             late = self.max_gap + 1
@@ -250,6 +252,10 @@ class Conduct:
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
+            if np.array_equal(a, self.answered) and a[1].any():
+                assert np.array_equal(q, self.sent[-1]), "sent again, and recorded otherwise"
+                self._again(r[0])
+                return
             step = motor - self.motor
             # Positions are compared in float64; both carry the rounding of their making.
             slack = 3 * rounding + np.spacing(np.float32(np.abs(a[1])))
@@ -266,17 +272,37 @@ class Conduct:
             self._beside(a)
         if self.motor is not None:
             self._count_lost(r[0])
+        self.repeats, self.answered = 0, a
         self.motors = [*self.motors, motor][-(self.max_gap + 2) :]
         self.motor = motor
         del self.sent[:-3]
 
-    def _count_lost(self, target: np.ndarray) -> None:
-        """More than `max_gap` answers that show in no target are reason enough for a stop."""
+    def _lag(self, target: np.ndarray) -> int:
         back = np.abs(np.array(self.motors[::-1]) - target)
         behind = back[0] > self.limits.standstill
-        lag = int(back.argmin(axis=0)[behind].max(initial=0))
+        return int(back.argmin(axis=0)[behind].max(initial=0))
+
+    def _again(self, target: np.ndarray) -> None:
+        """A set-point that the controller has not taken: the motion waits."""
+        lag = self._lag(target)
+        assert lag > self.lag, "sent again although it was taken"
+        self.lost += 1 if self.repeats else lag - self.lag
+        self.repeats += 1
+        self.stopping = self.stopping or self.lost > self.max_gap
+        self._count("again")
+
+    def _count_lost(self, target: np.ndarray) -> None:
+        """More than `max_gap` answers that show in no target are reason enough for a stop.
+
+        The motion goes on, though the target is further behind than before, only with small steps,
+        or on its way to rest.
+        """
+        lag = self._lag(target)
+        last = np.abs(self.motors[-1] - self.motors[-2]).max() if len(self.motors) > 1 else 0.0
+        slow = last <= 4.0 * self.limits.standstill * (1 + 1e-6)
+        assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
         self.lost += max(0, lag - self.lag)
-        self.lag = lag
+        self.lag = self.lag if self.repeats and not lag else lag
         self.stopping = self.stopping or self.lost > self.max_gap
 
     def _factors(self) -> tuple[float, float]:

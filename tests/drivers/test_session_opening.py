@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drivers import (
+    AxisLeft,
     CurrentLimit,
     FirstSetPoint,
     Mode,
@@ -215,3 +216,44 @@ class TestStaggeredOpening:
         answer = rig.cycle()
         np.testing.assert_array_equal(answer.axes["mode"], Mode.DELTA_POSITION)
         assert not answer.axes["d"].any()
+
+
+class TestOnlyAxis:
+    """One axis is open and moved; the others keep the safe answer of closed ones."""
+
+    def moving(self, by: np.ndarray) -> Rig:
+        rig = Rig(only_axis=1)
+        rig.session.request(smooth_move(by, 300))
+        rig.close()
+        rig.modes = np.array([Mode.POSITION, *[Mode.CLOSED] * (N - 1)])
+        return rig
+
+    def test_only_its_slot_carries_set_points(self):
+        rig = self.moving(MOVE * (np.arange(N) == 0))
+        before = rig.axes["d"].copy()
+        for _ in range(200):
+            answer = rig.cycle()
+            assert rig.state is State.OPEN
+            np.testing.assert_array_equal(answer.axes["mode"], rig.modes)
+            np.testing.assert_array_equal(answer.axes["d"][1:, :2], before[1:, :2])
+            rig.axes["d"][0, :4] = [*answer.axes["d"][0, :2]] * 2
+        assert abs(rig.axes["d"][0, 0] - before[0, 0]) > 0.5
+
+    @pytest.mark.parametrize("joint", range(1, N))
+    def test_a_motion_of_another_joint_is_refused(self, joint):
+        rig = self.moving(MOVE * np.isin(np.arange(N), [0, joint]))
+        for _ in range(300):
+            answer = rig.cycle()
+            if rig.state is State.FAULTED:
+                break
+            rig.axes["d"][0, :4] = [*answer.axes["d"][0, :2]] * 2
+        assert type(rig.refusal) is AxisLeft
+        assert (rig.refusal.joint, rig.refusal.mode) == (joint, Mode.CLOSED)
+
+    def test_another_axis_that_opens_ends_the_motion(self):
+        rig = self.moving(MOVE * (np.arange(N) == 0))
+        rig.cycle()
+        rig.modes[2] = Mode.POSITION
+        rig.cycle()
+        assert type(rig.refusal) is AxisLeft
+        assert rig.refusal.joint == 2

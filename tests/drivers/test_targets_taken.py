@@ -10,13 +10,15 @@ import pytest
 
 from drivers import Guard
 from drivers.errors import MotionNotCarriedOn, NotFinite
-from drivers.open_mode import SentSetPoints
+from drivers.set_points import REPETITIONS, SentSetPoints
 from tests.drivers.rig import PERIOD, N, limits
 
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])
 SLOW = 0.01
 """Steps of which many lie within what a target may be off."""
 STANDSTILL = 5e-4
+STEP = 3.9 * STANDSTILL
+"""Below four times standstill nothing is sent again."""
 
 
 class Sent:
@@ -127,7 +129,7 @@ class TestHowMany:
         assert sent.check(-1.01, missed=1) == 1
 
     def test_each_counts_once_however_long_the_target_stays_behind(self):
-        sent = Sent(SLOW)
+        sent = Sent(STEP)
         counts = []
         for behind in (0.0, 1.0, 1.0, 2.0, 1.0, 2.0, 0.0, 1.0):
             counts.append(sent.check(-behind))
@@ -151,12 +153,49 @@ class TestHowMany:
     @pytest.mark.parametrize(("step", "lost"), [(0.0, 0), (1.0, 1)], ids=["at rest", "moving on"])
     def test_an_arm_that_comes_to_rest_behind_is_not_behind_twice(self, step, lost):
         """At rest a target one behind looks like the last; it is still the same answer lost."""
-        sent = Sent(SLOW)
+        sent = Sent(STEP)
         assert sent.check(-1.0) == 1
         sent.add(step)
         assert sent.check(0.0) == 0
         sent.add(1.0)
         assert sent.check(-1.0) == lost
+
+    @pytest.mark.parametrize(("share", "again"), [(3.99, False), (4.01, True)])
+    def test_only_a_step_that_is_not_small_is_sent_again(self, share, again):
+        sent = Sent(share * STANDSTILL)
+        assert sent.check(-1.0) == 1
+        assert sent.taken.again is again
+
+    def test_sent_again_each_cycle_is_one_more_until_it_is_taken(self):
+        sent = Sent(SLOW)
+        for _ in range(5):
+            assert sent.check(-1.0) == 1
+            assert sent.taken.again
+            sent.taken.repeat()
+        assert sent.check(0.0) == 0
+        assert not sent.taken.again
+
+    @pytest.mark.parametrize("stopping", [False, True])
+    def test_behind_after_a_repetition_is_lost_or_on_the_way_to_rest_late(self, stopping):
+        """Sent again, a set-point looks taken to whoever reports a cycle late."""
+        sent = Sent(SLOW)
+        sent.check(-1.0)
+        sent.taken.repeat()
+        sent.check(0.0)
+        for _ in range(3):
+            sent.add(1.0)
+            assert sent.check(-1.0, stopping=stopping) == (not stopping)
+            assert sent.taken.again is not stopping
+            if not stopping:
+                sent.taken.repeat()
+                sent.check(0.0)
+
+    def test_a_controller_that_never_takes_it_is_refused(self):
+        sent = Sent(SLOW)
+        for _ in range(REPETITIONS):
+            sent.check(-1.0)
+            sent.taken.repeat()
+        assert sent.refuses(-1.0)
 
     def test_the_next_time_in_open_mode_begins_anew(self):
         sent = Sent(SLOW)

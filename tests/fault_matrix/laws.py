@@ -95,7 +95,10 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
     if still is not None and np.any(np.nan_to_num(records["commanded_velocity"][still])):
         yield "set-points that move after the motion was lost or refused"
     for first, last in _stretches(sent & (records["state"] != State.OPENING)):
-        yield from _broken_bounds(records["commanded_position"][first:last])
+        q, v = (records[name][first:last] for name in ("commanded_position", "commanded_velocity"))
+        same = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+        # What the controller did not take is sent again, with its velocity: no step of the motion.
+        yield from _broken_bounds(q[~(same & v.any(axis=1))])
 
 
 def _broken_bounds(q: Array) -> Iterator[str]:

@@ -22,10 +22,11 @@ from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.cell import Cell
 from hil.cli import app
 from hil.demo_link import LOOPBACK
-from hil.errors import InputError, UnsafeError
+from hil.errors import ControllerFault, InputError, UnsafeError
 from hil.move import posture, straight_way, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
+from tests.docs.typed import ROOT, commands
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,44 @@ def test_one_joint_turns_by_so_many_degrees_of_the_teach_pendant(
     pendant = np.degrees(ns16.controller_angles(archive.columns["position"][[0, -1]]))
     np.testing.assert_allclose(pendant[1] - pendant[0], [0, 0, 5, 0, 0, 0], atol=0.05)
     assert summary["outcome"] == "completed"
+
+
+class TestOnlyAxis:
+    """The controller's program opens one axis; the others stay in mode 0 and where they are."""
+
+    def test_it_moves_over_a_real_link(self, ns16: Cell, tmp_path: Path) -> None:
+        """As `docs/connect.md` types it."""
+        out = str(tmp_path / "one.mcap")
+        page = ROOT / "docs" / "connect.md"
+        simulate, moved = (words for words in commands(page) if "--only-axis" in words)
+        options = simulate[simulate.index("--only-axis") :]
+        with UdpController.started(ns16, tmp_path, options=options) as controller:
+            way = [str(controller.cell_path), *moved[3:], "-o", out]
+            assert ran(*way)["outcome"] == "completed"
+        columns = open_archive(out).columns
+        in_interval = columns["interval"] == 0
+        opened = columns["mode"][in_interval] == ns16.controller.mode
+        assert opened[:, 2].any()
+        assert not np.delete(opened, 2, axis=1).any()
+        target = np.degrees(ns16.controller_angles(columns["target_position"][in_interval]))
+        np.testing.assert_allclose(target[-1] - target[0], [0, 0, 2, 0, 0, 0], atol=1e-3)
+
+    def test_it_is_refused_where_others_open_too(self, ns16: Cell, tmp_path: Path) -> None:
+        with UdpController.started(ns16, tmp_path) as controller:
+            way = ["--joint", "3", "--by", "2", "--only-axis", "-o", str(tmp_path)]
+            result = CliRunner().invoke(app, ["move", str(controller.cell_path), *way, "--json"])
+        assert isinstance(result.exception, ControllerFault)
+        assert "joint 1 is in mode 4; the motion needs 0" in str(result.exception)
+
+    def test_a_joint_that_turns_other_motors_is_refused(self) -> None:
+        way = ["--joint", "4", "--by", "2", "--only-axis"]
+        result = CliRunner().invoke(app, ["move", str(CELL_PATH), *way])
+        assert isinstance(result.exception, InputError)
+        assert "joint 4 moves by the motors of axes 4, 5, 6" in str(result.exception)
+
+    def test_a_posture_needs_all_axes(self) -> None:
+        result = CliRunner().invoke(app, ["move", str(CELL_PATH), "--to", "home", "--only-axis"])
+        assert isinstance(result.exception, InputError)
 
 
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 import json
 import math
@@ -20,7 +21,15 @@ from hypothesis import strategies as st
 from matplotlib.image import imread
 from pydantic import ValidationError
 
-from hil.report import ReportSeries, SeriesError, numbers, render_report, report_bytes, validation
+from hil.report import (
+    ReportSeries,
+    SeriesError,
+    csv_tables,
+    numbers,
+    render_report,
+    report_bytes,
+    validation,
+)
 from hil.report.figures import correlation_matrix
 from hil.report.figures.canvas import thinned
 from hil.results import Results
@@ -462,3 +471,25 @@ def test_a_number_is_rounded_where_its_uncertainty_begins() -> None:
     assert numbers.beside(-0.00004, 0.02) == "0.000"
     assert numbers.beside(1.23456e-9, 2.2e-11) == "1.235e-9"
     assert numbers.beside(5.0, math.nan) == "5.000"
+
+
+class TestTables:
+    """Every list of records and every matrix is a CSV file with the numbers of `results.json`."""
+
+    def rows(self, name: str) -> list[dict[str, str]]:
+        return list(csv.DictReader(io.StringIO(csv_tables(make_results())[name])))
+
+    def test_a_record_is_a_row_in_full_precision(self) -> None:
+        found, results = self.rows("parameters.csv"), make_results()
+        assert [row["name"] for row in found] == [p.name for p in results.parameters]
+        assert [float(row["estimate"]) for row in found] == [p.estimate for p in results.parameters]
+
+    def test_numbers_of_joints_have_a_column_each(self) -> None:
+        run, row = make_results().validation[0], self.rows("validation.csv")[0]
+        assert [float(row[f"rms_error.{joint}"]) for joint in JOINTS] == list(run.rms_error)
+
+    def test_a_matrix_has_a_column_per_parameter(self) -> None:
+        results = make_results()
+        found = self.rows("repetition_values.csv")
+        assert list(found[0]) == [p.name for p in results.parameters]
+        assert [float(x) for x in found[-1].values()] == list(results.repetition_values[-1])

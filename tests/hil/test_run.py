@@ -36,8 +36,14 @@ from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_mo
 from hil.cell import Cell
 from hil.identify.sources import gather_sources
 from hil.screen.screen import Pace
-from hil.simulation import planted_truth, simulated_controller, simulated_link
+from hil.simulation import (
+    controller_settings,
+    planted_truth,
+    simulated_controller,
+    simulated_link,
+)
 from sim_fixtures.controller_faults import Faultable
+from sim_fixtures.fault_script import parse_fault, split_faults
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 
 Array = NDArray[np.float64]
@@ -387,6 +393,33 @@ def test_a_load_on_an_axis_is_seen_beside_the_repetitions_before(
     assert rejected.archive == "excitation_003_a1.mcap"
     assert "shoulder" in rejected.reason
     assert result.repetitions == (4, 4)
+
+
+def test_a_repetition_in_which_answers_were_lost_is_the_motion_as_planned(
+    tmp_path: Path, designed: Campaign, undisturbed: Campaign
+) -> None:
+    """Two in a row, at speed: the motion waits two cycles, and leaves nothing out.
+
+    What the controller's own hold does to the currents is another matter: they are compared.
+    """
+    name = "excitation_001_a1.mcap"
+    usual = open_archive(undisturbed.folder.archives / name, fields=["cycle"])
+    middle = int(np.mean(usual.columns["cycle"][[0, -1]]))
+    cell = fast_cell(tmp_path)
+    settings = replace(controller_settings(cell), missed_replies=5)
+    controller = simulated_controller(cell, settings=settings)
+    lost, _ = split_faults([parse_fault(f"lose@{middle}x2:to_controller")])
+    link = Link.over(SimulatedTransport(controller, lost), cell, controller.finish)
+    campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
+    campaign.run(link, unrehearsed=True, durable=False)
+    mine, theirs = (
+        open_archive(one.folder.archives / name).columns["commanded_position"]
+        for one in (campaign, undisturbed)
+    )
+    sent = [int(np.isfinite(one).all(axis=1).sum()) for one in (mine, theirs)]
+    assert sent[0] == sent[1] + 2
+    both = [played(one.folder.archives / name).commanded for one in (campaign, undisturbed)]
+    np.testing.assert_allclose(*both, atol=1e-5)
 
 
 def played(archive: Path) -> Played:

@@ -69,6 +69,16 @@ def test_phases_last_as_long_as_set() -> None:
     assert phases == [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
 
 
+def test_one_axis_opens_alone() -> None:
+    """The others stay closed, and the PC has the arm as soon as that axis is open."""
+    loop = program(only_axis=2)
+    advance_to(loop, Phase.OPEN)
+    assert loop.open_axes == [False, True, False]
+    assert loop.intervals == 1
+    with pytest.raises(SettingError, match="only_axis"):
+        program(only_axis=4)
+
+
 def test_axes_open_one_after_the_other() -> None:
     loop = program()
     advance_to(loop, Phase.OPENING)

@@ -3,6 +3,10 @@
 By differences of what was really sent, twice: of the float64 set-points in the records, and of the
 float32 numbers on the wire with the bound of their rounding. Bounds are the cell's; wider ones of
 a change of override or a stop count only once something asked for that.
+
+A set-point that the controller has not taken is sent again, the same position and velocity, until
+it is: the motion waits, so that no set-point is more than a step from the target that the
+controller holds. Rates are those of the motion, without such repetitions.
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ _STANDSTILL: Final = 5e-4
 """Motor revolutions per cycle: two increments of a 12-bit encoder (`drivers.guard_limits`)."""
 _FLOAT32: Final = float(np.finfo(np.float32).eps)
 """Motor revolutions per cycle: more than float32 leaves open of a step, which is far below 1."""
+_SLOW: Final = 4.0 * _STANDSTILL
+"""Steps of which several may be made up in one cycle (`drivers.set_points`)."""
 _FIRST: Final = 0.1
 """Share of the following-error threshold that target and arm may differ by at first."""
 _LEAP: Final = 0.25
@@ -88,7 +94,7 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
     yield from _feedback(stretch, threshold, current)
     led = slice(0, stretch.leading)
     factors = limits.factors(*_asked_for(stretch))
-    q = stretch.talk.records["commanded_position"][stretch.rows][led]
+    q = recorded = stretch.talk.records["commanded_position"][stretch.rows][led]
     if not np.isfinite(q).all():
         yield "a set-point was sent, and its record has none"
         return
@@ -96,15 +102,20 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
     span = 0.5 * (limits.upper - limits.lower) * _TOLERANCE
     if np.any(q > limits.upper + span) or np.any(q < limits.lower - span):
         yield f"a set-point outside the joints' range: {q.min(axis=0)} to {q.max(axis=0)}"
+    fresh = ~stretch.again[led]
+    q, factors = q[fresh], np.concatenate((factors[led][fresh], factors[stretch.leading :]))
     # What is held afterwards ends the motion: nobody may be brought to rest by a jump.
-    held = np.concatenate((q, q[-1:].repeat(min(3, len(stretch.sent) - len(q)), axis=0)))
+    after = min(3, len(stretch.sent) - stretch.leading)
+    held = np.concatenate((q, q[-1:].repeat(after, axis=0)))
     record_rounding = np.full_like(held, 8.0 * _EPS) * np.abs(held).max(axis=0)
     yield from _rates(held, limits.rates, factors, record_rounding, period, "recorded")
-    wire = gears.joint(stretch.sent[led])
-    ulps = 0.5 * np.spacing(np.abs(stretch.sent[led]).astype(np.float32)).astype(np.float64)
+    motor = stretch.sent[led][fresh]
+    wire = gears.joint(motor)
+    ulps = 0.5 * np.spacing(np.abs(motor).astype(np.float32)).astype(np.float64)
     wire_rounding = ulps @ np.abs(np.linalg.inv(gears.matrix)).T
     yield from _rates(wire, limits.rates, factors, wire_rounding, period, "float32")
-    yield from _only_when_requested(stretch, q)
+    yield from _only_when_requested(stretch, recorded)
+    yield from _no_leap(stretch)
     yield from _after_long_gaps(stretch)
     yield from _held_at_the_end(stretch)
 
@@ -217,18 +228,41 @@ def _distance_to_last(stretch: Stretch) -> Array:
     """(k-1, n) from each target received to the nearest set-point it may be."""
     depth = int(stretch.talk.life.settings.get("max_gap", 2)) + 1
     k = stretch.leading
-    sent = stretch.sent[:k]
+    fresh = ~stretch.again[:k]
+    sent = stretch.sent[:k][fresh]
     target = stretch.received[0, 1:k]
+    last = np.cumsum(fresh)[: k - 1] - 1
     nearest = np.full(target.shape, np.inf)
-    for back in range(1, depth + 1):
-        rows = np.maximum(np.arange(1, k) - back, 0)
-        nearest = np.fmin(nearest, np.abs(target - sent[rows]))
+    for back in range(depth):
+        nearest = np.fmin(nearest, np.abs(target - sent[np.maximum(last - back, 0)]))
     missed = np.minimum(_unanswered_before(stretch)[1:k], depth - 1)
-    step = sent[:-1] - sent[np.maximum(np.arange(k - 1) - 1, 0)]
+    step = sent[last] - sent[np.maximum(last - 1, 0)]
     for ahead in range(1, depth):
-        carried = np.abs(target - (sent[:-1] + ahead * step))
+        carried = np.abs(target - (sent[last] + ahead * step))
         nearest = np.where((missed >= ahead)[:, np.newaxis], np.fmin(nearest, carried), nearest)
     return nearest
+
+
+def _no_leap(stretch: Stretch) -> Iterator[str]:
+    """A set-point is its own step from the one that the target is, or is nearest to.
+
+    Slow ones may make up several steps; where packets were missed, the controller may have gone
+    on; on the way to rest a link that was found to be late is no reason to wait.
+    """
+    k, depth = stretch.leading, int(stretch.talk.life.settings.get("max_gap", 2)) + 1
+    fresh = ~stretch.again[:k]
+    sent = stretch.sent[:k][fresh]
+    last = np.cumsum(fresh)[: k - 1] - 1
+    rows = np.maximum(last - np.arange(depth + 1)[:, np.newaxis], 0)
+    off = np.abs(sent[rows] - stretch.received[0, 1:k])
+    target = np.take_along_axis(sent[rows], off.argmin(axis=0)[np.newaxis], axis=0)[0]
+    away = np.abs(stretch.sent[1:k] - target)
+    allowed = np.abs(stretch.step[1:k]).max(axis=1) + depth * _SLOW
+    free = _asked_for(stretch)[0][1:k] | (_unanswered_before(stretch)[1:k] > 0)
+    leaps = (away > allowed[:, np.newaxis]).any(axis=1) & ~free
+    if leaps.any():
+        row = int(np.argmax(leaps))
+        yield f"a set-point is {away[row].max():.4g} from the target (row {row + 1})"
 
 
 def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]:
@@ -240,8 +274,10 @@ def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]
     sent = stretch.sent[: len(q)]
     if np.any(sent < low) or np.any(sent > high):
         yield "the set-point on the wire is not the recorded one"
+    # A set-point sent again has the step that it had.
+    fresh = ~stretch.again[: len(q)]
+    motor, rounding, told = motor[fresh], rounding[fresh], stretch.step[: len(q)][fresh]
     step = np.diff(motor, axis=0, prepend=motor[:1])
-    told = stretch.step[: len(q)]
     slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
     if np.any(np.abs(told - step) > slack):
         yield "D2 is not the step from one set-point to the next"

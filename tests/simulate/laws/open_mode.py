@@ -83,6 +83,13 @@ class Stretch:
     received: Array
 
     @property
+    def again(self) -> Flags:
+        """(k,) set-points that are those before, with the same step: sent again."""
+        same = (np.diff(self.sent, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+        same &= (np.diff(self.step, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+        return np.asarray(same & self.step.any(axis=1))
+
+    @property
     def at(self) -> NDArray[np.intp]:
         """Index of each packet among those exchanged."""
         return self.talk.index[self.rows]

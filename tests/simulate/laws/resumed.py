@@ -107,7 +107,10 @@ def _played(
     if archived.ended != "completed":
         return f"it ended {archived.ended!r}"
     q: Array = archived.cycles["commanded_position"]
-    q = q[np.isfinite(q).all(axis=1)]
+    # One that the controller did not take was sent again, with its velocity: the motion waited.
+    waits = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+    waits &= (archived.cycles["commanded_velocity"] != 0.0).any(axis=1)
+    q = q[np.isfinite(q).all(axis=1) & ~waits]
     count = int(np.ceil(motion.duration / period)) + 1
     times: Array = np.arange(count, dtype=np.float64) * period
     planned = motion.sample(times)[0]
