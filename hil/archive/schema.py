@@ -34,6 +34,11 @@ COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
 PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
+DESCRIPTION = "/robot_description"
+TRANSFORMS = "/tf_static"
+
+ONCE = frozenset((DESCRIPTION, TRANSFORMS))
+"""Channels of one message that has no stamp: what viewers draw the arm with."""
 
 PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
 """Channels of which each cycle has one message, where there are cycles."""
@@ -142,11 +147,51 @@ class Channel:
     definition: str
 
 
+_DESCRIPTION = """\
+# The robot description (URDF) that is attached as well.
+string data
+"""
+
+_TRANSFORMS = """\
+geometry_msgs/TransformStamped[] transforms
+"""
+_TRANSFORM_STAMPED = """\
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+"""
+_TRANSFORM = """\
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+"""
+_VECTOR = """\
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+_QUATERNION = """\
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+
+
 def _text(message: str, *dependencies: str) -> str:
     return "".join([message, *(f"{_SEPARATOR}\n{part}" for part in dependencies)])
 
 
 EVENT_CHANNEL = Channel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
+DESCRIPTION_CHANNEL = Channel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
+TRANSFORM_CHANNEL = Channel(
+    TRANSFORMS,
+    "tf2_msgs/msg/TFMessage",
+    _text(_TRANSFORMS, _TRANSFORM_STAMPED, _HEADER, _TIME, _TRANSFORM, _VECTOR, _QUATERNION),
+)
 
 
 def profile(n_joints: int) -> Mapping[str, Channel]:
@@ -163,6 +208,8 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
         Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
         Channel(PACKETS, "hil_msgs/msg/Packet", packet),
         EVENT_CHANNEL,
+        DESCRIPTION_CHANNEL,
+        TRANSFORM_CHANNEL,
     )
     return {channel.topic: channel for channel in channels}
 
@@ -213,9 +260,20 @@ class CycleEncoder:
         measured["position"] = records["position"]
         measured["velocity"] = records["velocity"]
         measured["effort"] = torque
-        commanded["position"] = records["commanded_position"]
-        commanded["velocity"] = records["commanded_velocity"]
+        for name in ("position", "velocity"):
+            commanded[name] = set_points(records, name)
         return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
+
+
+def set_points(records: Rows, name: str) -> Array:
+    """Set-points (k, n) that a viewer shows: those inside the controller where none was sent.
+
+    Args:
+        records: of cycles.
+        name: ``position`` or ``velocity``.
+    """
+    sent = records[f"commanded_{name}"]
+    return np.where(np.isnan(sent), records[f"target_{name}"], sent)
 
 
 class PacketEncoder:

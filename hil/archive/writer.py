@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.cdr import LogMessage, Rows, encode_log
+from hil.archive.description import description_messages
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CHUNKS,
@@ -67,7 +68,7 @@ class ArchiveFile:
         path: where to write.
         channels: all channels.
         metadata: entries of the ``hil`` metadata record.
-        attachments: file name to content.
+        attachments: file name to content; viewers get a ``robot.urdf`` as a message as well.
         durable: wait at each flush until the disk has the data.
 
     Attributes:
@@ -88,6 +89,8 @@ class ArchiveFile:
         attachments: Mapping[str, bytes],
         durable: bool,
     ) -> None:
+        self._once = description_messages(attachments.get("robot.urdf", b""))
+        channels = [*channels, *self._once]
         self.counts = {channel.topic: 0 for channel in channels}
         self.slowest_flush = 0.0
         self.closed = False
@@ -116,6 +119,12 @@ class ArchiveFile:
         numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
         channels = [self._numbers[topic] for topic in topics]
         with self._guarded():
+            if len(batch.stamp):
+                for channel, message in self._once.items():
+                    number, stamp = self._numbers[channel.topic], int(batch.stamp[0])
+                    self._writer.add_message(number, stamp, 0, message)
+                    self.counts[channel.topic] = 1
+                self._once = {}
             self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
         for topic in topics:
             self.counts[topic] += len(batch.stamp)
