@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
 from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
 from hil.cli.verdict import NOT_GOOD
 from hil.exporting import FormatName, default_output, export_model
@@ -17,14 +18,7 @@ from hil.progress import reporter as make_reporter
 
 
 def export(
-    archives: Annotated[
-        list[Path],
-        typer.Argument(
-            help="One campaign folder, or archives (*.mcap).",
-            show_default=False,
-            metavar="ARCHIVE...",
-        ),
-    ],
+    archives: ArchivesArgument,
     to: Annotated[
         FormatName,
         typer.Option(
@@ -55,8 +49,8 @@ def export(
     estimator: EstimatorOption = "auto",
     friction: FrictionOption = "auto",
     delay: DelayOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Write the identified arm for a simulator, read it back, and say what the format leaves out.
 
@@ -68,16 +62,7 @@ def export(
     **Examples:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to sdf --ensemble 100`
     """
     reporter = make_reporter(quiet=quiet or json)
-    options = options_from(
-        estimator=estimator,
-        bandwidth="auto",
-        velocity="auto",
-        friction=friction,
-        standstill="auto",
-        delay=delay,
-        smoother="spline",
-        torque_bandwidth="auto",
-    )
+    options = options_from(estimator=estimator, friction=friction, delay=delay)
     found = identify_sources(archives, reporter, options)
     target = output or default_output(archives, to)
     exported = export_model(found, target, to, ensemble=ensemble, seed=seed)

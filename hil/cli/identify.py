@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
 from hil.cli.identify_options import (
     BandwidthOption,
     DelayOption,
@@ -27,14 +27,7 @@ from hil.progress import reporter as make_reporter
 
 
 def identify(
-    archives: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Archives (*.mcap), or one campaign folder.",
-            show_default=False,
-            metavar="ARCHIVE...",
-        ),
-    ],
+    archives: ArchivesArgument,
     output: Annotated[
         Path | None,
         typer.Option(

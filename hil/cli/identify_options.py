@@ -76,14 +76,14 @@ TorqueBandwidthOption = Annotated[
 
 def options_from(
     *,
-    estimator: Estimator,
-    bandwidth: str,
-    velocity: Literal["auto", "position", "measured"],
-    friction: str,
-    standstill: Literal["auto", "rests", "slow", "none"],
-    delay: str | None,
-    smoother: Smoother,
-    torque_bandwidth: str,
+    estimator: Estimator = "auto",
+    bandwidth: str = "auto",
+    velocity: Literal["auto", "position", "measured"] = "auto",
+    friction: str = "auto",
+    standstill: Literal["auto", "rests", "slow", "none"] = "auto",
+    delay: str | None = None,
+    smoother: Smoother = "spline",
+    torque_bandwidth: str = "auto",
     **others: Any,
 ) -> Options:
     """The options of an identification as the command line says them.

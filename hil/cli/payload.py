@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.identify_options import LONGEST_DELAY
+from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.files import write_or_tell
@@ -65,16 +66,9 @@ def payload(
         Path | None,
         typer.Option(help="File for the payload as a link of a URDF.", show_default=False),
     ] = None,
-    delay: Annotated[
-        float | None,
-        typer.Option(
-            help="Time in s by which torques lag positions; the cell's, or what is found, if left "
-            "out.",
-            show_default=False,
-        ),
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    delay: DelayOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Weigh what the arm carries: mass, centre of mass and inertia with 95 % intervals.
 
@@ -82,13 +76,9 @@ def payload(
     as they are typed into a COMAU, UR and Franka controller. Exit status 5 if a figure of --check
     lies outside its interval, or no possible body fits the recordings.
     """
-    if delay is not None and not abs(delay) <= LONGEST_DELAY:
-        raise InputError(
-            None, f"{delay} is no delay", field="--delay", remedy=f"give s, at most {LONGEST_DELAY}"
-        )
     box, wanted = _box(shape), _wanted(check or [])
     reporter = make_reporter(quiet=quiet or json)
-    options = Options(estimator="wls", delay=delay)
+    options = Options(estimator="wls", delay=delay_from(delay))
     found = find_payload(bare, loaded or [], reporter, frame=frame, box=box, options=options)
     outside = found.outside(wanted)
     text = json_module.dumps(

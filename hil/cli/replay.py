@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
 from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
@@ -19,14 +20,7 @@ from hil.replaying import replay_motions
 
 
 def replay(
-    archives: Annotated[
-        list[Path],
-        typer.Argument(
-            help="One campaign folder, or archives (*.mcap).",
-            show_default=False,
-            metavar="ARCHIVE...",
-        ),
-    ],
+    archives: ArchivesArgument,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -40,8 +34,8 @@ def replay(
     estimator: EstimatorOption = "auto",
     friction: FrictionOption = "auto",
     delay: DelayOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only the verdict.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Simulate held-out motions under their recorded torques: how far models go astray.
 
@@ -55,16 +49,7 @@ def replay(
     folder = archives[0] if archives[0].is_dir() else Path()
     target = output or folder / "replay.png"
     check_format(target)
-    options = options_from(
-        estimator=estimator,
-        bandwidth="auto",
-        velocity="auto",
-        friction=friction,
-        standstill="auto",
-        delay=delay,
-        smoother="spline",
-        torque_bandwidth="auto",
-    )
+    options = options_from(estimator=estimator, friction=friction, delay=delay)
     found = identify_sources(archives, reporter, options)
     replayed = replay_motions(found, reporter)
     make_folder(target.parent)
