@@ -251,7 +251,7 @@ class CycleEncoder:
         """Encode k cycle records, and the joint torques (k, n) that belong to them."""
         stamp = np.rint(records["cycle"] * self._period_ns).astype(np.int64)
         cycle, measured, commanded = (
-            _stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
+            stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
         )
         for name in self._copied:
             if name in (records.dtype.names or ()):  # records of old archives have no age
@@ -265,11 +265,11 @@ class CycleEncoder:
         return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
 
 
-def set_points(records: Rows, name: str) -> Array:
+def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
     """Set-points (k, n) that a viewer shows: those inside the controller where none was sent.
 
     Args:
-        records: of cycles.
+        records: of cycles, or columns of them.
         name: ``position`` or ``velocity``.
     """
     sent = records[f"commanded_{name}"]
@@ -292,7 +292,7 @@ class PacketEncoder:
     def encode(self, packets: Rows) -> Batch:
         """Encode k packets, rows of `drivers.packet_records.PACKET_DTYPE`."""
         stamp = np.rint(packets["cycle"] * self._period_ns).astype(np.int64)
-        rows = _stamped(self._layout, stamp)
+        rows = stamped(self._layout, stamp)
         for name in packets.dtype.names or ():
             rows[name] = packets[name]
         return Batch(stamp, {PACKETS: rows})
@@ -327,13 +327,13 @@ class SampleEncoder:
         motor_current: Array | None,
     ) -> Batch:
         """Encode k samples; arrays (k, n), None for what was announced as absent."""
-        state = _stamped(self._state, stamp)
+        state = stamped(self._state, stamp)
         for name, values in (("position", position), ("velocity", velocity), ("effort", torque)):
             if values is not None:
                 state[name] = values
         if self._current is None or motor_current is None:
             return Batch(stamp, {MEASURED: state})
-        current = _stamped(self._current, stamp)
+        current = stamped(self._current, stamp)
         current["motor_current"] = motor_current
         return Batch(stamp, {MEASURED: state, MOTOR_CURRENT: current})
 
@@ -383,7 +383,8 @@ def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
             raise LayoutError(f"their {name} is not that of {n_joints} joints")
 
 
-def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:
+def stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:
+    """So many messages with these stamps (k,) [ns]."""
     rows = layout.rows(len(stamp))
     rows["sec"], rows["nanosec"] = np.divmod(stamp, 10**9)
     return rows

@@ -111,7 +111,7 @@ class ArchiveFile:
             self._write()
             if durable:  # only now: the file is empty for as short a time as possible
                 sync_folder(path.parent)
-        self._numbers = {channel.topic: self._register(channel) for channel in channels}
+        self._numbers = {channel.topic: register(self._writer, channel) for channel in channels}
 
     def add(self, batch: Batch) -> None:
         """Add messages of channels that count alike to the chunk in progress."""
@@ -165,12 +165,6 @@ class ArchiveFile:
             os.fdatasync(self._descriptor)
         self.slowest_flush = max(self.slowest_flush, time.monotonic() - begin)
 
-    def _register(self, channel: Channel) -> int:
-        definition = channel.definition.encode()
-        return self._writer.register(
-            channel.topic, "cdr", schema=channel.schema, encoding="ros2msg", definition=definition
-        )
-
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Turn a failure of the disk into our error, and close the file for good."""
@@ -192,6 +186,17 @@ class ArchiveFile:
         if not self.closed:
             self.closed = True
             os.close(self._descriptor)
+
+
+def register(writer: McapWriter, channel: Channel) -> int:
+    """Announce a channel of CDR messages; returns its number."""
+    return writer.register(
+        channel.topic,
+        "cdr",
+        schema=channel.schema,
+        encoding="ros2msg",
+        definition=channel.definition.encode(),
+    )
 
 
 def _create(path: Path) -> int:
