@@ -86,6 +86,9 @@ def run(
     back to where the arm was. A repetition that fails its quality check is archived with the
     reason and run again. Ctrl-C brings the arm to rest on its path; the same command goes on.
 
+    With --payload only the excitation is run, without and with a payload in turns, as pairs; after
+    each pair it says how narrow the intervals are, and prints at the end what `hil payload` does.
+
     **Without a terminal:** `hil run C --dry-run`, somebody looks, then
     `hil run C --accept-dry-run --json`.
 

@@ -289,6 +289,22 @@ class TestRun:
         with pytest.raises(InputError, match=sentence):
             CliRunner().invoke(app, ["run", root, *words], catch_exceptions=False)
 
+    def test_a_real_arm_needs_somebody_who_mounts_it(
+        self, designed: Campaign, tmp_path: Path
+    ) -> None:
+        cell = designed.cell
+        link = 'transport = "udp"\nhost = "127.0.0.1"'
+        real = Cell.from_texts(
+            cell.text.replace('transport = "simulated"', link), cell.urdf, cell.path
+        )
+        campaign = Campaign.create(tmp_path / "real", real, designed.plan)
+        with pytest.raises(InputError, match="needs somebody at a terminal"):
+            CliRunner().invoke(
+                app,
+                ["run", str(campaign.folder.root), "--payload", "gripper"],
+                catch_exceptions=False,
+            )
+
     def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(CellError, match=r"simulation\.payload"):
             carrying(fast_cell(tmp_path))
