@@ -19,14 +19,13 @@ def description_messages(urdf: bytes) -> dict[Channel, bytes]:
     builder = LayoutBuilder()
     try:
         text = urdf.decode()
-        transforms = [*_transforms(text)]
         builder.string(text)
-    except (LayoutError, ParseError, ValueError):
+        return {
+            DESCRIPTION_CHANNEL: builder.build().template,
+            TRANSFORM_CHANNEL: _encoded([*_transforms(text)]),
+        }
+    except (LayoutError, LookupError, ParseError, ValueError):
         return {}
-    return {
-        DESCRIPTION_CHANNEL: builder.build().template,
-        TRANSFORM_CHANNEL: _encoded(transforms),
-    }
 
 
 _Transform = tuple[str, str, list[float]]
@@ -52,10 +51,14 @@ def _transforms(urdf: str) -> Iterator[_Transform]:
         if joint.get("type") == "fixed":
             origin = joint.find("origin")
             stated = {} if origin is None else origin.attrib
-            xyz, rpy = (
+            xyz, (roll, pitch, yaw) = (
                 [float(x) for x in stated.get(key, "0 0 0").split()] for key in ("xyz", "rpy")
             )
-            yield _link(joint, "parent"), _link(joint, "child"), [*xyz, *_quaternion(*rpy)]
+            yield (
+                _link(joint, "parent"),
+                _link(joint, "child"),
+                [*xyz, *_quaternion(roll, pitch, yaw)],
+            )
 
 
 def _link(joint: Element, end: str) -> str:

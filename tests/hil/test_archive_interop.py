@@ -19,6 +19,7 @@ from drivers.packet_records import LONGEST_PACKET, PacketRing
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive import schema as profile
+from hil.archive.description import description_messages
 
 JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
 COUNT = 250
@@ -204,6 +205,24 @@ def test_our_reader_reads_joint_states_that_another_program_encoded(tmp_path: Pa
     assert np.array_equal(row["position"], position)
     assert np.array_equal(row["effort"], effort)
     assert "velocity" not in (layout.dtype.names or ())
+
+
+@pytest.mark.parametrize(
+    "urdf",
+    [
+        b"",
+        b"\xff",
+        b"<robot name='x'/>",
+        b"<?xml version='1.0' encoding='none'?><robot><link name='a'/>",
+        URDF.replace("0.4 -1.1 2.5", "0.4 -1.1").encode(),
+        URDF.replace("0.1 -0.2 0.3", "0.1 -0.2").encode(),
+        URDF.replace("0.1 -0.2", "here").encode(),
+        URDF.replace("plate", "p" * (1 << 20)).encode(),
+    ],
+)
+def test_what_is_no_description_is_not_shown(urdf: bytes) -> None:
+    """A recording goes on without it."""
+    assert description_messages(urdf) == {}
 
 
 def test_imported_archives_are_read_as_well(tmp_path: Path) -> None:
