@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.archive.cdr import Rows, encode_log, joint_state_layout
-from hil.archive.description import description_messages
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
     COMMANDED,
@@ -22,6 +21,7 @@ from hil.archive.schema import (
     MEASURED,
     PROFILE,
     Channel,
+    description_messages,
     profile,
     set_points,
     stamped,

@@ -151,8 +151,8 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
         arms["nominal"] = nominal
     variants: list[Simulated] = []
     if ensemble > 1:
-        drawn = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
-        pairs = zip(drawn.standard, drawn.values, strict=True)
+        sampled = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
+        pairs = zip(sampled.standard, sampled.values, strict=True)
         variants = [Simulated(model, standard, values) for standard, values in pairs]
     errors: dict[str, list[Array]] = {name: [] for name in arms}
     spread: list[Array] = []

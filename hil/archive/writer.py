@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive.cdr import LogMessage, Rows, encode_log
-from hil.archive.description import description_messages
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CHUNKS,
@@ -45,6 +44,7 @@ from hil.archive.schema import (
     CycleEncoder,
     PacketEncoder,
     SampleEncoder,
+    description_messages,
 )
 from hil.errors import ArchiveWriteError
 

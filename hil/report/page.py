@@ -17,7 +17,6 @@ from hil.report import figures, numbers, parameters, validation
 from hil.report.figures.conduct import warm_up_panels
 from hil.report.figures.elimination import elimination_panels
 from hil.report.figures.parameters import shift_panels
-from hil.report.figures.replay import replay_panels
 from hil.report.figures.residuals import (
     autocorrelation_panels,
     friction_panels,
@@ -107,7 +106,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "torque_panels": figures.torque_panels(series, errors),
         "split_panels": figures.split_panels(series, errors),
         "spectrum_panels": figures.spectrum_panels(series, errors),
-        "replay_panels": replay_panels(series, errors),
+        "replay_panels": figures.replay_panels(series, errors),
         "curve_panels": figures.friction_curve_panels(series, errors),
         **validation.validation_context(results),
         **judgement_context(results),

@@ -19,7 +19,7 @@ from drivers.packet_records import LONGEST_PACKET, PacketRing
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive import schema as profile
-from hil.archive.description import description_messages
+from hil.archive.schema import description_messages
 
 JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
 COUNT = 250
