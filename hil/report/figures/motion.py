@@ -1,4 +1,4 @@
-"""What happens in time: the identification trajectory, torque measured, predicted, split; replays."""
+"""What happens in time: the identification motion, torque measured, predicted, split; replays."""
 
 from __future__ import annotations
 
