@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -20,7 +21,7 @@ from hil.report import ReportSeries, report_bytes
 from hil.results import Results
 
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
-_NAME: Final = "example_archive"
+_WORDS: Final = ("example_archive", "replay_words")
 _LARGEST: Final = 1 << 30
 """Bytes of series that are read; those of a campaign of 30 repetitions have a hundredth of it."""
 
@@ -76,6 +77,34 @@ def rewrite_report(folder: Path) -> Results:
     return results
 
 
+def report_replay(
+    folder: Path,
+    results: Results,
+    replay: Callable[[ReportSeries], ReportSeries],
+    reporter: Reporter,
+) -> None:
+    """Add a replay to the report in a folder, if that is of the same parameters.
+
+    Args:
+        folder: with results, series and report.
+        results: of the identification that was replayed.
+        replay: adds its series.
+        reporter: told where it is, or why it is not.
+
+    Raises:
+        InputError: results or series cannot be read.
+        OutputError: the folder cannot be written to.
+    """
+    there = Results.load(folder / RESULTS)
+    if [p.estimate for p in there.parameters] != [p.estimate for p in results.parameters]:
+        reporter.say(f"note: {folder / REPORT} is of another identification; it stays as it is")
+        return
+    series = replay(_load_series(folder / SERIES, len(there.joint_names)))
+    pages = {SERIES: _series_bytes(series), REPORT: report_bytes(there, series)}
+    write_together(folder, pages)
+    reporter.say(f"report: {folder / REPORT}")
+
+
 def _series_bytes(series: ReportSeries) -> bytes:
     """The series behind the figures as a `.npz` file."""
     content = BytesIO()
@@ -89,7 +118,8 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
             _require_bounded(stream)
             with np.load(stream, allow_pickle=False) as found:
                 arrays = {name: found[name] for name in found.files}
-        series = ReportSeries(**(arrays | {_NAME: str(arrays[_NAME])}))
+        words = {name: str(one) for name, one in arrays.items() if name in _WORDS}
+        series = ReportSeries(**(arrays | words))
         return series.checked_for(n_joints)
     except Exception as error:  # a forged archive makes its readers raise anything
         raise InputError(

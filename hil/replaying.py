@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,12 +11,21 @@ from numpy.typing import NDArray
 
 from hil.errors import InputError
 from hil.identify import Identification
+from hil.identify.run import FIGURE_SAMPLES
 from hil.identify.surroundings import nominal_of
-from hil.plots.style import bare, page
+from hil.plots.style import RULE, bare, page
 from hil.progress import Reporter
-from identification.validation.replay import FEEDBACK, Simulated, replay
+from hil.report import ReportSeries
+from identification.estimators.ensemble import sample_ensemble
+from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 
 Array = NDArray[np.float64]
+
+ENSEMBLE: Final = 10
+"""Variants: a standard deviation from ten is known to 24 %."""
+SEED: Final = 0
+DRIFT: Final = 3.0
+"""Times the spread of the ensemble; below it a drift is what the uncertainty allows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +37,9 @@ class Replayed:
         units: of the errors of each joint, degrees or mm.
         time: since the beginning of the first motion, one after the other (m,) [s].
         errors: of each model by name (m, n), in `units`; NaN in gaps.
+        spread: standard deviation of the positions of variants of the identified arm (m, n), in
+            `units`; None without variants.
+        reasons: why the identified model drifts by more than its uncertainty, in sentences.
         tested_on: which motions, in words.
         verdict: on the identified model, in a sentence.
     """
@@ -35,21 +48,28 @@ class Replayed:
     units: tuple[str, ...]
     time: Array
     errors: dict[str, Array]
+    spread: Array | None
+    reasons: tuple[str, ...]
     tested_on: str
     verdict: str
 
     def lines(self) -> list[str]:
         """Root mean square and largest error of each joint, model by model."""
         lines = [f"simulated on {self.tested_on}, with a feedback of {FEEDBACK:g} Hz:"]
-        for name, error in self.errors.items():
+        for name, error in self._rows:
             figures = (
                 f"{joint} {rms:.2g} (at most {most:.2g}) {unit}"
                 for joint, rms, most, unit in zip(
-                    self.joint_names, *self._figures(error), self.units, strict=True
+                    self.joint_names, *_figures(error), self.units, strict=True
                 )
             )
             lines.append(f"{name}: {', '.join(figures)}")
-        return [*lines, self.verdict]
+        return [*lines, *self.reasons, self.verdict]
+
+    @property
+    def _rows(self) -> list[tuple[str, Array]]:
+        rows = [*self.errors.items()]
+        return rows if self.spread is None else [*rows, ("spread of the ensemble", self.spread)]
 
     def to_dict(self) -> dict[str, object]:
         """The same for JSON."""
@@ -57,11 +77,10 @@ class Replayed:
             "joints": [*self.joint_names],
             "units": [*self.units],
             "models": {
-                name: dict(
-                    zip(("rms", "most"), (x.tolist() for x in self._figures(e)), strict=True)
-                )
-                for name, e in self.errors.items()
+                name: dict(zip(("rms", "most"), (x.tolist() for x in _figures(e)), strict=True))
+                for name, e in self._rows
             },
+            "reasons": [*self.reasons],
             "verdict": self.verdict,
         }
 
@@ -72,21 +91,48 @@ class Replayed:
             figure = Figure(figsize=(8.0, 0.6 + 1.3 * n), layout="constrained")
             rows = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
             for joint, axes in enumerate(rows):
+                if self.spread is not None:
+                    middle, width = self.errors["identified"][:, joint], 2.0 * self.spread[:, joint]
+                    axes.fill_between(
+                        self.time, middle - width, middle + width,
+                        label="ensemble (± 2 σ)", color=RULE,
+                    )  # fmt: skip
                 for name, error in reversed(self.errors.items()):
                     axes.plot(self.time, error[:, joint], label=name, linewidth=0.8)
                 axes.set_ylabel(f"{self.joint_names[joint]} [{self.units[joint]}]")
                 bare(axes)
-            rows[0].legend(loc="upper right", ncols=len(self.errors))
+            rows[0].legend(loc="upper right", ncols=len(self._rows))
             rows[0].set_title("Position error under the recorded torques")
             rows[-1].set_xlabel("time [s]")
         return figure
 
-    def _figures(self, error: Array) -> tuple[Array, Array]:
-        return np.sqrt(np.nanmean(error**2, axis=0)), np.nanmax(np.abs(error), axis=0)
+    def beside(self, series: ReportSeries) -> ReportSeries:
+        """The series of a report with those of the replay."""
+        some = slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES))
+        nothing = np.empty((0, 0))
+        nominal = self.errors.get("nominal")
+        return replace(
+            series,
+            replay_time=self.time[some],
+            replay_error=self.errors["identified"][some],
+            replay_nominal=nothing if nominal is None else nominal[some],
+            replay_spread=nothing if self.spread is None else self.spread[some],
+            replay_words="\n".join(self.reasons),
+        )
 
 
-def replay_motions(found: Identification, reporter: Reporter) -> Replayed:
+def _figures(error: Array) -> tuple[Array, Array]:
+    return np.sqrt(np.nanmean(error**2, axis=0)), np.nanmax(np.abs(error), axis=0)
+
+
+def replay_motions(found: Identification, reporter: Reporter, ensemble: int = ENSEMBLE) -> Replayed:
     """Simulate the motions that were predicted, by the identified and by the nominal model.
+
+    Args:
+        found: the identification.
+        reporter: of progress.
+        ensemble: number of variants of the identified arm that are simulated as well, at least two
+            of them or none.
 
     Raises:
         InputError: there are no physically consistent parameters to simulate.
@@ -103,24 +149,69 @@ def replay_motions(found: Identification, reporter: Reporter) -> Replayed:
     arms = {"identified": identified}
     if (nominal := _nominal(found)) is not None:
         arms["nominal"] = nominal
+    variants: list[Simulated] = []
+    if ensemble > 1:
+        sampled = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
+        pairs = zip(sampled.standard, sampled.values, strict=True)
+        variants = [Simulated(model, standard, values) for standard, values in pairs]
     errors: dict[str, list[Array]] = {name: [] for name in arms}
+    spread: list[Array] = []
     time: list[Array] = []
-    with reporter.task("simulating", len(arms) * len(found.unseen)) as task:
+    rounds = len(arms) + bool(variants)
+    with reporter.task("simulating", rounds * len(found.unseen)) as task:
         for samples in found.unseen:
             last = float(time[-1][-1]) if time else 0.0
             time.append(last + samples.motion.time - samples.motion.time[0])
             for name, arm in arms.items():
                 errors[name].append(replay(arm, samples, identified))
                 task.advance(1, name)
+            if variants:
+                every = [replay(variant, samples, identified) for variant in variants]
+                spread.append(np.std(every, axis=0, ddof=1))
+                task.advance(1, "ensemble")
     scale = np.where(model.chain.revolute, 180.0 / np.pi, 1e3)
+    strays = {name: scale * np.concatenate(every) for name, every in errors.items()}
+    width = scale * np.concatenate(spread) if spread else None
     return Replayed(
         joint_names=model.joint_names,
         units=tuple("°" if turns else "mm" for turns in model.chain.revolute),
         time=np.concatenate(time),
-        errors={name: scale * np.concatenate(every) for name, every in errors.items()},
+        errors=strays,
+        spread=width,
+        reasons=_reasons(found, identified, strays["identified"], width),
         tested_on=found.tested_on,
         verdict=found.verdict.line,
     )
+
+
+def _reasons(
+    found: Identification, arm: Simulated, error: Array, spread: Array | None
+) -> tuple[str, ...]:
+    """Why joints drift by more than the parameters are uncertain."""
+    if spread is None:
+        return ()
+    strays, uncertain = _figures(error)[0], _figures(spread)[0]
+    left = slow_residual(arm, found.unseen)
+    sentences = []
+    for joint in np.flatnonzero(strays > DRIFT * uncertain):
+        unit = "N·m" if arm.model.chain.revolute[joint] else "N"
+        constant, friction = left.constant[joint], left.friction[joint]
+        rest = 1.0 - constant - friction
+        share, cause = max(
+            (constant, "constant: an offset of the torque, a payload, or gravity"),
+            (friction, "in the direction of motion: friction that differs from the fitted one"),
+            (
+                rest,
+                "neither constant nor in the direction of motion: it depends on posture or time",
+            ),
+        )
+        times = strays[joint] / uncertain[joint]
+        sentences.append(
+            f"{found.cell.joint_names[joint]} drifts {times:.1f} times as far as its parameters are"
+            f" uncertain: averaged over {1.0 / FEEDBACK:g} s the model leaves out"
+            f" {left.rms[joint]:.2g} {unit}, {share:.0%} of its square {cause}"
+        )
+    return tuple(sentences)
 
 
 def _nominal(found: Identification) -> Simulated | None:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
+from xml.etree.ElementTree import SubElement, tostring
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from drivers.transports import SimulatedTransport
 from hil.campaign import Link
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
+from identification.model.urdf_text import urdf_tree
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -25,6 +27,7 @@ from sim_fixtures.controller_faults import ControllerFault
 
 Array = NDArray[np.float64]
 
+_LOAD = "hil_simulated_payload"
 _CHECKED = 100
 """Postures checked on each way of the controller's own motion."""
 
@@ -37,6 +40,8 @@ def simulated_link(
     truth: PlantTruth | None = None,
     instead_of_hardware: bool = False,
     only_axis: int | None = None,
+    loaded: bool = False,
+    session: int = 0,
 ) -> Link:
     """A link in virtual time to a simulated controller of this cell; one seed is one run.
 
@@ -47,9 +52,11 @@ def simulated_link(
         truth: what is planted in the plant, where it shall differ from the cell's.
         instead_of_hardware: simulate a cell that names a real link as well.
         only_axis: the axis, from 1, that alone is opened and moved; None for all.
+        loaded: the arm carries `[simulation.payload]`, of which controller and PC do not know.
+        session: how often the same controller was powered up before: each has its own noise.
 
     Raises:
-        CellError: the cell is one of real hardware.
+        CellError: the cell is one of real hardware, or names no such payload.
     """
     if cell.controller.transport != "simulated" and not instead_of_hardware:
         raise CellError(
@@ -59,12 +66,47 @@ def simulated_link(
             "a cell of real hardware is not simulated",
             'write "simulated" to try it without',
         )
+    arm = carrying(cell) if loaded else cell
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
     controller = simulated_controller(
-        cell, effects=effects, drive=drive, truth=truth, settings=settings
+        arm, effects=effects, drive=drive, truth=truth, settings=settings, session=session
     )
     transport = SimulatedTransport(controller)
     return Link.over(transport, cell, finish=controller.finish, only_axis=only_axis)
+
+
+def carrying(cell: Cell) -> Cell:
+    """The cell with `[simulation.payload]` as a link of its URDF.
+
+    Raises:
+        CellError: there is no such table, or no such link.
+    """
+    payload = cell.simulation.payload
+    if payload is None:
+        raise CellError(
+            cell.path,
+            "simulation.payload",
+            None,
+            "the simulated arm has nothing to carry",
+            "write that table: mass in kg, centre in m",
+        )
+    root = urdf_tree(cell.urdf)
+    last = root.find(f"joint[@name='{cell.joint_names[-1]}']/child")
+    frame = payload.frame or ("" if last is None else last.get("link", ""))
+    if frame not in {link.get("name") for link in root.findall("link")}:
+        raise CellError(
+            cell.path, "simulation.payload.frame", frame, "no link of the URDF", "name one"
+        )
+    link = SubElement(root, "link", name=_LOAD)
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=" ".join(map(repr, payload.centre)))
+    SubElement(inertial, "mass", value=repr(payload.mass))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    SubElement(inertial, "inertia", dict(zip(names, map(repr, payload.inertia), strict=True)))
+    mount = SubElement(root, "joint", name=f"{_LOAD}_mount", type="fixed")
+    SubElement(mount, "parent", link=frame)
+    SubElement(mount, "child", link=_LOAD)
+    return Cell.from_texts(cell.text, tostring(root, encoding="unicode"), cell.path)
 
 
 def simulated_controller(
@@ -75,6 +117,7 @@ def simulated_controller(
     truth: PlantTruth | None = None,
     settings: ControllerSettings | None = None,
     seed: int | None = None,
+    session: int = 0,
     faults: Sequence[ControllerFault] = (),
 ) -> SimulatedController:
     """The controller and arm of a cell, whatever link the cell names.
@@ -86,6 +129,7 @@ def simulated_controller(
         truth: what is planted in the plant, if not the cell's.
         settings: how the controller behaves; `controller_settings(cell)` if left out.
         seed: of noise and model errors; the cell's if left out.
+        session: how often the same controller was powered up before.
         faults: what goes wrong in controller and arm.
     """
     nominal_drive = simulated_drive(cell)
@@ -95,6 +139,7 @@ def simulated_controller(
         truth or planted_truth(cell),
         settings or controller_settings(cell, effects=effects),
         seed=cell.simulation.seed if seed is None else seed,
+        session=session,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
         initial_position=cell.initial,
         gravity=cell.file.robot.gravity,
@@ -245,6 +290,7 @@ def planted_values(cell: Cell) -> Array:
 
 
 __all__ = [
+    "carrying",
     "controller_settings",
     "own_postures",
     "planted_truth",

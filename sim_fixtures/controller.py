@@ -239,6 +239,7 @@ class SimulatedController:
         settings: ControllerSettings,
         *,
         seed: int,
+        session: int = 0,
         effects: UnmodelledEffects = NO_EFFECTS,
         initial_position: ArrayLike | None = None,
         gravity: ArrayLike = EARTH,
@@ -253,6 +254,7 @@ class SimulatedController:
             truth: rotor inertias, friction and inertias of links of the plant.
             settings: cycle, noise, gains, time table.
             seed: of the model's errors, the noise and the phases of the ripple.
+            session: how often the same cabinet was powered up before: each has its own noise.
             effects: unmodelled effects, none by default.
             initial_position: joint angles [rad]; the URDF's zero if not given.
             gravity: m/s2 in the base frame.
@@ -265,7 +267,9 @@ class SimulatedController:
         n = drive.n_axes
         if truth.n_joints != n or n > AXES_PER_ARM:
             raise SettingError("drive", f"{n} axes", f"{truth.n_joints}, at most {AXES_PER_ARM}")
-        model_rng, noise_rng, tail_rng = np.random.default_rng(seed).spawn(3)
+        streams = np.random.default_rng(seed).spawn(3 + session)
+        model_rng, noise_rng, tail_rng = streams[:3]
+        noise_rng = streams[-1] if session else noise_rng
         self.truth = truth
         self.settings = settings
         self.period = settings.period

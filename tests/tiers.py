@@ -92,6 +92,7 @@ LONG: Final = (
     "hil/test_study.py",
     "hil/test_testing_plugin.py",
     "hil/test_view.py",
+    "hil/test_viewers.py",
     "hil/test_what_a_run_leaves.py",
     "identification/test_calibration.py",
     "identification/test_causes.py",

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
 from mcap.records import Schema
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.packet_records import LONGEST_PACKET
 from hil.archive.cdr import (
+    LayoutBuilder,
     LayoutError,
     MessageLayout,
     Rows,
@@ -34,6 +37,11 @@ COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
 PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
+DESCRIPTION = "/robot_description"
+TRANSFORMS = "/tf_static"
+
+ONCE = frozenset((DESCRIPTION, TRANSFORMS))
+"""Channels of one message that has no stamp: what viewers draw the arm with."""
 
 PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
 """Channels of which each cycle has one message, where there are cycles."""
@@ -142,11 +150,51 @@ class Channel:
     definition: str
 
 
+_DESCRIPTION = """\
+# The robot description (URDF) that is attached as well.
+string data
+"""
+
+_TRANSFORMS = """\
+geometry_msgs/TransformStamped[] transforms
+"""
+_TRANSFORM_STAMPED = """\
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+"""
+_TRANSFORM = """\
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+"""
+_VECTOR = """\
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+_QUATERNION = """\
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+
+
 def _text(message: str, *dependencies: str) -> str:
     return "".join([message, *(f"{_SEPARATOR}\n{part}" for part in dependencies)])
 
 
 EVENT_CHANNEL = Channel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
+DESCRIPTION_CHANNEL = Channel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
+TRANSFORM_CHANNEL = Channel(
+    TRANSFORMS,
+    "tf2_msgs/msg/TFMessage",
+    _text(_TRANSFORMS, _TRANSFORM_STAMPED, _HEADER, _TIME, _TRANSFORM, _VECTOR, _QUATERNION),
+)
 
 
 def profile(n_joints: int) -> Mapping[str, Channel]:
@@ -163,6 +211,8 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
         Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
         Channel(PACKETS, "hil_msgs/msg/Packet", packet),
         EVENT_CHANNEL,
+        DESCRIPTION_CHANNEL,
+        TRANSFORM_CHANNEL,
     )
     return {channel.topic: channel for channel in channels}
 
@@ -204,7 +254,7 @@ class CycleEncoder:
         """Encode k cycle records, and the joint torques (k, n) that belong to them."""
         stamp = np.rint(records["cycle"] * self._period_ns).astype(np.int64)
         cycle, measured, commanded = (
-            _stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
+            stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
         )
         for name in self._copied:
             if name in (records.dtype.names or ()):  # records of old archives have no age
@@ -213,9 +263,20 @@ class CycleEncoder:
         measured["position"] = records["position"]
         measured["velocity"] = records["velocity"]
         measured["effort"] = torque
-        commanded["position"] = records["commanded_position"]
-        commanded["velocity"] = records["commanded_velocity"]
+        for name in ("position", "velocity"):
+            commanded[name] = set_points(records, name)
         return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
+
+
+def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
+    """Set-points (k, n) that a viewer shows: those inside the controller where none was sent.
+
+    Args:
+        records: of cycles, or columns of them.
+        name: ``position`` or ``velocity``.
+    """
+    sent = records[f"commanded_{name}"]
+    return np.where(np.isnan(sent), records[f"target_{name}"], sent)
 
 
 class PacketEncoder:
@@ -234,7 +295,7 @@ class PacketEncoder:
     def encode(self, packets: Rows) -> Batch:
         """Encode k packets, rows of `drivers.packet_records.PACKET_DTYPE`."""
         stamp = np.rint(packets["cycle"] * self._period_ns).astype(np.int64)
-        rows = _stamped(self._layout, stamp)
+        rows = stamped(self._layout, stamp)
         for name in packets.dtype.names or ():
             rows[name] = packets[name]
         return Batch(stamp, {PACKETS: rows})
@@ -269,13 +330,13 @@ class SampleEncoder:
         motor_current: Array | None,
     ) -> Batch:
         """Encode k samples; arrays (k, n), None for what was declared as absent."""
-        state = _stamped(self._state, stamp)
+        state = stamped(self._state, stamp)
         for name, values in (("position", position), ("velocity", velocity), ("effort", torque)):
             if values is not None:
                 state[name] = values
         if self._current is None or motor_current is None:
             return Batch(stamp, {MEASURED: state})
-        current = _stamped(self._current, stamp)
+        current = stamped(self._current, stamp)
         current["motor_current"] = motor_current
         return Batch(stamp, {MEASURED: state, MOTOR_CURRENT: current})
 
@@ -325,7 +386,89 @@ def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
             raise LayoutError(f"their {name} is not that of {n_joints} joints")
 
 
-def _stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:
+def stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:
+    """So many messages with these stamps (k,) [ns]."""
     rows = layout.rows(len(stamp))
     rows["sec"], rows["nanosec"] = np.divmod(stamp, 10**9)
     return rows
+
+
+WORLD: Final = "world"
+"""Frame that the base stands in, where the description has no link of that name."""
+
+
+def description_messages(urdf: bytes) -> dict[Channel, bytes]:
+    """The messages that describe an arm, by channel; none of what is no URDF, or is too long."""
+    builder = LayoutBuilder()
+    try:
+        text = urdf.decode()
+        builder.string(text)
+        return {
+            DESCRIPTION_CHANNEL: builder.build().template,
+            TRANSFORM_CHANNEL: _encoded([*_transforms(text)]),
+        }
+    except (LayoutError, LookupError, ParseError, ValueError):
+        return {}
+
+
+_Transform = tuple[str, str, list[float]]
+
+
+def _transforms(urdf: str) -> Iterator[_Transform]:
+    """Parent, child, and the child's origin [m] and quaternion (x, y, z, w) in the parent.
+
+    Raises:
+        ParseError: the text is no XML.
+        ValueError: a number is none, or there is no link.
+    """
+    root = fromstring(urdf)
+    links = [link.get("name", "") for link in root.findall("link")]
+    if not links:
+        raise ValueError("it has no link")
+    joints = root.findall("joint")
+    children = {_link(joint, "child") for joint in joints}
+    for base in links:
+        if WORLD not in links and base not in children:
+            yield WORLD, base, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    for joint in joints:
+        if joint.get("type") == "fixed":
+            origin = joint.find("origin")
+            stated = {} if origin is None else origin.attrib
+            xyz, (roll, pitch, yaw) = (
+                [float(x) for x in stated.get(key, "0 0 0").split()] for key in ("xyz", "rpy")
+            )
+            yield (
+                _link(joint, "parent"),
+                _link(joint, "child"),
+                [*xyz, *_quaternion(roll, pitch, yaw)],
+            )
+
+
+def _link(joint: Element, end: str) -> str:
+    found = joint.find(end)
+    return "" if found is None else found.get("link", "")
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Turns about the fixed axes x, y and z in that order, as (x, y, z, w)."""
+    (a, p), (b, q), (c, r) = ((math.sin(t / 2.0), math.cos(t / 2.0)) for t in (roll, pitch, yaw))
+    return (
+        a * q * r - p * b * c,
+        p * b * r + a * q * c,
+        p * q * c - a * b * r,
+        p * q * r + a * b * c,
+    )
+
+
+def _encoded(transforms: list[_Transform]) -> bytes:
+    builder = LayoutBuilder()
+    builder.count(len(transforms))
+    for k, (parent, child, _) in enumerate(transforms):
+        builder.variable(f"stamp{k}", "uint32", 2)  # zero: at all times
+        builder.string(parent)
+        builder.string(child)
+        builder.variable(f"pose{k}", "float64", 7)
+    row = builder.build().rows(1)
+    for k, (_, _, pose) in enumerate(transforms):
+        row[f"pose{k}"] = pose
+    return row.tobytes()

@@ -44,6 +44,7 @@ from hil.archive.schema import (
     CycleEncoder,
     PacketEncoder,
     SampleEncoder,
+    description_messages,
 )
 from hil.errors import ArchiveWriteError
 
@@ -67,7 +68,7 @@ class ArchiveFile:
         path: where to write.
         channels: all channels.
         metadata: entries of the ``hil`` metadata record.
-        attachments: file name to content.
+        attachments: file name to content; viewers get a ``robot.urdf`` as a message as well.
         durable: wait at each flush until the disk has the data.
 
     Attributes:
@@ -88,6 +89,8 @@ class ArchiveFile:
         attachments: Mapping[str, bytes],
         durable: bool,
     ) -> None:
+        self._once = description_messages(attachments.get("robot.urdf", b""))
+        channels = [*channels, *self._once]
         self.counts = {channel.topic: 0 for channel in channels}
         self.slowest_flush = 0.0
         self.closed = False
@@ -108,7 +111,7 @@ class ArchiveFile:
             self._write()
             if durable:  # only now: the file is empty for as short a time as possible
                 sync_folder(path.parent)
-        self._numbers = {channel.topic: self._register(channel) for channel in channels}
+        self._numbers = {channel.topic: register(self._writer, channel) for channel in channels}
 
     def add(self, batch: Batch) -> None:
         """Add messages of channels that count alike to the chunk in progress."""
@@ -116,6 +119,12 @@ class ArchiveFile:
         numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
         channels = [self._numbers[topic] for topic in topics]
         with self._guarded():
+            if len(batch.stamp):
+                for channel, message in self._once.items():
+                    number, stamp = self._numbers[channel.topic], int(batch.stamp[0])
+                    self._writer.add_message(number, stamp, 0, message)
+                    self.counts[channel.topic] = 1
+                self._once = {}
             self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
         for topic in topics:
             self.counts[topic] += len(batch.stamp)
@@ -156,12 +165,6 @@ class ArchiveFile:
             os.fdatasync(self._descriptor)
         self.slowest_flush = max(self.slowest_flush, time.monotonic() - begin)
 
-    def _register(self, channel: Channel) -> int:
-        definition = channel.definition.encode()
-        return self._writer.register(
-            channel.topic, "cdr", schema=channel.schema, encoding="ros2msg", definition=definition
-        )
-
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Turn a failure of the disk into our error, and close the file for good."""
@@ -183,6 +186,17 @@ class ArchiveFile:
         if not self.closed:
             self.closed = True
             os.close(self._descriptor)
+
+
+def register(writer: McapWriter, channel: Channel) -> int:
+    """Announce a channel of CDR messages; returns its number."""
+    return writer.register(
+        channel.topic,
+        "cdr",
+        schema=channel.schema,
+        encoding="ros2msg",
+        definition=channel.definition.encode(),
+    )
 
 
 def _create(path: Path) -> int:

@@ -7,6 +7,7 @@ cache, and is believed as long as nobody has touched the file and the programs a
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -38,6 +39,8 @@ USES: Final = ("excitation", "validation", "standstill")
 _SUFFIX: Final = ".mcap"
 _ARCHIVES: Final = "archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
+_LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.weighing`
+_FOR_VIEWERS: Final = "annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _NOT_ENTERED: Final = (
@@ -422,6 +425,8 @@ class _Sieve:
         motion again.
         """
         name = ArchiveName.parse(place.name)
+        if place.folder.endswith(f"/{_FOR_VIEWERS}"):
+            return "is a copy for viewers"
         if name is None:
             return ""
         if name.kind in _NEVER_FITTED:
@@ -435,6 +440,8 @@ class _Sieve:
             return f"is a {ref.use}"
         if ref.simulated and _REHEARSAL in ref.location:
             return "belongs to a rehearsal"
+        if _LOADED.search(ref.location):
+            return "carries a payload that its cell does not state"
         if ref.outcome != _COMPLETED:
             return f"ended {ref.outcome}"
         folder = Place(ref.location).folder

@@ -243,6 +243,7 @@ class Campaign:
         accept_dry_run: bool = False,
         accept_torque: Sequence[str] = (),
         live: LiveView | None = None,
+        repetitions: int | None = None,
     ) -> RunResult:
         """Run what is still missing, in order, and return to where the arm was.
 
@@ -267,6 +268,8 @@ class Campaign:
             accept_torque: joints whose torque ran against the model's gravity in the dry run that
                 was done before (`DryRun.against_gravity`), accepted by name.
             live: of the cell's own link: lets viewers look at what is recorded.
+            repetitions: of the excitation that are enough for now, without validation motions;
+                the whole plan if left out.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
@@ -295,6 +298,7 @@ class Campaign:
                 accept_torque=tuple(accept_torque),
                 durable=durable,
                 live=live,
+                repetitions=repetitions,
             ),
         )
 

@@ -180,6 +180,8 @@ class Choices:
             earlier run did, and that the caller accepts by name.
         durable: wait at each flush until the disk has the data; None: in real time only.
         live: of the cell's own link: lets viewers look at what is recorded.
+        repetitions: of the excitation that are enough for now, without validation motions; None
+            for the whole plan.
     """
 
     unrehearsed: bool = False
@@ -188,6 +190,7 @@ class Choices:
     accept_torque: tuple[str, ...] = ()
     durable: bool | None = None
     live: LiveView | None = None
+    repetitions: int | None = None
 
 
 def run_campaign(
@@ -244,7 +247,7 @@ class _Run:
         self._folder, self._cell, self._archiving = folder, cell, archiving
         self._stop, self._reporter, self._choices = stop, reporter, choices
         self._operator, self._simulated = operator, simulated
-        self._wanted = wanted(cell, plan)
+        self._wanted = wanted(cell, plan, choices.repetitions)
         self._watch = RunWatch(operator, stop)
         self._entering = Entering(folder, cell, plan)
         self._warm_up = WarmUpStage(

@@ -90,16 +90,24 @@ class Interval:
         return motion_name(self.kind, self.index)
 
 
-def wanted(cell: Cell, plan: CampaignPlan) -> list[Interval]:
-    """All motions of a plan, without the moves between them."""
+def wanted(cell: Cell, plan: CampaignPlan, repetitions: int | None = None) -> list[Interval]:
+    """All motions of a plan, without the moves between them.
+
+    Args:
+        cell: says how many repetitions there are.
+        plan: the motions.
+        repetitions: of the excitation, and no validation motion; None for all of both.
+    """
     settings = cell.campaign
+    validation = plan.validation if repetitions is None else ()
+    repetitions = settings.repetitions if repetitions is None else repetitions
     excitation = plan.excitation.trajectory
     return [
         Interval("standstill", 0, hold(cell.home, settings.standstill_s)),
-        *(Interval("excitation", i, excitation, plan.moves) for i in range(settings.repetitions)),
+        *(Interval("excitation", i, excitation, plan.moves) for i in range(repetitions)),
         *(
             Interval("validation", i, motion.trajectory, motion.moves)
-            for i, motion in enumerate(plan.validation)
+            for i, motion in enumerate(validation)
         ),
     ]
 

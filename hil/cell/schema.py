@@ -58,6 +58,22 @@ class SimulatedDriveTable(Table):
         return self
 
 
+class PayloadTable(Table):
+    """`[robot.payload]`: a body of known mass that the arm carries; not identified."""
+
+    mass: NonNegative = Field(description="its mass in kg")
+    centre: Point = Field(description="its centre of mass in the frame, three figures in m")
+    inertia: Annotated[Vector, Field(min_length=6, max_length=6)] = Field(
+        default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        description="its tensor about the centre of mass in the axes of the frame: xx, xy, xz, "
+        "yy, yz, zz in kg·m²",
+    )
+    frame: str = Field(
+        default="",
+        description="a link of the URDF whose frame is meant, nothing for that of the last joint",
+    )
+
+
 class SimulationTable(Table):
     """`[simulation]`: what the simulated cell really is; ignored on hardware."""
 
@@ -94,6 +110,9 @@ class SimulationTable(Table):
     drive_train: SimulatedDriveTable = Field(
         default=SimulatedDriveTable(),
         description="a table of what is known of its gears independently of [drive_train]",
+    )
+    payload: PayloadTable | None = Field(
+        default=None, description="a table of what it carries where `hil run --payload` mounts it"
     )
 
 
@@ -188,22 +207,6 @@ class FrictionTable(Table):
     )
     joints: dict[str, JointFrictionTable] = Field(
         default_factory=dict, description="tables of what is different for a joint, by its name"
-    )
-
-
-class PayloadTable(Table):
-    """`[robot.payload]`: a body of known mass that the arm carries; not identified."""
-
-    mass: NonNegative = Field(description="its mass in kg")
-    centre: Point = Field(description="its centre of mass in the frame, three figures in m")
-    inertia: Annotated[Vector, Field(min_length=6, max_length=6)] = Field(
-        default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        description="its tensor about the centre of mass in the axes of the frame: xx, xy, xz, "
-        "yy, yz, zz in kg·m²",
-    )
-    frame: str = Field(
-        default="",
-        description="a link of the URDF whose frame is meant, nothing for that of the last joint",
     )
 
 

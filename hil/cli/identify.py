@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hil.annotating import annotate as write_annotated
 from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
 from hil.cli.identify_options import (
     BandwidthOption,
@@ -20,6 +21,7 @@ from hil.cli.identify_options import (
     options_from,
 )
 from hil.cli.verdict import finish
+from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import identify_sources
 from hil.outcome import write_outcome
@@ -78,6 +80,14 @@ def identify(
     delay: DelayOption = None,
     smoother: SmootherOption = "spline",
     torque_bandwidth: TorqueBandwidthOption = "auto",
+    annotate: Annotated[
+        bool,
+        typer.Option(
+            "--annotate",
+            help="Also write copies of the archives for viewers, with the predicted torque as a "
+            "third JointState channel, into the folder annotated of OUTPUT.",
+        ),
+    ] = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -105,8 +115,14 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
     if output is not None:
         make_folder(output)
+    elif annotate:
+        raise InputError(
+            None, "has no folder to write to", field="--annotate", remedy="name one: -o FOLDER"
+        )
     found = identify_sources(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:
         results = write_outcome(output, found, reporter)
+        if annotate:
+            write_annotated(found, output, reporter)
     finish(results, json=json, quiet=quiet)

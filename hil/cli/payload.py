@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import math
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -84,7 +85,7 @@ def payload(
     text = json_module.dumps(
         found.as_json() | {"checked": wanted, "outside": outside}, indent=1, ensure_ascii=False
     )
-    lines = _lines(found, wanted, outside)
+    lines = payload_lines(found, wanted, outside)
     if urdf is not None:
         write_or_tell(urdf, found.urdf)
     typer.echo(text if json else "\n".join(lines))
@@ -92,7 +93,10 @@ def payload(
         raise typer.Exit(NOT_GOOD)
 
 
-def _lines(found: PayloadFound, wanted: dict[str, float], outside: list[str]) -> list[str]:
+def payload_lines(
+    found: PayloadFound, wanted: Collection[str] = (), outside: Sequence[str] = ()
+) -> list[str]:
+    """What was found, as a person reads it, and how figures that are known compare with it."""
     lines = [*found.sentences, ""]
     lines += [
         f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"

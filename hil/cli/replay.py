@@ -14,9 +14,10 @@ from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
 from hil.identify import identify_sources
 from hil.lines import say
+from hil.outcome import RESULTS, report_replay
 from hil.plots import check_format, save
 from hil.progress import reporter as make_reporter
-from hil.replaying import replay_motions
+from hil.replaying import ENSEMBLE, replay_motions
 
 
 def replay(
@@ -31,6 +32,15 @@ def replay(
             show_default=False,
         ),
     ] = None,
+    ensemble: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=1000,
+            help="Number of variants, as far apart as the parameters are uncertain, that are "
+            "simulated as well; 0 for none.",
+        ),
+    ] = ENSEMBLE,
     estimator: EstimatorOption = "auto",
     friction: FrictionOption = "auto",
     delay: DelayOption = None,
@@ -40,8 +50,10 @@ def replay(
     """Simulate held-out motions under their recorded torques: how far models go astray.
 
     A light feedback of 1 Hz, the same for every model, keeps errors from adding up. Position errors
-    over time of the identified and of the nominal arm go into a figure, their root mean squares
-    are printed. Exit status 5 if the model is not good.
+    over time of the identified and of the nominal arm go into a figure, with the spread of an
+    ensemble; their root mean squares are printed. A joint that drifts by more than the parameters
+    are uncertain is named, with the torque that the model leaves out. The figure goes into the
+    report of a campaign that was identified alike. Exit status 5 if the model is not good.
 
     **Example:** `hil replay runs/demo`
     """
@@ -51,9 +63,11 @@ def replay(
     check_format(target)
     options = options_from(estimator=estimator, friction=friction, delay=delay)
     found = identify_sources(archives, reporter, options)
-    replayed = replay_motions(found, reporter)
+    replayed = replay_motions(found, reporter, ensemble)
     make_folder(target.parent)
     save(replayed.figure(), target)
+    if (folder / RESULTS).exists() and archives[0].is_dir():
+        report_replay(folder, found.results, replayed.beside, reporter)
     if json:
         typer.echo(json_format.dumps({"picture": str(target), **replayed.to_dict()}))
     else:

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import json as json_format
-from collections.abc import Sequence
-from typing import Annotated
+import sys
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
+from rich.console import Console
 
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
-from hil.campaign import Campaign, stop_on_interrupt
+from hil.campaign import Campaign, Link, stop_on_interrupt
 from hil.campaign.execution_result import RunResult
 from hil.cell_link import require_watchable
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.cli.payload import payload_lines
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.lines import say
 from hil.progress import reporter as make_reporter
 from hil.screen import Screen
+from hil.screen.keys import can_read
+from hil.screen.screen import confirmed
+from hil.weighing import weigh
 
 
 def run(
@@ -51,6 +57,16 @@ def run(
     no_identify: Annotated[
         bool, typer.Option("--no-identify", help="Only run; no parameters, no report.")
     ] = False,
+    payload: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Weigh a payload: run the excitation without and with it in turns, asking for it "
+            "to be mounted and taken off, until another pair is not worth it. The recordings lie "
+            "in the folder payload/NAME of CAMPAIGN.",
+            show_default=False,
+        ),
+    ] = None,
     live: Annotated[
         str | None,
         typer.Option(
@@ -70,6 +86,9 @@ def run(
     back to where the arm was. A repetition that fails its quality check is archived with the
     reason and run again. Ctrl-C brings the arm to rest on its path; the same command goes on.
 
+    With --payload only the excitation is run, without and with a payload in turns, as pairs; after
+    each pair it says how narrow the intervals are, and prints at the end what `hil payload` does.
+
     **Without a terminal:** `hil run C --dry-run`, somebody looks, then
     `hil run C --accept-dry-run --json`.
 
@@ -83,32 +102,76 @@ def run(
             "--dry-run and --accept-dry-run together",
             remedy="run the one, look at the arm, then the other",
         )
+    if payload is not None and (dry_run or no_identify):
+        raise InputError(
+            None,
+            "does its own dry runs, and weighs what it records",
+            field="--payload",
+            remedy="leave out --dry-run and --no-identify",
+        )
     opened = Campaign.open(campaign)
     if rehearse:
         with stop_on_interrupt() as stop:
             opened.rehearse(reporter=make_reporter(quiet=quiet or json), stop=stop)
-    result = _run(
-        opened,
-        quiet=quiet or json,
-        live=live,
-        dry_run_only=dry_run,
-        accept_dry_run=accept_dry_run,
-        accept_torque=accept_torque or (),
-    )
+    choices: dict[str, Any] = {
+        "dry_run_only": dry_run,
+        "accept_dry_run": accept_dry_run,
+        "accept_torque": accept_torque or (),
+    }
+    if payload is not None:
+        _weigh(opened, payload, choices, live=live, quiet=quiet, json=json)
+        return
+    result = _run(opened, choices, quiet=quiet or json, live=live)
     if dry_run or no_identify:
         _tell(result, json=json)
         return
     _identify(opened, result, quiet=quiet, json=json)
 
 
-def _run(
+def _weigh(
     campaign: Campaign,
+    name: str,
+    choices: Mapping[str, Any],
     *,
-    quiet: bool,
     live: str | None,
-    dry_run_only: bool,
-    accept_dry_run: bool,
-    accept_torque: Sequence[str],
+    quiet: bool,
+    json: bool,
+) -> None:
+    """Record pairs and weigh; a simulated arm mounts by itself."""
+    silent = quiet or json
+    simulated = campaign.cell.controller.transport == "simulated"
+    if not simulated and (silent or not can_read(sys.stdin)):
+        raise InputError(
+            None,
+            "needs somebody at a terminal who mounts the payload",
+            field="--payload",
+            remedy="record both by `hil run` or `hil record`: `hil payload BARE --loaded LOADED`",
+        )
+
+    def mount(load: bool) -> bool:
+        deed = f"Mount {name}" if load else f"Take {name} off"
+        if simulated:
+            return True
+        question = f"{deed}, and change nothing else. Type yes when the arm may move; anything "
+        with stop_on_interrupt() as stop:
+            return confirmed(Console(), f"{question}else ends the recording: ", "yes", stop)
+
+    def run_side(side: Campaign, repetitions: int, link: Link | None) -> None:
+        more = {**choices, "link": link, "repetitions": repetitions}
+        _run(side, more, quiet=silent, live=live)
+
+    weighed = weigh(campaign, name, run=run_side, mount=mount, reporter=make_reporter(quiet=silent))
+    found = weighed.found
+    if json:
+        typer.echo(json_format.dumps(found.as_json() | {"pairs": weighed.pairs}))
+    else:
+        say("\n".join(payload_lines(found)))
+    if found.estimate.contradicted:
+        raise typer.Exit(NOT_GOOD)
+
+
+def _run(
+    campaign: Campaign, choices: Mapping[str, Any], *, quiet: bool, live: str | None
 ) -> RunResult:
     """Run with the screen; Ctrl-C stops the arm, then the program."""
     name = campaign.folder.root.resolve().name
@@ -120,14 +183,7 @@ def _run(
     ):
         try:
             return campaign.run(
-                None,
-                stop,
-                operator,
-                operator=operator,
-                live=view,
-                dry_run_only=dry_run_only,
-                accept_dry_run=accept_dry_run,
-                accept_torque=accept_torque,
+                stop=stop, reporter=operator, operator=operator, live=view, **choices
             )
         except (ControllerFault, OSError) as fault:
             if stop.requested:  # an OSError: of a terminal that was closed

@@ -231,27 +231,38 @@ class Identification:
 
     Attributes:
         paths: the archives.
-        cell: whose they are.
+        prepared: their recordings as samples.
         estimation: the estimate, and what was computed beside it.
         essential: the essential parameters; in words why there are none.
         consistency: parameters that a machine can have; in words why there are none.
         verdict: on the estimate.
         results: as they go into `results.json`.
         series: for the figures of the report.
-        unseen: the recordings that were predicted; those that were fitted where none were.
-        tested_on: what these are, in words.
     """
 
     paths: tuple[Path, ...]
-    cell: Cell
+    prepared: Prepared
     estimation: Estimation
     essential: EssentialChoice | str
     consistency: ConsistencyCheck | str
     verdict: Verdict
     results: Results
     series: ReportSeries
-    unseen: tuple[Samples, ...]
-    tested_on: str
+
+    @property
+    def cell(self) -> Cell:
+        """Whose archives they are."""
+        return self.prepared.sources.cell
+
+    @property
+    def unseen(self) -> tuple[Samples, ...]:
+        """The recordings that were predicted; those that were fitted where none were."""
+        return self.prepared.held_out
+
+    @property
+    def tested_on(self) -> str:
+        """What these are, in words."""
+        return self.prepared.sources.tested_on
 
     @property
     def estimate(self) -> RepeatedEstimate:
@@ -405,13 +416,11 @@ def _judged(
     )
     return Identification(
         paths=paths,
-        cell=cell,
+        prepared=prepared,
         estimation=estimation,
         essential=essential,
         consistency=consistency,
         verdict=verdict,
         results=results.model_copy(update={"judgement": judgement}),
         series=report_series(prepared, result),
-        unseen=prepared.held_out,
-        tested_on=prepared.sources.tested_on,
     )

@@ -37,6 +37,7 @@ class Source:
     """One archive: its recording and where the planned motion begins in it.
 
     Attributes:
+        path: of the archive.
         name: file name.
         recording: joints in the order of the model.
         origin: time of the first set-point [s].
@@ -47,6 +48,7 @@ class Source:
             it, so that filters know what lies beyond its ends. Its torques are zero outside.
     """
 
+    path: Path
     name: str
     recording: Recording
     origin: float
@@ -361,6 +363,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         clock = true_times(single)
         single, words = clock.apply(stamped), tuple(clock.describe())
     return Source(
+        archive.path,
         archive.path.name,
         single,
         float(single.time[0]),
@@ -423,6 +426,7 @@ def _part(whole: Source, words: str, start: int, stop: int) -> Source:
         motor_current=silent(recording.motor_current),
     )
     return Source(
+        whole.path,
         f"{whole.name} ({words})",
         recording.between(start, stop),
         float(recording.time[min(start, recording.n_samples - 1)]),

@@ -106,6 +106,7 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "torque_panels": figures.torque_panels(series, errors),
         "split_panels": figures.split_panels(series, errors),
         "spectrum_panels": figures.spectrum_panels(series, errors),
+        "replay_panels": figures.replay_panels(series, errors),
         "curve_panels": figures.friction_curve_panels(series, errors),
         **validation.validation_context(results),
         **judgement_context(results),

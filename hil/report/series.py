@@ -32,6 +32,7 @@ _LENGTHS: Final = {
     "s": "law_speed",
     "r": "reversal_travel",
     "f": "spectrum_frequency",
+    "q": "replay_time",
 }
 
 
@@ -70,6 +71,11 @@ class ReportSeries:
         spectrum_torque: (f, n) [N·m/√Hz], of the measured torque, every row.
         spectrum_residual: (f, n) of measured less predicted torque.
         motion_bandwidth: (n,) [Hz] of the smoothed positions of the example; NaN where unknown.
+        replay_time: (q,) [s] of a replay; empty where none was made.
+        replay_error: (q, n) simulated less recorded position of the identified model [° or mm].
+        replay_nominal: (q, n) of the nominal model.
+        replay_spread: (q, n) standard deviation of variants of the identified model.
+        replay_words: why the identified model drifts, a sentence a line.
 
     Raises:
         SeriesError: the shapes do not belong together.
@@ -98,6 +104,11 @@ class ReportSeries:
     spectrum_torque: Annotated[Array, "fn"] = field(default_factory=_empty)
     spectrum_residual: Annotated[Array, "fn"] = field(default_factory=_empty)
     motion_bandwidth: Annotated[Array, "n"] = field(default_factory=_empty)
+    replay_time: Annotated[Array, "q"] = field(default_factory=lambda: np.empty(0))
+    replay_error: Annotated[Array, "qn"] = field(default_factory=_empty)
+    replay_nominal: Annotated[Array, "qn"] = field(default_factory=_empty)
+    replay_spread: Annotated[Array, "qn"] = field(default_factory=_empty)
+    replay_words: str = ""
 
     def __post_init__(self) -> None:
         position = self.excitation_position

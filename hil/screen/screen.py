@@ -106,11 +106,18 @@ def ask(console: Console, summary: DryRunSummary, stop: Stop) -> bool:
     for joint in summary.against_gravity:
         console.print(f"{joint}: {AGAINST}", style="bold red", markup=False, highlight=False)
     known = f"If you know why, type {word}" if summary.against_gravity else "Type yes"
-    console.print(
+    return confirmed(
+        console,
         f"Did {what} move as it should, with nothing in its way at {summary.override:.0%} of full "
         f"speed? {known} to accept; anything else ends the run: ",
-        end="", markup=False, highlight=False,
-    )  # fmt: skip
+        word,
+        stop,
+    )
+
+
+def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
+    """Ask, and wait for an answer: whether it is the word. A stop asked for is a refusal."""
+    console.print(question, end="", markup=False, highlight=False)
     sys.stdout.flush()
     with contextlib.suppress(termios.error):  # what was typed before the question is no answer
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)

@@ -10,6 +10,7 @@ steps of at most `STEP`. Dry friction is an impulse that at most stops its joint
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -83,6 +84,54 @@ def replay(arm: Simulated, samples: Samples, gains_of: Simulated | None = None) 
                 q, v = dynamics.advanced(q, v, given, duration / steps)
         error[stretch] = found
     return error
+
+
+class SlowResidual(NamedTuple):
+    """Torque that a model leaves out, averaged over a period of the feedback, joint by joint.
+
+    Attributes:
+        rms: (n,) [N·m or N].
+        constant: (n,) share of its square that a constant torque explains.
+        friction: (n,) what one in the direction of motion explains beyond that.
+    """
+
+    rms: Array
+    constant: Array
+    friction: Array
+
+
+def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual:
+    """Return what makes a replay drift: faster residuals average out.
+
+    Args:
+        arm: the model.
+        recordings: motion and torque.
+    """
+    slow, turns = [], []
+    for samples in recordings:
+        residual = samples.torque - samples.predicted_torque(arm.model, arm.values)
+        turning = np.sign(samples.motion.velocity) * arm.model.moving(samples.motion.velocity)
+        for stretch in samples.segments:
+            period = (samples.motion.time[stretch] * FEEDBACK).astype(np.intp)
+            for one in np.split(np.arange(stretch.start, stretch.stop), _steps(period)):
+                slow.append(residual[one].mean(axis=0))
+                turns.append(turning[one].mean(axis=0))
+    means, direction = np.array(slow), np.array(turns)
+    power = np.mean(means**2, axis=0)
+    constant = np.mean(means, axis=0)
+    rest = means - constant
+    aside = direction - direction.mean(axis=0)
+    along = (aside * rest).sum(axis=0) ** 2
+    size = (aside**2).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        explained = np.nan_to_num(along / size) / len(means)
+        return SlowResidual(
+            np.sqrt(power), np.nan_to_num(constant**2 / power), np.nan_to_num(explained / power)
+        )
+
+
+def _steps(period: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.flatnonzero(np.diff(period)) + 1
 
 
 class _Dynamics:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
@@ -18,9 +19,13 @@ from drivers.packet_records import LONGEST_PACKET, PacketRing
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive import schema as profile
+from hil.archive.schema import description_messages
 
 JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
 COUNT = 250
+URDF = """<robot name="arm"><link name="base"/><link name="plate"/>
+<joint name="mount" type="fixed"><parent link="base"/><child link="plate"/>
+<origin xyz="0.1 -0.2 0.3" rpy="0.4 -1.1 2.5"/></joint></robot>"""
 STATE = {"position": "position", "velocity": "velocity", "effort": "torque"}
 
 
@@ -52,7 +57,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         joint_names=JOINTS,
         period=0.002,
         metadata={},
-        attachments={"cell.toml": b"[cell]"},
+        attachments={"cell.toml": b"[cell]", "robot.urdf": URDF.encode()},
         durable=False,
         packets=True,
     ) as archive:
@@ -92,7 +97,9 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
         assert bits(stacked(measured, word), column) == column.tobytes()
     commanded = found[profile.COMMANDED]
     for word in ("position", "velocity"):
-        column = ours.columns[f"commanded_{word}"]
+        column, inside = (ours.columns[f"{whose}_{word}"] for whose in ("commanded", "target"))
+        column = np.where(np.isnan(column), inside, column)
+        assert np.isfinite(column).all()
         assert bits(stacked(commanded, word), column) == column.tobytes()
     assert all(len(message.effort) == 0 for message in commanded)
     assert all(tuple(message.name) == JOINTS for message in [*measured, *commanded])
@@ -101,9 +108,24 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
         assert stamps == ours.columns["stamp"].tolist()
         assert {message.header.frame_id for message in messages} == {""}
     assert_same_packets(found[profile.PACKETS], ours)
+    assert [message.data for message in found[profile.DESCRIPTION]] == [URDF]
+    (still,) = found[profile.TRANSFORMS]
+    assert_transforms(still.transforms)
     (event,) = found[profile.EVENTS]
     assert (event.name, event.msg, event.level) == ("MotionStarted", "off we go", 20)
     assert event.stamp.sec == 4000
+
+
+def assert_transforms(found: list[Any]) -> None:
+    """The base stands in the world, and a fixed link where pinocchio has it."""
+    assert [(one.header.frame_id, one.child_frame_id) for one in found] == [
+        ("world", "base"), ("base", "plate"),
+    ]  # fmt: skip
+    place, turn = found[1].transform.translation, found[1].transform.rotation
+    assert (place.x, place.y, place.z) == (0.1, -0.2, 0.3)
+    quaternion = pin.Quaternion(turn.w, turn.x, turn.y, turn.z)
+    expected = pin.rpy.rpyToMatrix(0.4, -1.1, 2.5)
+    np.testing.assert_allclose(quaternion.matrix(), expected, atol=1e-14)
 
 
 def assert_same_packets(found: list[Any], ours: Archive) -> None:
@@ -135,7 +157,7 @@ def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: 
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        assert summary.statistics.message_count == 5 * COUNT + 1
+        assert summary.statistics.message_count == 5 * COUNT + 3
         assert len(summary.chunk_indexes) == 5
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attachments = {record.name: record.data for record in reader.iter_attachments()}
@@ -183,6 +205,24 @@ def test_our_reader_reads_joint_states_that_another_program_encoded(tmp_path: Pa
     assert np.array_equal(row["position"], position)
     assert np.array_equal(row["effort"], effort)
     assert "velocity" not in (layout.dtype.names or ())
+
+
+@pytest.mark.parametrize(
+    "urdf",
+    [
+        b"",
+        b"\xff",
+        b"<robot name='x'/>",
+        b"<?xml version='1.0' encoding='none'?><robot><link name='a'/>",
+        URDF.replace("0.4 -1.1 2.5", "0.4 -1.1").encode(),
+        URDF.replace("0.1 -0.2 0.3", "0.1 -0.2").encode(),
+        URDF.replace("0.1 -0.2", "here").encode(),
+        URDF.replace("plate", "p" * (1 << 20)).encode(),
+    ],
+)
+def test_what_is_no_description_is_not_shown(urdf: bytes) -> None:
+    """A recording goes on without it."""
+    assert description_messages(urdf) == {}
 
 
 def test_imported_archives_are_read_as_well(tmp_path: Path) -> None:

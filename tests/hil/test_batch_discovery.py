@@ -164,6 +164,21 @@ def test_what_was_simulated_is_not_the_arm_itself(tmp_path: Path, arm: Cell) -> 
     assert [one.reason for one in result.skipped] == ["belongs to a rehearsal"]
 
 
+def test_what_is_made_beside_a_campaign_is_left_alone(tmp_path: Path, arm: Cell) -> None:
+    """Runs with a payload that no cell states, and copies for viewers."""
+    recording(tmp_path / "real.mcap", arm)
+    recording(tmp_path / "payload" / "gripper" / "bare" / "archives" / "x.mcap", arm)
+    recording(tmp_path / "payload" / "gripper" / "loaded" / "archives" / "y.mcap", arm)
+    (tmp_path / "annotated").mkdir()
+    (tmp_path / "annotated" / "real.mcap").write_bytes(b"for viewers")
+    result = found_in(tmp_path, cache=tmp_path / "cache")
+    assert {Path(ref.location).name for ref in result.refs} <= {"real.mcap", "x.mcap"}
+    assert not result.broken
+    reasons = {Path(one.path).parent.name: one.reason for one in result.skipped}
+    assert reasons["annotated"] == "is a copy for viewers"
+    assert any("carries a payload" in one.reason for one in result.skipped)
+
+
 def test_delays_of_one_folder_are_each_taken_for_their_own(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,7 +134,25 @@ class TestCommand:
         assert result.exit_code in (0, 5), result.output
         models = json.loads(result.stdout)["models"]
         assert max(models["identified"]["rms"]) < min(models["nominal"]["rms"])
+        assert 0.0 < max(models["spread of the ensemble"]["rms"]) < min(models["nominal"]["rms"])
         assert "</svg>" in picture.read_text()
+
+    def test_a_replay_goes_into_a_report_of_the_same_parameters(
+        self, log: Path, tmp_path: Path
+    ) -> None:
+        """Not into that of another estimate, and a new identification takes it out."""
+        (tmp_path / log.name).write_bytes(log.read_bytes())
+        reports = []
+        for command in (
+            ["identify"],
+            ["replay", "--ensemble", "2", "--estimator", "wls"],
+            ["replay", "--ensemble", "2"],
+            ["identify"],
+        ):
+            result = CliRunner().invoke(app, [*command, str(tmp_path)])
+            assert result.exit_code in (0, 5), result.output
+            reports.append("Simulated forwards" in (tmp_path / "report.html").read_text())
+        assert reports == [False, False, True, False]
 
     def test_a_folder_without_archives_is_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "mjcf"])

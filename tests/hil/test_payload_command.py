@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,21 +13,22 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.transports.simulated import SimulatedTransport
+from hil import weighing
 from hil.campaign import Campaign, Stop, design
 from hil.campaign.link import Link
-from hil.cell import Cell
+from hil.cell import Cell, CellError
 from hil.cli import app
-from hil.errors import ArchiveError, InputError
+from hil.errors import ArchiveError, InputError, OperatorStopError
 from hil.identify.options import FIXED
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.importers import ColumnMap, Robot, import_log
 from hil.progress import Silent
-from hil.simulation import simulated_controller, simulated_provenance
+from hil.simulation import carrying, simulated_controller, simulated_provenance
 from identification import FrictionLaw, IdentificationError
 from identification.model.kinematics import pinocchio_model
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
-from tests.hil.fast_cell import fast_cell
+from tests.hil.fast_cell import fast_campaign, fast_cell
 from tests.hil.simulated_logs import Simulated, simulate
 
 MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
@@ -89,6 +91,16 @@ def printed(folder: Path) -> dict[str, object]:
     return found
 
 
+CARRIED = """
+[simulation.payload]
+mass = 2.0
+centre = [0.3, 0.0, 0.05]
+inertia = [0.004, 0.0, 0.0, 0.006, 0.0, 0.005]
+"""
+BY_HAND = {"design": ("--settings", "quick.toml"), "run": ("--accept-dry-run",)}
+"""What a test adds to a command: less of a search, and the answer of a person at a terminal."""
+
+
 class TestPage:
     def test_every_command_of_the_page_runs(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -100,10 +112,12 @@ class TestPage:
             (folder / name / source).write_bytes((folder / source).read_bytes())
         for file in ("cell.toml", "robot.urdf"):
             (folder / file).write_bytes((ROOT / "examples" / "two_joints" / file).read_bytes())
+        with (folder / "cell.toml").open("a") as cell:
+            cell.write(CARRIED)
         (folder / "quick.toml").write_text(QUICK)
         for program, *words in commands(ROOT / "docs" / "payload.md"):
             assert program == "hil"
-            words += ("--settings", "quick.toml") if words[0] == "design" else ()
+            words += BY_HAND.get(words[0], ())
             result = CliRunner().invoke(app, words)
             assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
         model = pinocchio_model((folder / "gripper.urdf").read_text())
@@ -175,6 +189,125 @@ class TestRefusals:
     ) -> None:
         with pytest.raises(InputError, match=sentence):
             run(folder, *arguments)
+
+
+def payload_campaign(folder: Path) -> Campaign:
+    """Of the small cell, whose simulated arm carries 2 kg where it is loaded."""
+    cell = fast_cell(folder, repetitions=2)
+    carrying = Cell.from_texts(cell.text + CARRIED, cell.urdf, cell.path)
+    return fast_campaign(folder / "campaign", carrying)
+
+
+@pytest.fixture(scope="module")
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    return payload_campaign(tmp_path_factory.mktemp("designed"))
+
+
+@pytest.fixture(scope="module")
+def pairs(designed: Campaign) -> dict[str, Any]:
+    root = str(designed.folder.root)
+    words = ["run", root, "--payload", "weight", "--accept-dry-run", "--json"]
+    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+class TestRun:
+    """Bare and loaded runs in ABBA order, behind the gates of every run."""
+
+    def test_the_load_of_the_simulated_arm_is_weighed(self, pairs: dict[str, Any]) -> None:
+        low, high = pairs["figures"]["mass"]["interval"]
+        assert pairs["figures"]["mass"]["value"] == pytest.approx(2.0, rel=0.02)
+        assert 0.0 < high - low < 0.2
+
+    def test_each_side_is_a_campaign_that_was_seen_slowly(
+        self, designed: Campaign, pairs: dict[str, Any]
+    ) -> None:
+        assert not list(designed.folder.archives.iterdir())
+        for side in weighing.SIDES:
+            own = Campaign.open(designed.folder.root / "payload" / "weight" / side)
+            kinds = [path.name.split("_")[0] for path in own.folder.archives.iterdir()]
+            assert kinds.count("excitation") == pairs["pairs"]
+            assert kinds.count("dryrun") == 1
+            assert "validation" not in kinds
+
+    def test_what_is_recorded_is_not_recorded_again(
+        self, designed: Campaign, pairs: dict[str, Any]
+    ) -> None:
+        def run(*_: object) -> None:
+            pytest.fail("nothing was missing")
+
+        again = weighing.weigh(
+            designed, "weight", run=run, mount=lambda _: False, reporter=Silent()
+        )
+        assert again.pairs == pairs["pairs"]
+
+    def test_order_is_abba_until_another_pair_adds_nothing(
+        self, folder: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Mounting is asked for only where it changes."""
+        found = weigh(folder, ["empty"], ["full"])
+        monkeypatch.setattr(weighing, "find_payload", lambda *_: found)
+        done, asked = list[str](), list[bool]()
+
+        def run(side: Campaign, repetitions: int, link: Link | None) -> None:
+            assert link is not None
+            done.append(f"{side.folder.root.name} {repetitions}")
+
+        def mount(load: bool) -> bool:
+            asked.append(load)
+            return True
+
+        monkeypatch.setattr(weighing, "ENOUGH", 0.0)
+        weighed = weighing.weigh(designed, "x", run=run, mount=mount, reporter=Silent())
+        assert done == ["bare 1", "loaded 1", "loaded 2", "bare 2"]
+        assert asked == [False, True, False]
+        assert "another pair is worth it" in weighed.sentence
+        monkeypatch.setattr(weighing, "ENOUGH", 0.5)
+        weighed = weighing.weigh(designed, "y", run=run, mount=mount, reporter=Silent())
+        assert weighed.pairs == 1
+        assert "another pair is not worth it" in weighed.sentence
+
+    def test_nobody_who_mounts_it_ends_the_recording(self, designed: Campaign) -> None:
+        with pytest.raises(OperatorStopError, match="nothing was recorded"):
+            weighing.weigh(
+                designed, "z", run=lambda *_: None, mount=lambda _: False, reporter=Silent()
+            )
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (("--payload", "../x"), "no name of a payload"),
+            (("--payload", "x", "--dry-run"), "does its own dry runs"),
+        ],
+    )
+    def test_what_cannot_be_run_is_named(
+        self, designed: Campaign, words: tuple[str, ...], sentence: str
+    ) -> None:
+        root = str(designed.folder.root)
+        with pytest.raises(InputError, match=sentence):
+            CliRunner().invoke(app, ["run", root, *words], catch_exceptions=False)
+
+    def test_a_real_arm_needs_somebody_who_mounts_it(
+        self, designed: Campaign, tmp_path: Path
+    ) -> None:
+        cell = designed.cell
+        link = 'transport = "udp"\nhost = "127.0.0.1"'
+        real = Cell.from_texts(
+            cell.text.replace('transport = "simulated"', link), cell.urdf, cell.path
+        )
+        campaign = Campaign.create(tmp_path / "real", real, designed.plan)
+        with pytest.raises(InputError, match="needs somebody at a terminal"):
+            CliRunner().invoke(
+                app,
+                ["run", str(campaign.folder.root), "--payload", "gripper"],
+                catch_exceptions=False,
+            )
+
+    def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(CellError, match=r"simulation\.payload"):
+            carrying(fast_cell(tmp_path))
 
 
 class TestCampaigns:

@@ -13,7 +13,7 @@ from identification.export.simulators import Arm, Ranges, load_mujoco, mjcf
 from identification.model.coupling import Coupling
 from identification.model.elements import TorsionSpring
 from identification.signals.samples import Samples
-from identification.validation.replay import FEEDBACK, Simulated, replay
+from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import some_bodies
 
@@ -141,3 +141,22 @@ def _column(mujoco: object, model: object, data: object, k: int) -> Array:
     out = np.zeros(6)
     mujoco.mj_mulM(model, data, out, np.eye(6)[k])  # type: ignore[attr-defined]
     return out
+
+
+class TestSlowResidual:
+    """What makes a replay drift is told apart by how it depends on the motion."""
+
+    @pytest.mark.parametrize("joint", [0, 3])
+    def test_an_offset_and_friction_are_told_apart(self, joint: int) -> None:
+        arm = an_arm()
+        right = samples_of(arm)
+        velocity = right.motion.velocity[:, joint]
+        for torque, shares in ((5.0, (1.0, 0.0)), (5.0 * np.sign(velocity), (0.0, 1.0))):
+            wrong = right.torque.copy()
+            wrong[:, joint] += torque
+            found = slow_residual(arm, [changed(right, torque=wrong)])
+            explained = found.constant[joint], found.friction[joint]
+            others = np.delete(found.rms, joint)
+            assert np.argmax(explained) == np.argmax(shares)
+            assert explained[0] + explained[1] > 0.9
+            assert others.max() < 1e-6 * found.rms[joint]

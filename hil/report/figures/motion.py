@@ -1,4 +1,4 @@
-"""What happens in time: the identification trajectory, torque measured, predicted and split."""
+"""What happens in time: the identification motion, torque measured, predicted, split; replays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from hil.report import numbers
-from hil.report.figures.canvas import blank, footed, headed, place, ruled, thinned
+from hil.report.figures.canvas import blank, footed, headed, place, plot_panel, ruled, thinned
 from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
 from hil.report.figures.traces import MOST_POINTS, Plot, Trace, traces_text
@@ -23,6 +23,7 @@ _WIDTH, _LEFT, _RIGHT = 370.0, 46.0, 10.0
 _SECONDS = "time [s]"
 _INNER = _WIDTH - _LEFT - _RIGHT
 _POINTS = 1200  # of lines that are smooth
+_BAND_POINTS = 400
 
 Stretches = Sequence[tuple[float, float]]
 """Begin and end [s]."""
@@ -167,3 +168,33 @@ def _from_zero(time: Array) -> Array:
 
 def _length(time: Array) -> str:
     return numbers.significant(float(time[-1]))
+
+
+def replay_panels(series: ReportSeries, joints: Sequence[TorqueError]) -> list[Panel]:
+    """Position error of each joint over time; none where nothing was simulated."""
+    if series.replay_time.size < 2:
+        return []
+    return [_replay_panel(j, series, one) for j, one in enumerate(joints)]
+
+
+def _replay_panel(j: int, series: ReportSeries, joint: TorqueError) -> Panel:
+    time, error = series.replay_time, np.nan_to_num(series.replay_error[:, j])
+    unit = "°" if joint.unit == "N·m" else "mm"
+    rms = numbers.significant(float(np.sqrt(np.mean(error**2))), 2)
+    with drawing():
+        figure, axes = plot_panel(170.0)
+        if series.replay_spread.size:
+            some = slice(None, None, 1 + len(time) // _BAND_POINTS)
+            width = 2.0 * np.nan_to_num(series.replay_spread[some, j])
+            edges = error[some] - width, error[some] + width
+            axes.fill_between(time[some], *edges, color=BAND, linewidth=0.0)
+        if series.replay_nominal.size:
+            nominal = np.nan_to_num(series.replay_nominal[:, j])
+            axes.plot(*thinned(time, nominal), color=SECOND, linewidth=1.0)
+        axes.plot(*thinned(time, error), color=INK, linewidth=1.2)
+        axes.set_xlim(float(time[0]), float(time[-1]))
+        ruled(axes, "y")
+        headed(axes, f"position error [{unit}]")
+        footed(axes, _SECONDS)
+        alt = f"{joint.joint}: simulated less recorded position, {rms} {unit} rms."
+        return to_panel(figure, key=f"q{j}r", title=joint.joint, note=f"{rms} {unit} rms", alt=alt)

@@ -185,7 +185,11 @@ def _columns(archived: Archived, period: float) -> Iterator[str]:
     if not np.array_equal(archived.sequences, np.arange(len(rows))):
         yield "messages are not numbered without a hole"
     state = np.concatenate([rows[name] for name in ("position", "velocity", "torque")], axis=1)
-    sent = np.concatenate([rows[f"commanded_{name}"] for name in ("position", "velocity")], axis=1)
+    sent, inside = (
+        np.concatenate([rows[f"{whose}_{name}"] for name in ("position", "velocity")], axis=1)
+        for whose in ("commanded", "target")
+    )
+    sent = np.where(np.isnan(sent), inside, sent)
     same = np.array_equal(state, archived.states, equal_nan=True)
     if not (same and np.array_equal(sent, archived.commanded, equal_nan=True)):
         yield "the JointState channels do not repeat the records"

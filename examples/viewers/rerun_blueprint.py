@@ -1,0 +1,26 @@
+"""Write `arm.rbl`: `rerun arm.rbl runs/demo/annotated/validation_000_a1.mcap` opens both.
+
+Needs `pip install rerun-sdk`; hil itself does not.
+"""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+PLOTS = {
+    "position, velocity and torque": "/joint_states",
+    "commanded": "/joint_states_commanded",
+    "predicted": "/joint_states_predicted",
+}
+EVENTS = "/hil/events"
+ARM = ("/robot_description", "/tf_static")
+
+plots = [
+    rrb.TimeSeriesView(name=name, origin=topic, contents=f"{topic}/**")
+    for name, topic in PLOTS.items()
+]
+arm = rrb.Spatial3DView(name="arm", origin="/", contents=[f"{topic}/**" for topic in ARM])
+events = rrb.TextLogView(name="events", origin=EVENTS, contents=f"{EVENTS}/**")
+layout = rrb.Horizontal(rrb.Vertical(arm, events), rrb.Vertical(*plots))
+rrb.Blueprint(layout, collapse_panels=True).save("hil", "arm.rbl")
+print("written: arm.rbl")

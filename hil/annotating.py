@@ -1,0 +1,158 @@
+"""Copies of archives for viewers, with the torque that the identified model predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import Archive, open_archive
+from hil.archive.cdr import Rows, encode_log, joint_state_layout
+from hil.archive.mcap_writer import McapWriter
+from hil.archive.schema import (
+    COMMANDED,
+    EVENT_CHANNEL,
+    LIBRARY,
+    MEASURED,
+    PROFILE,
+    Channel,
+    description_messages,
+    profile,
+    set_points,
+    stamped,
+)
+from hil.archive.writer import register
+from hil.errors import InputError
+from hil.files import make_folder, write_together
+from hil.identify import Identification
+from hil.identify.sources import Source
+from hil.progress import Reporter
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+FOLDER: Final = "annotated"
+PREDICTED: Final = "/joint_states_predicted"
+_CHUNK: Final = 10**9  # ns
+
+
+def annotate(found: Identification, output: Path, reporter: Reporter) -> list[Path]:
+    """Write a copy of each archive that was fitted or predicted into a folder of `output`.
+
+    Raises:
+        InputError: two archives have one file name.
+        OutputError: the folder cannot be written to.
+    """
+    predictions = dict(_predictions(found))
+    names = [path.name for path in predictions]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(
+            next(path for path in predictions if path.name == twice),
+            "has the file name of another archive",
+            field="--annotate",
+            remedy="annotate the archives of each folder by themselves",
+        )
+    folder = output / FOLDER
+    make_folder(folder)
+    with reporter.task("annotating archives", len(predictions)) as task:
+        for path, prediction in predictions.items():
+            write_together(folder, {path.name: annotated(open_archive(path), prediction)})
+            task.advance(1, path.name)
+    reporter.say(f"copies with predicted torque: {folder}")
+    return [folder / name for name in names]
+
+
+def _predictions(found: Identification) -> Iterator[tuple[Path, dict[str, Array]]]:
+    """Of each archive the time since its first sample [s], and the effort predicted at it."""
+    prepared = found.prepared
+    sources = prepared.sources.training, prepared.training
+    pairs = [*zip(*sources, strict=True)]
+    if not prepared.sources.in_sample:
+        pairs += zip(prepared.sources.held_out, prepared.held_out, strict=True)
+    for path in dict.fromkeys(source.path for source, _ in pairs):
+        parts = [_prediction(found, *pair) for pair in pairs if pair[0].path == path]
+        yield path, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _prediction(found: Identification, source: Source, samples: Samples) -> dict[str, Array]:
+    predicted = samples.predicted_torque(found.cell.model, found.estimate.pooled.values)
+    recorded = source.recording.torque
+    assert recorded is not None  # what is fitted or predicted has torques
+    return {
+        "time": source.recording.time,
+        "effort": recorded - (samples.torque - predicted),  # known payloads act on both
+    }
+
+
+def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
+    """An MCAP file of what viewers show of an archive, and of the torque that a model predicts.
+
+    Times are those of the day where the archive knows the day.
+
+    Args:
+        archive: whole or torn.
+        prediction: ``time`` since the first sample (m,) [s], and the ``effort`` predicted at it
+            (m, n).
+    """
+    columns, names = archive.columns, archive.joint_names
+    stamp = np.asarray(columns["stamp"], np.int64)
+    begin = _recorded_at(archive)
+    shift = 0 if begin is None else begin - int(stamp[0])
+    first = int(stamp[0]) + shift
+    words = {"position": "position", "velocity": "velocity", "effort": "torque"}
+    states = {MEASURED: (stamp, {w: columns[c] for w, c in words.items() if c in columns})}
+    if "commanded_position" in columns:
+        commands = {name: set_points(columns, name) for name in ("position", "velocity")}
+        states[COMMANDED] = (stamp, commands)
+    times = stamp[0] + np.rint(1e9 * prediction["time"]).astype(np.int64)
+    states[PREDICTED] = (times, {"effort": prediction["effort"]})
+    measured = profile(len(names))[MEASURED]
+    once = description_messages(archive.attachments.get("robot.urdf", b""))
+    content: list[bytes] = []
+    writer = McapWriter(content.append)
+    writer.start(PROFILE, LIBRARY)
+    for channel, message in once.items():
+        writer.add_message(register(writer, channel), first, 0, message)
+    events = register(writer, EVENT_CHANNEL)
+    for number, event in enumerate(archive.events):
+        log = event.to_log()
+        shifted = replace(log, stamp=log.stamp + shift)
+        writer.add_message(events, shifted.stamp, number, encode_log(shifted))
+    messages = []
+    for topic, (times, values) in states.items():
+        number = register(writer, Channel(topic, measured.schema, measured.definition))
+        messages.append((number, times + shift, _states(names, times + shift, values)))
+    last = max(int(times[-1]) for _, times, _ in messages)
+    for start in range(first, last + 1, _CHUNK):
+        for number, times, rows in messages:
+            a, b = np.searchsorted(times, (start, start + _CHUNK))
+            writer.add_rows([number], times[a:b], np.arange(a, b), [rows[a:b]])
+        writer.flush()
+    writer.finish()
+    return b"".join(content)
+
+
+def _recorded_at(archive: Archive) -> int | None:
+    """Time of day at which it began [ns since 1970]; None of virtual time."""
+    try:
+        return round(datetime.fromisoformat(archive.header.recorded_at or "").timestamp()) * 10**9
+    except ValueError:
+        return None
+
+
+def _states(names: tuple[str, ...], stamp: Stamps, values: Mapping[str, Array]) -> Rows:
+    position, velocity, effort = (
+        len(names) * (word in values) for word in ("position", "velocity", "effort")
+    )
+    layout = joint_state_layout(names, position=position, velocity=velocity, effort=effort)
+    rows = stamped(layout, stamp)
+    for word, column in values.items():
+        rows[word] = column
+    return rows
