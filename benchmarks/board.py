@@ -1,7 +1,8 @@
 """Identification by default settings beside a plain fit, on real recordings and on spoilt ones.
 
-Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--degraded] [--json]``, where
-FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
+Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
+[--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes. With
+``--short`` the first and the last 40 % of each log are fitted and its rest is predicted.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
@@ -128,7 +129,7 @@ def cut(split: Split, logs: Mapping[str, JointLog]) -> Parts:
     whole = logs[split.fitted]
     if split.predicted is not None:
         return Parts(whole, logs[split.predicted])
-    share = round(FITTED_SHARE * whole.n_rows)
+    share = round(split.share * whole.n_rows)
     if split.part == "first":
         return Parts(whole.rows(slice(0, share)), whole.rows(slice(share, None)))
     if split.part == "last":
@@ -153,7 +154,7 @@ def identified_split(split: Split, archives: Mapping[str, Path], parts: Parts) -
     fitted = archives[split.fitted]
     if split.predicted is not None:
         return identified(fitted, [archives[split.predicted]])
-    if split.part == "last":
+    if split.part == "last" or split.share != FITTED_SHARE:
         return identified_parts(parts, fitted.parent)
     return identified(fitted, in_sample=split.in_sample)
 
@@ -199,13 +200,13 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
     )
 
 
-def rows_of(name: str, data: Path) -> Iterator[Row]:
-    """Every split of a configuration, by its name, in the folder of all recordings."""
+def rows_of(name: str, data: Path, *, short: bool = False) -> Iterator[Row]:
+    """Every split of a configuration, or every short one, in the folder of all recordings."""
     published = Published.named(name)
     with tempfile.TemporaryDirectory() as scratch:
         archives = import_all(published, data / (published.folder or name), Path(scratch))
         logs = {log: JointLog.read(path, published.rated_payload) for log, path in archives.items()}
-        for split in published.splits:
+        for split in published.short_splits if short else published.splits:
             yield row(name, split, archives, logs)
 
 
@@ -341,6 +342,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
     )
+    parser.add_argument("--short", action="store_true", help="fit 40 %% of a log, predict the rest")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
     parser.add_argument("--json", action="store_true", help="end with a line of JSON")
     options = parser.parse_args(arguments)
@@ -349,7 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     degraded: list[DegradedRow] = []
     print(_HEADING)
     for name in wanted:
-        for one in () if name == SIMULATED else rows_of(name, options.data):
+        for one in () if name == SIMULATED else rows_of(name, options.data, short=options.short):
             rows.append(one)
             print(_line(one), flush=True)
     found = summary(rows, ())

@@ -21,6 +21,7 @@ from planner.toml_text import toml_value
 
 CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
 FITTED_SHARE: Final = 0.7
+SHORT_SHARE: Final = 0.4
 
 
 class _Table(BaseModel):
@@ -33,13 +34,15 @@ class Split(_Table):
     Attributes:
         fitted: name of a log.
         predicted: of another; None where a part of the same log is.
-        part: of that log what is fitted: its first or last 70 %, and the rest predicted, or all of
+        part: of that log what is fitted: its first or last rows, and the rest predicted, or all of
             it, and predicted as well.
+        share: of its rows that are fitted where it is a part.
     """
 
     fitted: str
     predicted: str | None = None
     part: Literal["first", "last", "all"] = "all"
+    share: float = FITTED_SHARE
 
     @property
     def in_sample(self) -> bool:
@@ -49,8 +52,11 @@ class Split(_Table):
     def __str__(self) -> str:
         if self.predicted is not None:
             return f"{self.fitted} to {self.predicted}"
-        words = {"first": "first 70 % to last 30 %", "last": "last 70 % to first 30 %"}
-        return f"{self.fitted}: {words.get(self.part, 'in sample')}"
+        if self.part == "all":
+            return f"{self.fitted}: in sample"
+        other = {"first": "last", "last": "first"}[self.part]
+        mine, rest = round(100 * self.share), round(100 * (1.0 - self.share))
+        return f"{self.fitted}: {self.part} {mine} % to {other} {rest} %"
 
 
 class Published(_Table):
@@ -91,6 +97,15 @@ class Published(_Table):
             raise SystemExit(f"nothing is known about {name}; known are {', '.join(known())}")
         text = (CONFIGURATIONS / f"{name}.toml").read_text(encoding="utf-8")
         return cls.model_validate(tomllib.loads(text))
+
+    @property
+    def short_splits(self) -> tuple[Split, ...]:
+        """The rest of each log predicted from less than half of it, which hardly excites the arm."""
+        return tuple(
+            Split(fitted=log, part=part, share=SHORT_SHARE)
+            for log in self.logs
+            for part in ("first", "last")
+        )
 
     def urdf_text(self, folder: Path) -> str:
         """The URDF, beside the logs or in an installed package, with the bag's names of joints.
