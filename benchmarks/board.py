@@ -1,8 +1,8 @@
 """Identification by default settings beside a plain fit, on real recordings and on spoilt ones.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
-[--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes. With
-``--short`` the first and the last 40 % of each log are fitted and its rest is predicted.
+[--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
+With ``--short`` the first and the last 40 % of each log are fitted and its rest is predicted.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil

@@ -100,7 +100,7 @@ class Published(_Table):
 
     @property
     def short_splits(self) -> tuple[Split, ...]:
-        """The rest of each log predicted from less than half of it, which hardly excites the arm."""
+        """The rest of each log predicted from 40 % of it, which hardly excite the arm."""
         return tuple(
             Split(fitted=log, part=part, share=SHORT_SHARE)
             for log in self.logs
