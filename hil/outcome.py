@@ -83,13 +83,13 @@ def report_replay(
     replay: Callable[[ReportSeries], ReportSeries],
     reporter: Reporter,
 ) -> None:
-    """Add a replay to the report in a folder, if that is of the same parameters.
+    """Add a replay to the report in a folder, if it has the same parameters.
 
     Args:
         folder: with results, series and report.
         results: of the identification that was replayed.
         replay: adds its series.
-        reporter: told where it is, or why it is not.
+        reporter: says where it is, or why it is not.
 
     Raises:
         InputError: results or series cannot be read.

@@ -75,7 +75,7 @@ def weigh(
     mount: Callable[[bool], bool],
     reporter: Reporter,
 ) -> Weighed:
-    """Record pairs until another is not worth it, and weigh after each.
+    """Record pairs until another is not worth it, and weigh after each of them.
 
     The recordings are two campaigns below the folder of the campaign, with its cell, its plan and,
     where it was passed, its rehearsal. What is there already is not recorded again.
@@ -85,7 +85,7 @@ def weigh(
         name: of the payload, and of the folder.
         run: records.
         mount: whether the payload was mounted (True) or taken off (False); no ends the recording.
-        reporter: told of each pair.
+        reporter: of each pair.
 
     Raises:
         InputError: the name is no name of a folder.

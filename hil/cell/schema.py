@@ -112,7 +112,7 @@ class SimulationTable(Table):
         description="a table of what is known of its gears independently of [drive_train]",
     )
     payload: PayloadTable | None = Field(
-        default=None, description="a table of what it carries where `hil run --payload` mounts it"
+        default=None, description="a table of the body that `hil run --payload` mounts on it"
     )
 
 

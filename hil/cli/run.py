@@ -62,7 +62,7 @@ def run(
         typer.Option(
             metavar="NAME",
             help="Weigh a payload: run the excitation without and with it in turns, asking for it "
-            "to be mounted and taken off, until another pair is not worth it. The recordings lie "
+            "to be mounted and removed, until another pair is not worth it. The recordings lie "
             "in the folder payload/NAME of CAMPAIGN.",
             show_default=False,
         ),

@@ -145,7 +145,7 @@ class TestCommand:
         reports = []
         for command in (
             ["identify"],
-            ["replay", "--ensemble", "2", "--estimator", "wls"],
+            ["replay", "--ensemble", "2", "--estimator", "ols"],
             ["replay", "--ensemble", "2"],
             ["identify"],
         ):
