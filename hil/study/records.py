@@ -28,7 +28,7 @@ from identification.validation.prediction import FIGURE_BANDWIDTH
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Counted up when the same archives come to give other numbers, or a record another form."""
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
@@ -78,8 +78,6 @@ class ClassErrors(Frozen):
 
     durations: list[float]
     overall: dict[str, list[float]]
-    unfiltered: dict[str, list[float]]
-    """The same without the low-pass."""
     own: dict[str, list[float]]
     """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
     mean_abs: dict[str, list[list[float]]]

@@ -6,7 +6,7 @@ estimates, which is the same on all of these motions: other repetitions would ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -20,7 +20,6 @@ from .records import ClassForms, FitRecord
 from .results import ALPHA, SMALL, AblationBand, ComparisonResult, EqualDataResult, Verdict
 
 Array = NDArray[np.float64]
-Kernels = Callable[[Array], Array]
 
 DRAWS: Final = 4000
 FEWEST: Final = 3
@@ -30,14 +29,6 @@ asked."""
 _CHUNK: Final = 500
 _SUBSETS: Final = 400
 _SEED, _BAND_SEED = 20140901, 20140902
-
-
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """An estimate by its key, with the estimates (r, p) of the repetitions it is the mean of."""
-
-    key: str
-    values: Array
 
 
 @dataclass(frozen=True)
@@ -86,42 +77,30 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
     return "slightly worse" if ratio - 1.0 < SMALL else "worse"
 
 
-def torque_kernels(forms: ClassForms, joint: int | None = None) -> Kernels:
-    """Inner products of the low-passed torque errors, as :func:`compared_on` needs them."""
-    return lambda values: forms.torque_kernels(values, joint)
-
-
-def own_kernels(forms: ClassForms, truth: Array) -> Kernels:
-    """The same of the errors of the estimates themselves."""
-    return lambda values: forms.own_kernels(values, truth)
-
-
 def compared_on(
     motion_class: str,
-    first: Estimated,
-    second: Estimated,
-    kernels: Kernels,
+    keys: tuple[str, str],
+    inner: tuple[Array, Array],
     *,
     joint: str | None = None,
     drifts: bool,
 ) -> ComparisonResult:
-    """Errors with `second` over errors with `first`, motion by motion; a table of one.
+    """Errors with the second estimate over errors with the first, motion by motion; a table of one.
 
-    `kernels` are the inner products (m, r, r) of the errors that r estimates leave, of one joint or
-    of all together; with `drifts`, repetitions may resemble their neighbours.
+    `inner` are the inner products (m, r, r) of the errors that the r repetitions of each estimate
+    leave, of one joint or of all; with `drifts`, repetitions may resemble their neighbours.
     """
-    inner = [kernels(one.values) for one in (first, second)]
     # The sum of a mean's squared errors: weights 1 / r on either side.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
     ratio, wins, p_value = compare(before, after)
-    known = spread(inner[0], inner[1], drifts=drifts, seed=_SEED)
+    known = spread(*inner, drifts=drifts, seed=_SEED)
     one = ComparisonResult(
         motion_class=motion_class,
         joint=joint,
-        first=first.key,
-        second=second.key,
+        first=keys[0],
+        second=keys[1],
         motions=len(before),
-        repetitions=[len(first.values), len(second.values)],
+        repetitions=[one.shape[1] for one in inner],
         ratio=ratio,
         error=None if known is None else known.error,
         freedom=None if known is None else known.freedom,

@@ -60,7 +60,6 @@ def scored(errors: Mapping[str, Array]) -> ScoreRecord:
             for k, column in enumerate(table.T)
         ],
         overall={name: values.tolist() for name, values in errors.items()},
-        unfiltered={name: values.tolist() for name, values in errors.items()},
         all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
         own={},
         mean_abs={
