@@ -37,7 +37,6 @@ from .settings import StudyFolder
 from .tables import (
     Condition,
     condition_result,
-    cut_estimate,
     estimates_of,
     parameters_of,
     printed_rows,
@@ -67,19 +66,10 @@ class Recorded:
         return cell_of(self.archive)
 
     @property
-    def simulated(self) -> bool:
-        """Whether no robot moved."""
-        return self.archive.header.only_simulated
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Unmodelled effects of its simulated arm."""
-        return self.archive.header.effects
-
-    @property
     def planted(self) -> Array | None:
         """Parameters (p,) of its simulated arm; None of a real one."""
-        return planted_in(self.cell, self.archive.header) if self.simulated else None
+        header = self.archive.header
+        return planted_in(self.cell, header) if header.only_simulated else None
 
     @cached_property
     def excitation(self) -> Excitation | None:
@@ -101,7 +91,7 @@ class Recorded:
     def arm(self) -> str:
         """Digest of the arm: another drive train is another arm, and so is a simulated one."""
         drive_train = self.archive.attachments.get("drive_train.json")
-        return arm_digest(self.cell, drive_train, simulated=self.simulated)
+        return arm_digest(self.cell, drive_train, simulated=self.archive.header.only_simulated)
 
     def row(self, record: FitRecord) -> MotionRow:
         """Row of Table 1."""
@@ -137,14 +127,15 @@ def study_campaigns(
     """
     begin = time.perf_counter()
     folder, recorded = StudyFolder(root), recorded_runs(campaigns)
+    header = recorded[0].archive.header
     runs, first = [one.run for one in recorded], recorded[0]
     keys, labels, cell = [run.key for run in runs], {run.key: run.label for run in runs}, first.cell
-    truth = first.planted
-    if truth is None or not all(_equal(one.planted, truth) for one in recorded):
-        truth = None
+    planted = [values for one in recorded if (values := one.planted) is not None]
+    same = len(planted) == len(recorded) and all(np.array_equal(p, planted[0]) for p in planted)
+    truth = planted[0] if same else None
     with folder.locked(), workers_of(workers) as processes:
         fits = fit_all(runs, folder.fits, reporter, processes)
-        estimates = estimates_of(fits) | cut_estimate(fits)
+        estimates = estimates_of(fits)
 
         def scored(some: Sequence[Run]) -> dict[str, ScoreRecord]:
             return score_all(some, folder.fits, estimates, keys[:2], reporter, processes)
@@ -152,15 +143,15 @@ def study_campaigns(
         scores, parameters = scored(runs), parameters_of(cell, truth)
         conditions = {
             Condition(
-                f"recorded-{one.key}", f"on the motions of {one.label}", first.effects
+                f"recorded-{one.key}", f"on the motions of {one.label}", header.effects
             ): scored([one])
             for one in homes(runs)
-        } or {Condition("recorded", "as recorded", first.effects): scores}
+        } or {Condition("recorded", "as recorded", header.effects): scores}
         results = study_results(
             root,
             cell,
             parameters,
-            simulated=first.simulated,
+            simulated=header.only_simulated,
             quick=False,
             settings=None,
             searches=[],
@@ -175,10 +166,6 @@ def study_campaigns(
         )
         write_outcome(root, results, reporter)
     return results
-
-
-def _equal(values: Array | None, others: Array) -> bool:
-    return values is not None and np.array_equal(values, others)
 
 
 def recorded_runs(campaigns: Sequence[Path]) -> list[Recorded]:
@@ -226,8 +213,9 @@ def _require_alike(one: Recorded, first: Recorded) -> None:
     if one.arm != first.arm:
         problem = f"is of another arm than {first.run.root}: {apart(one.cell, first.cell)}"
         raise InputError(one.run.root, problem, remedy="name campaigns of one arm")
-    if one.effects != first.effects:
-        own, other = ("; ".join(each.effects) or "none" for each in (one, first))
+    effects = [each.archive.header.effects for each in (one, first)]
+    if effects[0] != effects[1]:
+        own, other = ("; ".join(some) or "none" for some in effects)
         raise InputError(
             one.run.root,
             f"was simulated with other unmodelled effects ({own}) than {first.run.root}"

@@ -39,7 +39,6 @@ from .settings import StudyFolder, StudySettings, stage
 from .tables import (
     Condition,
     condition_result,
-    cut_estimate,
     estimates_of,
     parameters_of,
     printed_rows,
@@ -159,7 +158,7 @@ class _Analysis:
         executions, fits = self.plans.executions[condition], self.fits[condition]
         labels = {key: label for key, label in LABELS.items() if key in executions}
         methods = {key: fits[key] for key in labels}
-        estimates = estimates_of(methods) | {PLANTED: truth} | cut_estimate(methods)
+        estimates = estimates_of(methods) | {PLANTED: truth}
         runs = [Run(key, label, executions[key].root) for key, label in labels.items()]
         fits_folder = self.folder.fits / condition
         scores = score_all(runs, fits_folder, estimates, (A, B), self.reporter, self.workers)

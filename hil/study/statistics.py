@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,12 +215,12 @@ def _logs(kernels: Array, weights: Array) -> Array:
     return np.asarray(0.5 * np.log(np.maximum(found, np.finfo(float).tiny)))
 
 
-def equal_data(fits: Mapping[str, FitRecord], keys: Sequence[str]) -> EqualDataResult | None:
+def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
     """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
-    if len(keys) < 2:
+    if len(fits) < 2:
         return None
-    whole = {key: fits[key].duration * len(fits[key].values) for key in keys[:2]}
-    other, cut = sorted(keys[:2], key=lambda key: whole[key])
+    whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
+    other, cut = sorted(whole, key=lambda key: whole[key])
     count = max(1, round(whole[other] / fits[cut].duration))
     if count >= len(fits[cut].values):
         return None
@@ -258,32 +258,31 @@ def bands_of(
     if not 1 <= size < len(values):
         return []
     weights = _subsets(len(values), size)
-    figures: list[tuple[str, str | None, Array]] = []
+    found: list[AblationBand] = []
+
+    def add(
+        quantity: Literal["error", "own", "parameter_error"], name: str | None, some: Array
+    ) -> None:
+        # Figures that exist: of few subsets the smallest and the largest.
+        low, high = np.percentile(some, (2.5, 97.5), method="inverted_cdf").tolist()
+        found.append(
+            AblationBand(
+                method=method, repetitions=size, quantity=quantity, motion_class=name,
+                low=low, high=high, subsets=len(some),
+            )
+        )  # fmt: skip
+
     for name, one in forms.items():
         scale = one.torque_squared.sum(axis=1)
-        figures.append(("error", name, _medians(one.torque_kernels(values), weights, scale)))
+        add("error", name, _medians(one.torque_kernels(values), weights, scale))
         if truth is not None:
-            own = _medians(one.own_kernels(values, truth), weights, scale)
-            figures.append(("own", name, own))
+            add("own", name, _medians(one.own_kernels(values, truth), weights, scale))
     if truth is not None:
         errors = [parameter_error(estimate, reference, truth) for estimate in weights @ values]
         known = [error for error in errors if error is not None]
-        figures += [("parameter_error", None, np.array(known))] if known else []
-    return [
-        AblationBand.model_validate(
-            {
-                "method": method,
-                "repetitions": size,
-                "quantity": quantity,
-                "motion_class": name,
-                # Figures that exist: of few subsets the smallest and the largest.
-                "low": float(np.percentile(some, 2.5, method="inverted_cdf")),
-                "high": float(np.percentile(some, 97.5, method="inverted_cdf")),
-                "subsets": len(some),
-            }
-        )
-        for quantity, name, some in figures
-    ]
+        if known:
+            add("parameter_error", None, np.array(known))
+    return found
 
 
 def _subsets(count: int, size: int) -> Array:

@@ -96,17 +96,20 @@ def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
     ]
 
 
+def repetitions_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
+    """Estimates (r, p) of the repetitions of each method.
+
+    Among them those of the longer of the first two with as much motion as the other has.
+    """
+    found, equal = {key: np.array(one.values) for key, one in fits.items()}, equal_data(fits)
+    if equal is not None:
+        found[equal.name] = found[equal.cut][: equal.repetitions]
+    return found
+
+
 def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
     """The paper's estimate of each: the mean over the repetitions' own estimates (p,)."""
-    return {key: np.mean(one.values, axis=0) for key, one in fits.items()}
-
-
-def cut_estimate(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
-    """Estimate of the longer of the first two methods from as much motion as the other has."""
-    equal = equal_data(fits, list(fits))
-    if equal is None:
-        return {}
-    return {equal.name: np.mean(fits[equal.cut].values[: equal.repetitions], axis=0)}
+    return {key: values.mean(axis=0) for key, values in repetitions_of(fits).items()}
 
 
 def condition_result(
@@ -120,13 +123,10 @@ def condition_result(
 ) -> ConditionResult:
     """All tables of one condition.
 
-    `labels` of the methods are in the order of the tables, `scores` by class of motion, `others`
+    `fits` of the methods are in the order of the tables, `scores` by class of motion, `others`
     further estimates in the cross table, such as the planted parameters.
     """
-    keys, equal = list(labels), equal_data(fits, list(labels))
-    estimates = {key: np.array(fits[key].values) for key in keys}
-    if equal is not None:
-        estimates[equal.name] = estimates[equal.cut][: equal.repetitions]
+    keys, equal, estimates = list(fits), equal_data(fits), repetitions_of(fits)
     wanted = [*estimates, *others]
     classes = [_class_result(name, one, condition) for name, one in scores.items()]
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}

@@ -34,7 +34,7 @@ from hil.study.records import ClassForms, ScoreRecord
 from hil.study.searches import SINES, run_searches, searches
 from hil.study.settings import Effort, StudyFolder
 from hil.study.statistics import compare, equal_data, holm, parameter_error
-from hil.study.tables import cut_estimate, parameters_of
+from hil.study.tables import estimates_of, parameters_of
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 from tests.hil.study_numbers import fitted
@@ -86,13 +86,13 @@ def test_holm_on_the_example_of_every_textbook() -> None:
 def test_with_as_much_motion_of_each_the_longer_one_is_cut() -> None:
     long, short = fitted(np.arange(24.0).reshape(6, 4)), fitted(np.ones((6, 4)))
     fits = {"a": long.model_copy(update={"duration": 20.0}), "b": short}  # 120 s and 48 s
-    equal = equal_data(fits, ["a", "b"])
+    equal = equal_data(fits)
     assert equal is not None
     assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
     assert (equal.other, equal.other_seconds) == ("b", 48.0)
-    assert cut_estimate(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
-    assert equal_data({"a": short, "b": short}, ["a", "b"]) is None
-    assert equal_data({"a": long}, ["a"]) is None
+    assert estimates_of(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert equal_data({"a": short, "b": short}) is None
+    assert equal_data({"a": long}) is None
 
 
 def test_the_distance_to_the_truth_is_one_for_the_base_itself() -> None:
