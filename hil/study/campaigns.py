@@ -13,19 +13,18 @@ import numpy as np
 
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.cell import AngleFrame, Cell
+from hil.campaign.quick_design import plan_around
+from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import DesignSettings, problem_of
-from hil.design.advice import NoExcitationError, forbidden
+from hil.design.advice import NoExcitationError
 from hil.errors import ControllerFault, HilError
-from hil.motion_checks import MotionChecks, planned
+from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from hil.simulation import simulated_link, simulated_provenance
 from identification import IdentificationError
 from identification.excitation import (
     Excitation,
-    NoFeasibleMotionError,
-    random_validation_motions,
     sampled,
 )
 from planner import FourierSeries, PlanFile, PlannerError
@@ -142,12 +141,12 @@ def noise_key(method: str, factor: float) -> str:
     return f"{method}-noise-{factor:g}"
 
 
-def with_noise(cell: Cell, factor: float) -> Cell:
-    """The cell with so many times the noise of its currents, in its text too."""
-    noise = str(factor * cell.simulation.current_noise)
-    return Cell.from_texts(
-        replaced_value(cell.text, "simulation", "current_noise", noise), cell.urdf, cell.path
-    )
+def _with(cell: Cell, table: str, **values: Any) -> Cell:
+    """The cell with other values in a table of its file."""
+    text = cell.text
+    for name, value in values.items():
+        text = replaced_value(text, table, name, str(value))
+    return Cell.from_texts(text, cell.urdf, cell.path)
 
 
 def plan_study(
@@ -169,8 +168,10 @@ def plan_study(
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
     held_out = {
         A: sine_motions(cell, found[sines].search.settings, checks, count=count, seed=seed),
-        B: via_point_motions(cell, checks, fly=fly, count=count, seed=seed),
-        B0: via_point_motions(cell, checks, fly=0.0, count=count, seed=seed),
+        B: via_point_motions(cell, excitations[B], checks, fly=fly, count=count, seed=seed),
+        B0: via_point_motions(
+            cell, excitations[B0], checks, fly=0.0, count=count, seed=seed + _STOPS_SEED
+        ),
     }
     main = cell.with_campaign(
         repetitions=settings.repetitions, validation_runs=count, simulation_seed=seed
@@ -194,7 +195,7 @@ def plan_study(
     for key, one in varied.items():
         add(ABLATION, key, few, one)
     for factor in settings.noise:
-        noisy = with_noise(few, factor)
+        noisy = _with(few, "simulation", current_noise=factor * cell.simulation.current_noise)
         for key in (A, B):
             add(ABLATION, noise_key(key, factor), noisy, excitations[key])
     return Plans(sines, printed, excitations, executions, missing)
@@ -242,35 +243,15 @@ def _of(found: Mapping[str, Found], key: str) -> Excitation:
 
 
 def via_point_motions(
-    cell: Cell, checks: MotionChecks, *, fly: float, count: int, seed: int
+    cell: Cell, excitation: Excitation, checks: MotionChecks, *, fly: float, count: int, seed: int
 ) -> tuple[PlannedMotion, ...]:
     """Wide random motions through as many via points as the cell's excitation has.
 
     Raises:
         NoExcitationError: none satisfies the constraints.
     """
-    try:
-        found = random_validation_motions(
-            cell.joint_limits,
-            home=cell.home,
-            seed=seed if fly > 0.0 else seed + _STOPS_SEED,
-            count=count,
-            n_via=cell.campaign.n_via,
-            fly=fly,
-            checker=checks.checker,
-            currents=planned(checks.currents),
-        )
-    except NoFeasibleMotionError as error:
-        why = forbidden(error, AngleFrame.of(cell))
-        raise NoExcitationError(f"no motion to predict: {why}") from error
-    limits = cell.joint_limits
-    return tuple(
-        PlannedMotion(
-            one.trajectory,
-            PlanFile(cell.joint_names, one.via_points[0], one.moves, limits=limits),
-        )
-        for one in found
-    )
+    own = _with(cell, "campaign", fly=fly, seed=seed, validation_runs=count)
+    return plan_around(own, excitation, checks).validation
 
 
 def sine_motions(

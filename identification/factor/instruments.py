@@ -5,8 +5,8 @@ r"""What instrumental variables need of the samples: per joint the Gram matrix o
 
 W is the regressor of the measured motion, whose noise it carries, and Z that of a motion without
 measurement noise (:mod:`identification.estimators.instrument_motion`), column by column the same
-functions. Sums are stored by short blocks of time (see :mod:`identification.estimators.covariance`) and
-only over the columns that act on a joint: a third of all of them.
+functions. Sums are stored by short blocks of time (:mod:`identification.estimators.covariance`)
+and only over the columns that act on a joint: a third of all of them.
 """
 
 from __future__ import annotations
