@@ -12,7 +12,6 @@ from hil.study.records import (
     FitRecord,
     MotionForm,
     ScoreRecord,
-    packed,
 )
 
 Array = NDArray[np.float64]
@@ -77,8 +76,8 @@ def form(archive: str, gram: Array, joints: int = 2) -> MotionForm:
         archive=archive,
         torque_squared=[1.0 / joints] * joints,
         columns=[list(range(n))] * joints,
-        slow=[packed(gram / joints)] * joints,
-        whole=packed(gram[:n, :n]),
+        slow=[(gram / joints).tolist()] * joints,
+        whole=gram[:n, :n].tolist(),
     )
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hil.study.campaigns import Execution, Plans
-from hil.study.records import packed, unpacked
 from hil.study.results import ComparisonResult
 from hil.study.searches import AP, B0, A, B, Found, printed_sines
 from hil.study.statistics import (
@@ -60,11 +59,6 @@ def test_a_form_gives_the_error_of_any_estimate_and_of_any_mean_of_estimates() -
     away = np.linalg.norm(phi @ (values.mean(axis=0) - 1.0))
     assert forms.own(values.mean(axis=0), np.ones(3)) == pytest.approx([away])
     assert np.sqrt(forms.own_kernels(values, np.ones(3)).mean()) == pytest.approx(away)
-
-
-def test_a_form_comes_back_from_its_text_to_the_last_bit() -> None:
-    table = np.random.default_rng(2).standard_normal((9, 6))
-    assert np.array_equal(unpacked(packed(table.T @ table)), table.T @ table)
 
 
 # Motions and repetitions drawn
