@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .campaigns import noise_key
-from .records import ClassForms, FitRecord, ScoreRecord
+from .records import CLASSES, ClassForms, FitRecord, ScoreRecord
 from .results import AblationBand, AblationPoint, AblationResult
 from .searches import SINES, A, B, fly_key, via_key, weight_key
 from .settings import StudySettings
@@ -65,21 +65,27 @@ class Evidence:
     Attributes:
         fits: of every executed excitation of the ablations, by key.
         main: of A and B with all repetitions.
-        scores: of the held-out motions, by class.
+        scores: of the held-out motions, by class, of one or several campaigns.
         truth: planted parameters (p,), None for a real arm.
         sines: key of the sines that method A is represented by.
     """
 
     fits: Mapping[str, FitRecord]
     main: Mapping[str, FitRecord]
-    scores: Mapping[str, ScoreRecord]
+    scores: Sequence[Mapping[str, ScoreRecord]]
     truth: Array | None
     sines: str = ""
 
     @cached_property
     def forms(self) -> dict[str, ClassForms]:
         """Of the held-out motions, by class: the error of any estimate."""
-        return {name: ClassForms.of(one.forms) for name, one in self.scores.items()}
+        return {
+            name: ClassForms.of(
+                [form for own in self.scores if name in own for form in own[name].forms]
+            )
+            for name in CLASSES
+            if any(name in own for own in self.scores)
+        }
 
     def executed(self, key: str) -> Array:
         """Estimates (r, p) of the repetitions of an ablation's own campaign."""

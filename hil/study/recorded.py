@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -140,13 +140,15 @@ def study_campaigns(
         def scored(some: Sequence[Run]) -> dict[str, ScoreRecord]:
             return score_all(some, folder.fits, estimates, keys[:2], reporter, processes)
 
-        scores, parameters = scored(runs), parameters_of(cell, truth)
-        conditions = {
-            Condition(
-                f"recorded-{one.key}", f"on the motions of {one.label}", header.effects
-            ): scored([one])
+        parameters, effects = parameters_of(cell, truth), header.effects
+        conditions = [
+            (
+                Condition(f"recorded-{one.key}", f"on the motions of {one.label}", effects),
+                scored([one]),
+            )
             for one in homes(runs)
-        } or {Condition("recorded", "as recorded", header.effects): scores}
+        ] or [(Condition("recorded", "as recorded", effects), scored(runs))]
+        scores = [some for _, some in conditions]
         results = study_results(
             root,
             cell,
@@ -158,10 +160,10 @@ def study_campaigns(
             table1=[one.row(fits[one.run.key]) for one in recorded] + printed_rows(cell),
             conditions=[
                 condition_result(one, labels, fits, some, parameters, cell.joint_names)
-                for one, some in conditions.items()
+                for one, some in conditions
             ],
             ablations=[repetition_ablation(Evidence({}, fits, scores, truth), SUBSETS, keys)],
-            missing=_missing(recorded, truth, list(scores)),
+            missing=_missing(recorded, truth, {name for some in scores for name in some}),
             times={"estimates and predictions": round(time.perf_counter() - begin, 1)},
         )
         write_outcome(root, results, reporter)
@@ -240,7 +242,7 @@ def homes(runs: Sequence[Run]) -> list[Run]:
 
 
 def _missing(
-    recorded: Sequence[Recorded], truth: Array | None, classes: Sequence[str]
+    recorded: Sequence[Recorded], truth: Array | None, classes: Collection[str]
 ) -> list[str]:
     """What the recordings do not allow, in sentences."""
     absent = [name for name in CLASSES if name not in classes]

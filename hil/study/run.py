@@ -130,7 +130,7 @@ class _Analysis:
         evidence = Evidence(
             self.fits[ABLATION],
             self.fits[NO_EFFECTS],
-            self.scores[NO_EFFECTS],
+            [self.scores[NO_EFFECTS]],
             truth,
             self.plans.sines,
         )
