@@ -28,7 +28,7 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 101_040,
+    "product lines": 101_048,
     "product files": 510,
     "test lines": 94_356,
     "test files": 521,
