@@ -178,7 +178,7 @@ def _keep(path: Path, copy: Path) -> None:
 def _write_through(path: Path, content: str | bytes) -> None:
     """Write a new file and have it on the disk.
 
-    What lies there is taken away before: in a folder that came from elsewhere it may be a link to
+    What lies there is removed before: in a folder that came from elsewhere it may be a link to
     a file of the user's, or a pipe.
     """
     path.unlink(missing_ok=True)

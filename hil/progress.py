@@ -106,7 +106,7 @@ class Bar:
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A bar with what is done, the time taken and the time left."""
+        """A bar with what is done, the time spent and the time left."""
         progress = _WithNote(
             _whole(TextColumn, "{task.description}"),
             BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=_NARROWEST)),

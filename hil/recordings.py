@@ -38,7 +38,7 @@ def open_recording(
 
     Works on archives of this package and on imported ones. An archive that was cut off gives what
     is whole of it; the recording's provenance then has an entry ``missing`` that says what is not.
-    The recording is as it was taken: `Recording.checked` decides whether it can be identified from.
+    The recording is as it was made: `Recording.checked` decides whether it can be identified from.
 
     Only what is wanted is decoded, chunk by chunk, and of a range of times only the chunks it lies
     in are read where the index of the file is whole.

@@ -5,7 +5,7 @@ a perfect solver save the more the more of both ramps they replace, because to f
 then a smaller join is one of the motions to choose from. The solver is not perfect: at a few
 isolated states, such as those at a knot of a ramp, it misses the fastest join by far, or takes one
 that breaks a limit. So it is asked at shares next to each other and the corner that saves most is
-taken; none is taken that would be slower than to stop.
+used; none is used that would be slower than to stop.
 """
 
 from __future__ import annotations

@@ -239,7 +239,7 @@ class Interpolator(MoveServices):
         return status
 
     def stop_motion(self) -> Status:
-        """Come to rest on the path, and stay, with targets kept, until asked otherwise."""
+        """Come to rest on the path, and stay, with unchanged targets, until asked otherwise."""
         status = self._set()
         if status >= 0 and not self._held:
             self._held = True

@@ -50,7 +50,7 @@ class TrajectoryPlayer:
     asked for during a hold takes effect with `resume`. One asked for while a resumed motion is
     still gathering speed changes the target at once; it goes on within the bounds of a stop if
     those of an override no longer suffice. As long as the arm is at rest at the start of the
-    motion, every rate is taken up at once.
+    motion, every rate applies at once.
 
     Args:
         trajectory: What to play, keeping `limits`.

@@ -53,7 +53,7 @@ from sim_fixtures.truth import PlantTruth, standard_parameters
 
 Numbers = Sequence[float]
 Wanted = Sequence[Sequence[float] | None]
-"""D1..D5 that the PC answered for each axis; None for an axis without an answer to be taken."""
+"""D1..D5 that the PC answered for each axis; None for an axis without an answer to be accepted."""
 
 _ADDS_SPEED = (2, 8)
 _ADDS_CURRENT = (1, 2, 9)

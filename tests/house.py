@@ -28,15 +28,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 101_520,
+    "product lines": 101_048,
     "product files": 510,
-    "test lines": 94_392,
+    "test lines": 94_356,
     "test files": 521,
     "import circles": 0,
     "imports inside functions": 38,
     "files with one importer": 31,
     "banned names": 0,
-    "functions over 60 lines": 39,
+    "functions over 60 lines": 37,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {

@@ -21,8 +21,8 @@ from scipy.stats import t as student
 Array = NDArray[np.float64]
 
 FEWEST: Final = 15
-"""Repetitions without which their correlation cannot be estimated. A campaign of fewer is taken to
-be known no better than one of them is: they may all have been made while the arm warmed up."""
+"""Repetitions without which their correlation cannot be estimated. A campaign of fewer is assumed
+to be known no better than one of them is: they may all have been made while the arm warmed up."""
 _HIGHEST: Final = 0.95
 
 

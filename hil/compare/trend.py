@@ -225,7 +225,7 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
     """Find what changed on one arm from campaign to campaign, in any order.
 
     Campaigns without a time of recording are left out if others have one, since nobody knows where
-    they belong. If none has, all are taken in the order of their folders' names.
+    they belong. If none has, all are used in the order of their folders' names.
     """
     known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
     if known:
@@ -474,7 +474,7 @@ class Levels:
         residuals = np.concatenate(
             [self.values[one] - np.median(self.values[one]) for one in self.members]
         )
-        # Each level has taken its own median from its residuals.
+        # Each level has subtracted its own median from its residuals.
         spare = len(every) - len(self.members)
         scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
         typical = float(np.median(self.stds[every]))

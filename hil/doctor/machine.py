@@ -292,7 +292,7 @@ def idle_states(system: System, *, no_sleep: bool) -> Check:
 
 
 def isolation(system: System) -> Check:
-    """Whether a processor is kept free of other programs."""
+    """Whether a processor is isolated from other programs."""
     isolated = system.text(f"{_CPU}/isolated")
     why = "other programs and interrupts stay off an isolated processor"
     if isolated:
@@ -384,7 +384,7 @@ def virtualisation(system: System) -> Check:
 
 
 def stolen_share(stat: str, since: str = "") -> float | None:
-    """Share of processor time that the host kept for others, from texts of /proc/stat.
+    """Share of processor time that the host gave to others, from texts of /proc/stat.
 
     Args:
         stat: the text now.
@@ -403,7 +403,7 @@ def _ticks(stat: str) -> list[int] | None:
 
 
 def stolen(before: str, after: str) -> Check:
-    """How much processor time the host kept for others during the measurement."""
+    """How much processor time the host gave to others during the measurement."""
     share = stolen_share(after, before)
     name, why = "stolen time while measuring", "time in which a virtual machine did not run at all"
     if share is None:

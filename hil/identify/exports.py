@@ -35,7 +35,7 @@ class Exports:
 
     Attributes:
         contents: text of each file by name, in the order of writing; None for one that is to be
-            taken away if it is there: it would be of other parameters than its neighbours.
+            removed if it is there: it would be of other parameters than its neighbours.
         withheld: why there is none, by the name of each such file.
     """
 

@@ -287,7 +287,7 @@ def endogeneity_result(estimation: Estimation) -> EndogeneityResult | None:
 
 
 def uncertainty_result(estimation: Estimation) -> UncertaintyResult:
-    """Standard deviations by every route that was taken."""
+    """Standard deviations by every method that was used."""
     result = estimation.result
     pooled, many = result.pooled, len(result.repetitions) > 1
     by_posterior = estimation.estimator == "prior"

@@ -112,7 +112,7 @@ class _Reader:
         self._parts: list[dict[str, NDArray[Any]]] = []
 
     def add(self, stamp: int, data: bytes) -> bool:
-        """Take the next message; whether it is kept."""
+        """Add the next message; whether it is used."""
         if self._refusal is None and self._layout is None:
             self._begin(data)
         if self._refusal is not None:

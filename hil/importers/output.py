@@ -43,7 +43,7 @@ def write_imported(
         samples: joint side, SI units.
         source: the files they come from.
         robot: whose they are.
-        metadata: what else is to be kept of them.
+        metadata: what else is to be stored of them.
         held_joints: joints known to have been held still.
         period: step [s] of a recording at a fixed rate.
         use: what identification may do with them: fit, only predict, or take the noise from.

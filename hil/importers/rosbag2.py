@@ -395,7 +395,7 @@ class _States:
                 )
 
     def samples(self, effort: Effort) -> Samples:
-        """Everything taken in."""
+        """Everything that was read."""
         if not self.bag_stamps:
             recorded = f"recorded are {', '.join(self._seen)}" if self._seen else "it is empty"
             raise SourceError(

@@ -64,7 +64,7 @@ class Known:
 def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     """Limits that a URDF states; angles in degrees, in its own frame.
 
-    A joint without a stated range or speed gets `"?"` there. Torques are taken only if every joint
+    A joint without a stated range or speed gets `"?"` there. Torques are used only if every joint
     has one: a list of torque limits has no gaps.
     """
     limits = urdf_limits(urdf, joint_names)

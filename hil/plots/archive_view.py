@@ -117,7 +117,7 @@ def view_of(
         start: s since its first sample; the beginning if left out.
         stop: s, likewise; the end.
         joints: names or numbers from 1 of the joints wanted; all if empty.
-        bins: stretches of the time shown, of which the lowest and the highest sample are kept.
+        bins: stretches of the time shown, of which the lowest and the highest sample are shown.
 
     Raises:
         ArchiveError: it cannot be read, or holds no sample in that time.

@@ -103,7 +103,7 @@ class FrontView:
         on_front: whether it is one of the front's points.
         knee: (log10 det, I_c) of the point that it grew from, if it did.
         references: (log10 det, I_c) of others by name.
-        kinematic: names of those that kept joint limits only.
+        kinematic: names of those that satisfy joint limits only.
         together: whether earlier archives are part of all measures.
     """
 
@@ -529,7 +529,7 @@ def draw_design(
         chosen: index of this motion on the front, None where it is not one of its points.
         knee: (log10 det, I_c) of the point of the front that it grew from, if it did.
         references: (log10 det, I_c) of other motions to compare with, by name.
-        kinematic: names of references that kept joint limits only.
+        kinematic: names of references that satisfy joint limits only.
         unchecked: what the search did not look at ("floor", "the arm itself", ...).
         complete: whether the search came to its end.
         together: whether all measures, but those of the matrix, add earlier archives, weighted.

@@ -386,7 +386,7 @@ class CalibrationResult(Frozen):
     """Held-out means of torque and their 95 % intervals; lists are per joint."""
 
     block: float = Field(gt=0.0)
-    """Time that a mean is taken over, s."""
+    """Time that a mean covers, s."""
     means: int = Field(gt=0)
     """How many were compared with their interval, all joints."""
     inside: float

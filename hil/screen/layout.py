@@ -186,7 +186,7 @@ def _state(shown: Shown, width: int) -> Text:
 
 
 def _health(shown: Shown, width: int) -> Text:
-    """How well the cycle is kept."""
+    """Regularity of the cycle."""
     status = shown.status
     motion = None if status is None else status.motion
     text = Text().append("cycles ", style="bold")

@@ -211,7 +211,7 @@ class PlainLines:
 
     Args:
         console: written to.
-        unsaid: lines to be printed, taken from there.
+        unsaid: lines to be printed, removed from there.
     """
 
     def __init__(self, console: Console, unsaid: deque[str]) -> None:

@@ -52,22 +52,9 @@ _MOVES: Final = 1e-3
 """rad/s or m/s: a joint that is faster moves."""
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Archives to be read together.
-
-    Attributes:
-        archives: excitations, or held-out motions.
-        standstill: of the same campaign, for the noise of the positions.
-    """
-
-    archives: tuple[Path, ...]
-    standstill: tuple[Path, ...] = ()
-
-
-def fit(reading: Reading, inputs: str) -> FitRecord:
+def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
     """Estimate from each repetition and from all (eq. 4)."""
-    prepared = _prepared(reading)
+    prepared = _prepared(archives)
     model, recordings = prepared.sources.cell.model, prepared.fitted
     found = estimate_repetitions(model, recordings)
     first, source = recordings[0], prepared.sources.training[0]
@@ -99,18 +86,27 @@ def fit(reading: Reading, inputs: str) -> FitRecord:
 
 
 def score(
-    reading: Reading, inputs: str, estimates: Mapping[str, Sequence[float]], shown: Sequence[str]
+    groups: Sequence[tuple[str, Sequence[Path]]],
+    inputs: str,
+    estimates: Mapping[str, Sequence[float]],
+    shown: Sequence[str],
 ) -> ScoreRecord:
     """Predict held-out motions by several estimates.
 
     Args:
-        reading: the held-out archives.
+        groups: key of each campaign, its held-out archives and those of its standstill.
         inputs: digest of all this rests on.
         estimates: parameters (p,) by name.
         shown: estimates of the example in time, drawn on the motion of median error.
     """
-    prepared = _prepared(reading)
-    model, runs = prepared.sources.cell.model, prepared.fitted
+    runs: list[Samples] = []
+    names: list[str] = []
+    for key, archives in groups:
+        prepared = _prepared(archives)
+        runs += prepared.fitted
+        # Every campaign numbers its archives from 0.
+        names += [f"{key}/{source.name}" for source in prepared.sources.training]
+    model = prepared.sources.cell.model
     table = np.array(list(estimates.values()), dtype=np.float64)
     truth = list(estimates).index(PLANTED) if PLANTED in estimates else None
     by_motion = [_errors(model, table, run, truth) for run in runs]
@@ -128,16 +124,13 @@ def score(
         every = np.mean([errors["overall"][name] for name in shown], axis=0)
         typical = int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])
         series = {name: np.asarray(estimates[name]) for name in shown}
-        examples.append(_example(prepared, runs[typical], typical, series))
+        examples.append(_example(model, runs[typical], names[typical], series))
     return ScoreRecord(
         inputs=inputs,
         durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs],
         samples=[len(rows) for rows in usable],
         left_out=[np.count_nonzero(~rows, axis=0).tolist() for rows in usable],
-        forms=[
-            motion_form(model, source.name, run)
-            for source, run in zip(prepared.sources.training, runs, strict=True)
-        ],
+        forms=[motion_form(model, name, run) for name, run in zip(names, runs, strict=True)],
         examples=examples,
         **errors,
     )
@@ -164,7 +157,6 @@ def _errors(model: RobotModel, table: Array, run: Samples, truth: int | None) ->
     rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
     found = {
         "overall": _relative(slow, torque),
-        "unfiltered": _relative(left, torque),
         "all_rows": _relative(everywhere[whole], run.torque[whole]),
         "mean_abs": (np.abs(slow).sum(axis=0) / rows[:, None]).T,
     }
@@ -184,25 +176,23 @@ def _motion_rows(run: Samples) -> slice:
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
-def _prepared(reading: Reading) -> Prepared:
+def _prepared(archives: Sequence[Path]) -> Prepared:
     """All archives as they are fitted; nothing is held out of what is asked for."""
-    paths = [*reading.archives, *reading.standstill]
     options = replace(FIXED, in_sample=True)
-    sources = gather_sources(paths, options.split, in_sample=True)
+    sources = gather_sources(archives, options.split, in_sample=True)
     return prepare_sources(sources, options, Silent())
 
 
 def _example(
-    prepared: Prepared, run: Samples, index: int, estimates: Mapping[str, Array]
+    model: RobotModel, run: Samples, name: str, estimates: Mapping[str, Array]
 ) -> ExampleRecord:
-    model, time = prepared.sources.cell.model, run.motion.time
-    shown = _thinned(moving_rows(run))
+    time, shown = run.motion.time, _thinned(moving_rows(run))
 
     def joints(torque: Array) -> list[list[float]]:
         return [_rounded(column) for column in for_figure(time, torque)[shown].T]
 
     return ExampleRecord(
-        archive=prepared.sources.training[index].name,
+        archive=name,
         time=_rounded(time[shown] - time[shown.start]),
         measured=joints(run.torque),
         predicted={
@@ -252,14 +242,10 @@ class Run:
         sums = {entry.name: entry.sha256 for entry in self.folder.manifest()}
         return tuple((name, sums[name]) for name in names)
 
-    def reading(self, kind: str, names: Sequence[str] | None = None) -> Reading:
-        """Its archives of one kind, all or those named."""
-
-        def paths(chosen: Sequence[str]) -> tuple[Path, ...]:
-            return tuple(self.folder.archives / name for name in chosen)
-
-        chosen = [name for name, _ in self.archives(kind)] if names is None else names
-        return Reading(paths(chosen), paths([name for name, _ in self.archives("standstill")]))
+    def paths(self, names: Sequence[str]) -> list[Path]:
+        """Its archives of these names, and those of the standstill, for the noise of positions."""
+        standstill = [name for name, _ in self.archives("standstill")]
+        return [self.folder.archives / name for name in (*names, *standstill)]
 
 
 def fit_all(
@@ -277,7 +263,7 @@ def fit_all(
             raise InputError(run.root, "holds no whole excitation", remedy="run the campaign first")
         inputs = digest([*archives, *run.archives("standstill")], {})
         place = fits / f"{run.key}.json"
-        tasks.append((place, inputs, fit, (run.reading("excitation"), inputs)))
+        tasks.append((place, inputs, fit, (run.paths([name for name, _ in archives]), inputs)))
     found = _all(FitRecord, tasks, "estimating (excitations)", reporter, workers)
     return {run.key: record for run, record in zip(runs, found, strict=True)}
 
@@ -291,22 +277,21 @@ def score_all(
     workers: Workers,
 ) -> dict[str, ScoreRecord]:
     """Predict the held-out motions of all runs, class by class; by class."""
-    tasks = []
     values = {name: estimate.tolist() for name, estimate in estimates.items()}
-    classes = [(run, name, names) for run in runs for name, names in classes_of(run).items()]
-    for run, name, names in classes:
-        sums = dict(run.archives("validation"))
-        archives = [(one, sums[one]) for one in names] + [*run.archives("standstill")]
-        inputs = digest(archives, {"estimates": values, "shown": [*shown]})
-        arguments = (run.reading("validation", names), inputs, values, list(shown))
-        place = fits / f"{run.key}-{name}.json"
-        tasks.append((place, inputs, score, arguments))
-    found = _all(ScoreRecord, tasks, "predicting (classes of motion)", reporter, workers)
-    by_class: dict[str, ScoreRecord] = {}
-    for (run, name, _), record in zip(classes, found, strict=True):
-        named = _named(record, run.key)
-        by_class[name] = _together(by_class[name], named) if name in by_class else named
-    return {name: by_class[name] for name in CLASSES if name in by_class}
+    names = {run.key: classes_of(run) for run in runs}
+    tasks, found = [], [one for one in CLASSES if any(one in own for own in names.values())]
+    for one in found:
+        members = [(run, names[run.key][one]) for run in runs if one in names[run.key]]
+        sums = [run.archives(kind) for run, _ in members for kind in ("validation", "standstill")]
+        inputs = digest(
+            [archive for some in sums for archive in some],
+            {"estimates": values, "shown": [*shown], "archives": [own for _, own in members]},
+        )
+        groups = [(run.key, run.paths(own)) for run, own in members]
+        place = fits / f"{'+'.join(key for key, _ in groups)}-{one}.json"
+        tasks.append((place, inputs, score, (groups, inputs, values, list(shown))))
+    title = "predicting (classes of motion)"
+    return dict(zip(found, _all(ScoreRecord, tasks, title, reporter, workers), strict=True))
 
 
 def _all(
@@ -393,26 +378,3 @@ def _rounds(fly: Fly) -> bool:
         case FlyDistance(distance):
             return distance > 0.0
     return False
-
-
-def _named(record: ScoreRecord, key: str) -> ScoreRecord:
-    """The same with archives named after their run, since every campaign counts from 0."""
-    forms, examples = (
-        [one.model_copy(update={"archive": f"{key}/{one.archive}"}) for one in some]
-        for some in (record.forms, record.examples)
-    )
-    return record.model_copy(update={"forms": forms, "examples": examples})
-
-
-def _together(first: ScoreRecord, second: ScoreRecord) -> ScoreRecord:
-    """Two records of the same estimates on different motions."""
-
-    def joined(name: str) -> Any:
-        some, more = getattr(first, name), getattr(second, name)
-        if isinstance(some, dict):
-            return {key: [*values, *more[key]] for key, values in some.items()}
-        return [*some, *more]
-
-    return first.model_copy(
-        update={name: joined(name) for name in ScoreRecord.model_fields if name != "inputs"}
-    )

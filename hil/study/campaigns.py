@@ -13,19 +13,18 @@ import numpy as np
 
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.cell import AngleFrame, Cell
+from hil.campaign.quick_design import plan_around
+from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.design import DesignSettings, problem_of
-from hil.design.advice import NoExcitationError, forbidden
+from hil.design.advice import NoExcitationError
 from hil.errors import ControllerFault, HilError
-from hil.motion_checks import MotionChecks, planned
+from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from hil.simulation import simulated_link, simulated_provenance
 from identification import IdentificationError
 from identification.excitation import (
     Excitation,
-    NoFeasibleMotionError,
-    random_validation_motions,
     sampled,
 )
 from planner import FourierSeries, PlanFile, PlannerError
@@ -52,26 +51,9 @@ from .settings import StudyFolder, StudySettings
 T = TypeVar("T")
 
 NO_EFFECTS, EFFECTS, ABLATION = "plain", "effects", "ablation"
-EFFECT_SETTINGS: Final = {
-    "ripple": ("torque_ripple", 0.0),
-    "drift": ("friction_drift", 0.0),
-    "elasticity": ("elasticity", []),
-    "delay": ("delay", 0.0),
-}
-"""Setting in a cell's `[simulation]` for each effect, and the value that switches it off."""
 LONGEST: Final = 6 * 3600.0
 """s that one campaign, or one reading of archives, may last."""
 
-# What the keys of an ablation's campaigns have in them.
-_KEY_PARTS: Final = {
-    "fly": "fly",
-    "n_via": "via",
-    "weight": "weight",
-    "noise": "noise",
-    "effects": "only",
-}
-_ONE_EFFECT_SHARE: Final = 5
-"""One effect alone is tried on this part of the held-out motions, on two at least."""
 # Streams of random numbers that no search and no other class draws from.
 _STOPS_SEED, _SINES_SEED, _TRIES = 1_000_003, 5, 400
 
@@ -116,14 +98,14 @@ class Plans:
             there are none.
         excitations: A, B, B with fly 0, and the paper's own sines.
         executions: by condition and key.
-        missing: what cannot be run, by ablation, in sentences.
+        missing: what cannot be run, in sentences.
     """
 
     sines: str
     printed: str | None
     excitations: dict[str, Excitation]
     executions: dict[str, dict[str, Execution]]
-    missing: dict[str, list[str]]
+    missing: list[str]
 
     @property
     def all(self) -> list[Execution]:
@@ -137,7 +119,7 @@ class Plans:
         Raises:
             StudyError: A, B or B with fly 0 itself was ended.
         """
-        missing = {name: list(sentences) for name, sentences in self.missing.items()}
+        missing = list(self.missing)
         executions = {condition: dict(some) for condition, some in self.executions.items()}
         for condition, some in self.executions.items():
             for key, one in some.items():
@@ -150,8 +132,7 @@ class Plans:
                         " another one"
                     )
                 del executions[condition][key]
-                name = next((n for n, part in _KEY_PARTS.items() if f"-{part}-" in key), "sines")
-                missing[name].append(f"{key} could not be run: {ended[one.root]}")
+                missing.append(f"{key} could not be run: {ended[one.root]}")
         return replace(self, executions=executions, missing=missing)
 
 
@@ -160,31 +141,11 @@ def noise_key(method: str, factor: float) -> str:
     return f"{method}-noise-{factor:g}"
 
 
-def effect_key(method: str, effect: str) -> str:
-    """Key of a method's campaign with one effect."""
-    return f"{method}-only-{effect}"
-
-
-def effects_of(cell: Cell) -> list[str]:
-    """Effects whose size in a cell is not zero."""
-    return [
-        name
-        for name, (setting, _) in EFFECT_SETTINGS.items()
-        if np.any(getattr(cell.simulation, setting))
-    ]
-
-
-def with_only(cell: Cell, effect: str) -> Cell:
-    """The cell with every effect but one switched off."""
-    off = {setting: value for name, (setting, value) in EFFECT_SETTINGS.items() if name != effect}
-    return _with_simulation(cell, off)
-
-
-def _with_simulation(cell: Cell, settings: Mapping[str, Any]) -> Cell:
-    """The cell with other settings of its simulation, in its text too."""
+def _with(cell: Cell, table: str, **values: Any) -> Cell:
+    """The cell with other values in a table of its file."""
     text = cell.text
-    for name, value in settings.items():
-        text = replaced_value(text, "simulation", name, str(value))
+    for name, value in values.items():
+        text = replaced_value(text, table, name, str(value))
     return Cell.from_texts(text, cell.urdf, cell.path)
 
 
@@ -207,8 +168,10 @@ def plan_study(
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
     held_out = {
         A: sine_motions(cell, found[sines].search.settings, checks, count=count, seed=seed),
-        B: via_point_motions(cell, checks, fly=fly, count=count, seed=seed),
-        B0: via_point_motions(cell, checks, fly=0.0, count=count, seed=seed),
+        B: via_point_motions(cell, excitations[B], checks, fly=fly, count=count, seed=seed),
+        B0: via_point_motions(
+            cell, excitations[B0], checks, fly=0.0, count=count, seed=seed + _STOPS_SEED
+        ),
     }
     main = cell.with_campaign(
         repetitions=settings.repetitions, validation_runs=count, simulation_seed=seed
@@ -232,37 +195,30 @@ def plan_study(
     for key, one in varied.items():
         add(ABLATION, key, few, one)
     for factor in settings.noise:
-        noise = factor * cell.simulation.current_noise
-        noisy = _with_simulation(few, {"current_noise": noise})
+        noisy = _with(few, "simulation", current_noise=factor * cell.simulation.current_noise)
         for key in (A, B):
             add(ABLATION, noise_key(key, factor), noisy, excitations[key])
-    for effect in effects_of(few) if settings.single_effects else ():
-        arm = with_only(few, effect)
-        seen = held_out[B][: max(2, count // _ONE_EFFECT_SHARE)]
-        add(ABLATION, effect_key(A, effect), arm, excitations[A], effects=True)
-        add(ABLATION, effect_key(B, effect), arm, excitations[B], seen, effects=True)
     return Plans(sines, printed, excitations, executions, missing)
 
 
 def _varied(
     cell: Cell, settings: StudySettings, found: Mapping[str, Found], checks: MotionChecks
-) -> tuple[dict[str, Excitation], dict[str, list[str]]]:
+) -> tuple[dict[str, Excitation], list[str]]:
     """Excitations of the ablations by key, B itself among them; and what there is none of."""
     varied = {B: _of(found, B)}
-    missing: dict[str, list[str]] = {name: [] for name in (*_KEY_PARTS, "sines")}
+    missing: list[str] = []
     for fly in settings.fly:
         if fly_key(fly) not in varied:
             try:
                 varied[fly_key(fly)] = with_fly(cell, varied[B], fly, checks)
             except NoExcitationError as error:
-                missing["fly"].append(f"B's via points cannot be run so: {error}.")
-    wanted = [("n_via", via_key(k)) for k in settings.n_via]
-    wanted += [("weight", weight_key(w)) for w in settings.coupling_weight]
-    wanted += [("sines", key) for key in SINES if key in found]
-    for ablation, key in wanted:
+                missing.append(f"B's via points cannot be run so: {error}.")
+    wanted = [via_key(k) for k in settings.n_via]
+    wanted += [weight_key(w) for w in settings.coupling_weight]
+    for key in wanted + [key for key in SINES if key in found]:
         one = found[key].excitation
         if one is None:
-            missing[ablation].append(f"The search of {found[key].search.words} found no motion.")
+            missing.append(f"The search of {found[key].search.words} found no motion.")
         else:
             varied[key] = one
     return varied, missing
@@ -287,35 +243,15 @@ def _of(found: Mapping[str, Found], key: str) -> Excitation:
 
 
 def via_point_motions(
-    cell: Cell, checks: MotionChecks, *, fly: float, count: int, seed: int
+    cell: Cell, excitation: Excitation, checks: MotionChecks, *, fly: float, count: int, seed: int
 ) -> tuple[PlannedMotion, ...]:
     """Wide random motions through as many via points as the cell's excitation has.
 
     Raises:
         NoExcitationError: none satisfies the constraints.
     """
-    try:
-        found = random_validation_motions(
-            cell.joint_limits,
-            home=cell.home,
-            seed=seed if fly > 0.0 else seed + _STOPS_SEED,
-            count=count,
-            n_via=cell.campaign.n_via,
-            fly=fly,
-            checker=checks.checker,
-            currents=planned(checks.currents),
-        )
-    except NoFeasibleMotionError as error:
-        why = forbidden(error, AngleFrame.of(cell))
-        raise NoExcitationError(f"no motion to predict: {why}") from error
-    limits = cell.joint_limits
-    return tuple(
-        PlannedMotion(
-            one.trajectory,
-            PlanFile(cell.joint_names, one.via_points[0], one.moves, limits=limits),
-        )
-        for one in found
-    )
+    own = _with(cell, "campaign", fly=fly, seed=seed, validation_runs=count)
+    return plan_around(own, excitation, checks).validation
 
 
 def sine_motions(

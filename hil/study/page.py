@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hil.files import write_together
 from hil.progress import Reporter
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, log_ticks, place, ruled
+from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
 from hil.report.figures.correlation import matrix_panel
 from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
 from hil.report.figures.svg import Panel, drawing, to_panel
@@ -23,22 +21,14 @@ from hil.report.figures.traces import Plot, Trace, traces_text
 from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord
-from .results import AblationBand, AblationResult, ComparisonResult, ConditionResult, StudyResults
+from .results import ConditionResult, StudyResults
 
 Array = NDArray[np.float64]
-Points = Sequence[tuple[float, float | None]]
 
 COLOURS: Final = (FIRST, SECOND, ROUTES[3], ROUTES[0])
 MARKERS: Final = ("o", "D", "^", "s")
-CLASS_STYLES: Final = {
-    "fly-by": (SECOND, "D"),
-    "stop-to-stop": (ROUTES[3], "^"),
-    "sinusoid": (FIRST, "o"),
-}
 _LEGEND: Final = tuple(zip(("--first", "--second", "--route-3", "--route-0"), "●◆▲■", strict=True))
 _WIDTH, _LEFT, _RIGHT = 370.0, 46.0, 10.0
-_BESIDE: Final = 4  # names that have room in one line
-_DECADES: Final = 20.0  # between smallest and largest: beyond that a scale from zero hides most
 
 
 def write_outcome(root: Path, results: StudyResults, reporter: Reporter) -> None:
@@ -65,10 +55,8 @@ def study_page(results: StudyResults) -> bytes:
         ),
         trajectories=[_trajectory(first, j, name) for j, name in enumerate(joints)],
         correlations=_correlations(results, first),
-        ratios=_ratio_panels(results.conditions),
         boxes={one.key: _error_panels(one, joints) for one in results.conditions},
         examples={one.key: _example_panels(one, joints) for one in results.conditions},
-        ablation_panels={one.key: _ablation_panels(one, first.labels) for one in results.ablations},
     )
     return page_bytes(text)
 
@@ -211,158 +199,3 @@ def _example(condition: ConditionResult, example: ExampleRecord, j: int, name: s
         alt = f"{name}: measured and predicted torque over {time[-1]:.1f} s; {note}."
         key, text = f"e{condition.key}{j}", traces_text(time, plots)
         return to_panel(figure, key=key, title=name, note=note, alt=alt, traces=text)
-
-
-def _ratio_panels(conditions: Sequence[ConditionResult]) -> list[Panel]:
-    """Ratio of errors with its interval, every pair of estimates on every class."""
-    every = [one for condition in conditions for one in condition.comparisons]
-    ends = [end for one in every for end in (one.ratio, one.low, one.high) if end is not None]
-    low, high = min(0.9, *ends, 0.9) / 1.03, max(1.1, *ends, 1.1) * 1.03
-    return [_ratios(condition, (low, high)) for condition in conditions] if every else []
-
-
-def _ratios(condition: ConditionResult, limits: tuple[float, float]) -> Panel:
-    rows, labels = condition.comparisons, condition.labels
-    names = [f"{one.motion_class}: {labels[one.second]} over {labels[one.first]}" for one in rows]
-    height = 17.0 * len(rows)
-    with drawing():
-        figure = blank(520.0, 10.0 + height + 42.0)
-        axes = place(figure, 220.0, 8.0, 286.0, height)
-        axes.set_xscale("log")
-        axes.axvline(1.0, color=MUTED, linewidth=1.0)
-        for row, one in enumerate(rows):
-            _ratio(axes, row, one)
-        axes.set_xlim(*limits)
-        axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set_yticks(range(len(rows)), names)
-        axes.tick_params(axis="y", length=0.0)
-        axes.spines["left"].set_visible(False)
-        log_ticks(axes.xaxis, MaxNLocator(6, steps=[1, 2, 5, 10]))
-        axes.grid(True, axis="x", color=BAND, linewidth=0.8)
-        footed(axes, "ratio of errors, geometric mean over the motions")
-        shown = [f"{name} {one.ratio:.3f}" for name, one in zip(names, rows, strict=True)]
-        alt = f"{condition.words}: {'; '.join(shown)}."
-        return to_panel(figure, key=f"r{condition.key}", title=condition.words, note="", alt=alt)
-
-
-def _ratio(axes: Axes, row: int, one: ComparisonResult) -> None:
-    dark = INK if one.differs else MUTED
-    if one.low is not None and one.high is not None:
-        axes.plot([one.low, one.high], [row, row], color=dark, linewidth=1.6)
-    marker, face = ("o", INK) if one.differs else ("s", BAND)
-    axes.scatter(
-        [one.ratio], [row], s=38.0, marker=marker, facecolor=face, edgecolor=dark, zorder=3
-    )
-
-
-def _ablation_panels(ablation: AblationResult, labels: Mapping[str, str]) -> list[Panel]:
-    """Criteria, distance to the planted values, and prediction errors over one setting."""
-    methods = list(dict.fromkeys(point.method for point in ablation.points))
-    of = {method: [p for p in ablation.points if p.method == method] for method in methods}
-    styles = {method: (INK, MARKERS[list(labels).index(method) % 4]) for method in methods}
-    panels = []
-    figures = {"parameter_error": "distance to planted values, B = 1"}
-    if len(ablation.points) > 1 and ablation.key not in ("repetitions", "noise", "effects"):
-        figures = {"coupling_index": "coupling index I_c", "log10_det": "log det"} | figures
-    for name, title in figures.items():
-        series: dict[str, Points] = {
-            method: [(p.value, getattr(p, name)) for p in points] for method, points in of.items()
-        }
-        if any(y is not None for points in series.values() for _, y in points):
-            bands = {method: _bands(ablation, method, name) for method in methods}
-            panels.append(_lines(ablation, title, series, styles, bands, key=name))
-    for method, points in of.items():
-        # The noise that every estimate leaves would cover what differs, where it can be separated.
-        quantity = "own" if all(point.own for point in points) else "error"
-        errors = [(point.value, getattr(point, quantity)) for point in points]
-        series = {
-            name: [(value, 100.0 * some[name]) for value, some in errors]
-            for name in CLASS_STYLES
-            if all(name in some for _, some in errors)
-        }
-        bands = {name: _bands(ablation, method, quantity, name, 100.0) for name in series}
-        title = f"{'own' if quantity == 'own' else 'torque'} error [%]"
-        title = title if len(methods) == 1 else f"{labels[method]}: {title}"
-        panels.append(_lines(ablation, title, series, CLASS_STYLES, bands, key=f"error-{method}"))
-    return panels
-
-
-def _bands(
-    ablation: AblationResult,
-    method: str,
-    quantity: str,
-    motion_class: str | None = None,
-    scale: float = 1.0,
-) -> list[AblationBand]:
-    wanted = (method, quantity, motion_class)
-    return [
-        band.model_copy(update={"low": scale * band.low, "high": scale * band.high})
-        for band in ablation.bands
-        if (band.method, band.quantity, band.motion_class) == wanted
-    ]
-
-
-def _lines(
-    ablation: AblationResult,
-    title: str,
-    series: Mapping[str, Points],
-    styles: Mapping[str, tuple[str, str]],
-    bands: Mapping[str, Sequence[AblationBand]],
-    *,
-    key: str,
-) -> Panel:
-    """One panel: each series by its name, and behind its points the range of chance."""
-    labelled = any(point.label for point in ablation.points)
-    names = {point.value: point.name for point in sorted(ablation.points, key=lambda p: p.value)}
-    # Settings are few and unevenly spaced: each has a place of its own.
-    at = {value: k for k, value in enumerate(names)}
-    known = {
-        name: [(at[x], y) for x, y in points if y is not None and math.isfinite(y)]
-        for name, points in series.items()
-    }
-    known = {name: points for name, points in known.items() if points}
-    with drawing():
-        figure = blank(270.0, 196.0)
-        axes = place(figure, 46.0, 22.0, 212.0, 130.0)
-        for value in {point.value for point in ablation.points if point.base}:
-            axes.axvspan(at[value] - 0.3, at[value] + 0.3, color=BAND, linewidth=0.0, zorder=0.5)
-        for name, points in known.items():
-            colour, marker = styles[name]
-            axes.plot(
-                *zip(*points, strict=True),
-                color=colour,
-                marker=marker,
-                markersize=5.0,
-                linewidth=0.0 if labelled else 1.2,  # names have nothing in between
-            )
-            for band in bands[name]:
-                alike = (band.method, band.repetitions)
-                some = {at[p.value] for p in ablation.points if (p.method, p.repetitions) == alike}
-                axes.bar(
-                    sorted(some),
-                    band.high - band.low,
-                    bottom=band.low,
-                    width=0.42,
-                    color=colour,
-                    alpha=0.22,
-                    linewidth=0.0,
-                    zorder=1,
-                )
-        axes.set_xlim(-0.4, len(at) - 0.6)
-        ruled(axes, "y", y_ticks=4)
-        lower = labelled and len(at) > _BESIDE  # every second name a line lower
-        texts = [name.replace(", ", "\n") for name in names.values()]
-        axes.set_xticks(range(len(at)), ["\n" * (lower and k % 2) + t for k, t in enumerate(texts)])
-        shown = [y for points in known.values() for _, y in points if y > 0.0]
-        shown += [band.high for some in bands.values() for band in some]
-        if shown and max(shown) > _DECADES * min(shown):
-            axes.set_yscale("log")
-            log_ticks(axes.yaxis, axes.yaxis.get_major_locator())
-        elif shown and key != "log10_det":  # a logarithm has no zero to begin at
-            axes.set_ylim(0.0, 1.12 * max(shown))
-        headed(axes, title)
-        if not labelled:
-            footed(axes, ablation.variable)
-        ends = [f"{name} {some[0][1]:.3g} to {some[-1][1]:.3g}" for name, some in known.items()]
-        alt = f"{ablation.title}, {title}: {'; '.join(ends)}."
-        return to_panel(figure, key=f"a{ablation.key}-{key}", title="", note="", alt=alt)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,7 +37,6 @@ from .settings import StudyFolder
 from .tables import (
     Condition,
     condition_result,
-    cut_estimate,
     estimates_of,
     parameters_of,
     printed_rows,
@@ -67,19 +66,10 @@ class Recorded:
         return cell_of(self.archive)
 
     @property
-    def simulated(self) -> bool:
-        """Whether no robot moved."""
-        return self.archive.header.only_simulated
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Unmodelled effects of its simulated arm."""
-        return self.archive.header.effects
-
-    @property
     def planted(self) -> Array | None:
         """Parameters (p,) of its simulated arm; None of a real one."""
-        return planted_in(self.cell, self.archive.header) if self.simulated else None
+        header = self.archive.header
+        return planted_in(self.cell, header) if header.only_simulated else None
 
     @cached_property
     def excitation(self) -> Excitation | None:
@@ -101,7 +91,7 @@ class Recorded:
     def arm(self) -> str:
         """Digest of the arm: another drive train is another arm, and so is a simulated one."""
         drive_train = self.archive.attachments.get("drive_train.json")
-        return arm_digest(self.cell, drive_train, simulated=self.simulated)
+        return arm_digest(self.cell, drive_train, simulated=self.archive.header.only_simulated)
 
     def row(self, record: FitRecord) -> MotionRow:
         """Row of Table 1."""
@@ -137,48 +127,47 @@ def study_campaigns(
     """
     begin = time.perf_counter()
     folder, recorded = StudyFolder(root), recorded_runs(campaigns)
+    header = recorded[0].archive.header
     runs, first = [one.run for one in recorded], recorded[0]
     keys, labels, cell = [run.key for run in runs], {run.key: run.label for run in runs}, first.cell
-    truth = first.planted
-    if truth is None or not all(_equal(one.planted, truth) for one in recorded):
-        truth = None
+    planted = [values for one in recorded if (values := one.planted) is not None]
+    same = len(planted) == len(recorded) and all(np.array_equal(p, planted[0]) for p in planted)
+    truth = planted[0] if same else None
     with folder.locked(), workers_of(workers) as processes:
         fits = fit_all(runs, folder.fits, reporter, processes)
-        estimates = estimates_of(fits) | cut_estimate(fits)
+        estimates = estimates_of(fits)
 
         def scored(some: Sequence[Run]) -> dict[str, ScoreRecord]:
             return score_all(some, folder.fits, estimates, keys[:2], reporter, processes)
 
-        scores, parameters = scored(runs), parameters_of(cell, truth)
-        conditions = {
-            Condition(
-                f"recorded-{one.key}", f"on the motions of {one.label}", first.effects
-            ): scored([one])
+        parameters, effects = parameters_of(cell, truth), header.effects
+        conditions = [
+            (
+                Condition(f"recorded-{one.key}", f"on the motions of {one.label}", effects),
+                scored([one]),
+            )
             for one in homes(runs)
-        } or {Condition("recorded", "as recorded", first.effects): scores}
+        ] or [(Condition("recorded", "as recorded", effects), scored(runs))]
+        scores = [some for _, some in conditions]
         results = study_results(
             root,
             cell,
             parameters,
-            simulated=first.simulated,
+            simulated=header.only_simulated,
             quick=False,
             settings=None,
             searches=[],
             table1=[one.row(fits[one.run.key]) for one in recorded] + printed_rows(cell),
             conditions=[
                 condition_result(one, labels, fits, some, parameters, cell.joint_names)
-                for one, some in conditions.items()
+                for one, some in conditions
             ],
             ablations=[repetition_ablation(Evidence({}, fits, scores, truth), SUBSETS, keys)],
-            missing=_missing(recorded, truth, list(scores)),
+            missing=_missing(recorded, truth, {name for some in scores for name in some}),
             times={"estimates and predictions": round(time.perf_counter() - begin, 1)},
         )
         write_outcome(root, results, reporter)
     return results
-
-
-def _equal(values: Array | None, others: Array) -> bool:
-    return values is not None and np.array_equal(values, others)
 
 
 def recorded_runs(campaigns: Sequence[Path]) -> list[Recorded]:
@@ -226,8 +215,9 @@ def _require_alike(one: Recorded, first: Recorded) -> None:
     if one.arm != first.arm:
         problem = f"is of another arm than {first.run.root}: {apart(one.cell, first.cell)}"
         raise InputError(one.run.root, problem, remedy="name campaigns of one arm")
-    if one.effects != first.effects:
-        own, other = ("; ".join(each.effects) or "none" for each in (one, first))
+    effects = [each.archive.header.effects for each in (one, first)]
+    if effects[0] != effects[1]:
+        own, other = ("; ".join(some) or "none" for some in effects)
         raise InputError(
             one.run.root,
             f"was simulated with other unmodelled effects ({own}) than {first.run.root}"
@@ -252,7 +242,7 @@ def homes(runs: Sequence[Run]) -> list[Run]:
 
 
 def _missing(
-    recorded: Sequence[Recorded], truth: Array | None, classes: Sequence[str]
+    recorded: Sequence[Recorded], truth: Array | None, classes: Collection[str]
 ) -> list[str]:
     """What the recordings do not allow, in sentences."""
     absent = [name for name in CLASSES if name not in classes]

@@ -7,7 +7,6 @@ one matrix for each motion gives the error of every estimate, without its archiv
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from identification.validation.prediction import FIGURE_BANDWIDTH
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Counted up when the same archives come to give other numbers, or a record another form."""
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
@@ -78,8 +77,6 @@ class ClassErrors(Frozen):
 
     durations: list[float]
     overall: dict[str, list[float]]
-    unfiltered: dict[str, list[float]]
-    """The same without the low-pass."""
     own: dict[str, list[float]]
     """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
     mean_abs: dict[str, list[list[float]]]
@@ -105,9 +102,9 @@ class MotionForm(Frozen):
     """Sum of the measured torque², per joint."""
     columns: list[list[int]]
     """Parameters that each joint's torque depends on."""
-    slow: list[str]
-    """Of the low-passed [Phi | tau] of each joint, in these columns: packed lower triangles."""
-    whole: str
+    slow: list[list[list[float]]]
+    """Of the low-passed [Phi | tau] of each joint, in these columns and the last."""
+    whole: list[list[float]]
     """Of Phi as it is, all joints together (p, p)."""
 
 
@@ -155,13 +152,13 @@ def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
         table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
         whole[np.ix_(used, used)] += table[:, :-1].T @ table[:, :-1]
         passed = low_passed(run, table)[usable]
-        slow.append(packed(passed.T @ passed))
+        slow.append((passed.T @ passed).tolist())
     return MotionForm(
         archive=archive,
         torque_squared=(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0).tolist(),
         columns=[[int(k) for k in used] for used in columns],
         slow=slow,
-        whole=packed(whole),
+        whole=whole.tolist(),
     )
 
 
@@ -193,14 +190,14 @@ class ClassForms:
 
     @classmethod
     def of(cls, forms: Sequence[MotionForm]) -> ClassForms:
-        """Unpack the forms of the motions."""
-        whole = np.array([unpacked(one.whole) for one in forms])
+        """Arrays of the forms of the motions."""
+        whole = np.array([one.whole for one in forms])
         size = whole.shape[1] + 1
         slow = np.zeros((len(forms), len(forms[0].columns), size, size))
         for m, one in enumerate(forms):
-            for j, (used, text) in enumerate(zip(one.columns, one.slow, strict=True)):
+            for j, (used, gram) in enumerate(zip(one.columns, one.slow, strict=True)):
                 index = [*used, size - 1]
-                slow[m, j][np.ix_(index, index)] = unpacked(text)
+                slow[m, j][np.ix_(index, index)] = gram
         return cls(slow, whole, np.array([one.torque_squared for one in forms]))
 
     def torque_kernels(self, values: Array, joint: int | None = None) -> Array:
@@ -229,18 +226,3 @@ class ClassForms:
     def _relative(self, kernels: Array) -> Array:
         squared = np.maximum(kernels[:, 0, 0], 0.0)
         return np.asarray(np.sqrt(squared / self.torque_squared.sum(axis=1)))
-
-
-def packed(gram: Array) -> str:
-    """The lower triangle of a symmetric matrix as text."""
-    triangle = gram[np.tril_indices(len(gram))].astype("<f8")
-    return base64.b64encode(triangle.tobytes()).decode("ascii")
-
-
-def unpacked(text: str) -> Array:
-    """The symmetric matrix that `packed` made a text of."""
-    triangle = np.frombuffer(base64.b64decode(text), dtype="<f8")
-    size = round((np.sqrt(8.0 * len(triangle) + 1.0) - 1.0) / 2.0)
-    gram = np.zeros((size, size))
-    gram[np.tril_indices(size)] = triangle
-    return gram + np.tril(gram, -1).T

@@ -93,8 +93,6 @@ class CrossCell(Frozen):
     lower: float
     upper: float
     """Quartiles over the motions."""
-    unfiltered_median: float
-    """With the noise of the currents."""
     all_rows_median: float
     """Over the whole motion: rows at rest, near ends and at reversals are included."""
     own_median: float | None
@@ -114,8 +112,6 @@ class ComparisonResult(Frozen):
     first: str
     second: str
     motions: int
-    setting: str = ""
-    """What was varied, in an ablation."""
     repetitions: list[int]
     """Of `first` and `second`."""
     ratio: float
@@ -263,10 +259,9 @@ class AblationResult(Frozen):
     words: str
     points: list[AblationPoint]
     comparisons: list[ComparisonResult] = Field(default_factory=list)
-    """With B, where the settings are another method's, or setting by setting."""
+    """With B, where the settings are another method's."""
     bands: list[AblationBand] = Field(default_factory=list)
     """Of as many repetitions as the points have; none where the study has no more itself."""
-    missing: list[str]
 
 
 class Paragraph(Frozen):
@@ -301,11 +296,7 @@ class StudyResults(Frozen):
     missing: list[str]
     """What of the paper's study is not in this one, and why."""
     times: dict[str, float]
-    """Wall time [s] of each stage, over all sessions."""
-    processor_times: dict[str, float] = Field(default_factory=dict)
-    """Processor time [s], this process and its children, likewise."""
-    times_whole: bool = True
-    """False where a session was killed: the times are then at least so long."""
+    """Wall time [s] of each stage in the last session."""
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -18,7 +18,7 @@ from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from sim_fixtures.ns16 import CELL_PATH
 
-from .ablations import EffectSetting, Evidence, ablations, effect_ablation
+from .ablations import Evidence, ablations
 from .analysis import Run, fit_all, score_all
 from .campaigns import (
     ABLATION,
@@ -26,22 +26,19 @@ from .campaigns import (
     NO_EFFECTS,
     Plans,
     Workers,
-    effect_key,
-    effects_of,
     execute_all,
     plan_study,
     workers_of,
 )
 from .page import write_outcome
-from .records import PLANTED, ClassForms, FitRecord, ScoreRecord
+from .records import PLANTED, FitRecord, ScoreRecord
 from .results import ConditionResult, MotionRow, StudyResults
 from .searches import AP, B0, LABELS, A, B, Found, run_searches, searches
 from .sentences import study_results
-from .settings import Stages, StudyFolder, StudySettings
+from .settings import StudyFolder, StudySettings, stage
 from .tables import (
     Condition,
     condition_result,
-    cut_estimate,
     estimates_of,
     parameters_of,
     printed_rows,
@@ -90,26 +87,19 @@ def run_study(
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
     with folder.locked():
         folder.begin(settings)
-        stages = Stages(root)
+        times: dict[str, float] = {}
         wanted = searches(settings, len(cell.joint_names))
-        with stages.stage("searches"):
+        with stage("searches", times):
             found = run_searches(folder, cell, wanted, reporter, workers=workers)
-        with stages.stage("plans"):
+        with stage("plans", times):
             plans = plan_study(folder, cell, settings, found)
-        with stages.stage("campaigns"), workers_of(workers) as processes:
+        with stage("campaigns", times), workers_of(workers) as processes:
             plans = plans.without(execute_all(plans.all, reporter, processes))
-        with stages.stage("estimates and predictions"), workers_of(workers) as processes:
+        with stage("estimates and predictions", times), workers_of(workers) as processes:
             study = _Analysis(folder, cell, settings, plans, found, reporter, processes)
             results = study.results()
-        times = stages.times
-        spent = {
-            "times": times.wall,
-            "processor_times": times.processor,
-            "times_whole": times.whole,
-        }
-        results = results.model_copy(update=spent)
-        with stages.stage("page"):
-            write_outcome(root, results, reporter)
+        results = results.model_copy(update={"times": times})
+        write_outcome(root, results, reporter)
     return results
 
 
@@ -140,23 +130,10 @@ class _Analysis:
         evidence = Evidence(
             self.fits[ABLATION],
             self.fits[NO_EFFECTS],
-            self.scores[NO_EFFECTS],
+            [self.scores[NO_EFFECTS]],
             truth,
-            self.plans.missing,
             self.plans.sines,
         )
-        varied = ablations(settings, evidence)
-        missing = []
-        if settings.single_effects:
-            few = settings.ablation_repetitions
-            varied.append(effect_ablation(evidence, self._effect_settings(), few))
-        elif settings.effects:
-            missing = [
-                "The unmodelled effects were not tried one at a time: each setting is run too few"
-                f" times ({settings.ablation_repetitions}) for a conclusion."
-            ]
-        else:
-            missing = ["The unmodelled effects were not run."]
         sizes = preset("b").search
         return study_results(
             self.folder.root,
@@ -171,24 +148,21 @@ class _Analysis:
             ],
             table1=self._table1() + printed_rows(cell),
             conditions=conditions,
-            ablations=varied,
-            missing=missing,
+            ablations=ablations(settings, evidence),
+            missing=self.plans.missing
+            + ([] if settings.effects else ["The unmodelled effects were not run."]),
             times={},
         )
-
-    def _scored(
-        self, runs: list[Run], place: str, estimates: Mapping[str, Array], shown: tuple[str, ...]
-    ) -> dict[str, ScoreRecord]:
-        fits = self.folder.fits / place
-        return score_all(runs, fits, estimates, shown, self.reporter, self.workers)
 
     def _condition(self, condition: str, truth: Array) -> ConditionResult:
         executions, fits = self.plans.executions[condition], self.fits[condition]
         labels = {key: label for key, label in LABELS.items() if key in executions}
         methods = {key: fits[key] for key in labels}
-        estimates = estimates_of(methods) | {PLANTED: truth} | cut_estimate(methods)
+        estimates = estimates_of(methods) | {PLANTED: truth}
         runs = [Run(key, label, executions[key].root) for key, label in labels.items()]
-        self.scores[condition] = scores = self._scored(runs, condition, estimates, (A, B))
+        fits_folder = self.folder.fits / condition
+        scores = score_all(runs, fits_folder, estimates, (A, B), self.reporter, self.workers)
+        self.scores[condition] = scores
         on = condition == EFFECTS
         effects = tuple(json.loads(simulated_provenance(self.cell, on)["effects"]))
         return condition_result(
@@ -200,25 +174,6 @@ class _Analysis:
             self.cell.joint_names,
             [PLANTED],
         )
-
-    def _effect_settings(self) -> list[EffectSetting]:
-        """What A and B gave without effects, with each by itself, and with all."""
-        found, ablation = [], self.fits[ABLATION]
-        for effect in effects_of(self.cell):
-            keys = {method: effect_key(method, effect) for method in (A, B)}
-            if not ablation.keys() >= set(keys.values()):
-                continue  # the arm did not bear one of them, which the page says
-            fits = {method: ablation[key] for method, key in keys.items()}
-            run = Run(keys[B], keys[B], self.plans.executions[ABLATION][keys[B]].root)
-            scored = self._scored([run], ABLATION, estimates_of(fits), ())
-            found.append(EffectSetting(effect, fits, ClassForms.of(scored["fly-by"].forms)))
-        none, every = (
-            EffectSetting(
-                label, self.fits[one], ClassForms.of(self.scores[one]["fly-by"].forms), base=True
-            )
-            for label, one in (("none", NO_EFFECTS), ("all", EFFECTS))
-        )
-        return [none, *found, every]
 
     def _table1(self) -> list[MotionRow]:
         """Of the excitations that the arm bore."""

@@ -1,25 +1,23 @@
-"""What a study is asked for, the folder it lies in, and how long its stages took."""
+"""What a study is asked for, and the folder it lies in."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 from pydantic import Field
 
-from hil.errors import InputError, OutputError
+from hil.errors import InputError
 from hil.files import exclusive_folder, write_or_tell
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 
 M = TypeVar("M", bound=Frozen)
 Count = Annotated[int, Field(strict=True, ge=1)]
-Seconds = Annotated[float, Field(ge=0.0, le=1e9)]
 
 
 class Effort(Frozen):
@@ -50,11 +48,6 @@ class StudySettings(Frozen):
     subsets: tuple[int, ...] = Field(description="numbers of repetitions that are fitted")
     noise: tuple[float, ...] = Field(description="multiples of the cell's current noise")
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
-
-    @property
-    def single_effects(self) -> bool:
-        """Whether the effects are tried one by one: fewer than 3 repetitions show nothing."""
-        return self.effects and self.ablation_repetitions >= 3
 
 
 FULL: Final = StudySettings(
@@ -170,59 +163,9 @@ class StudyFolder:
                 )
 
 
-class Times(Frozen):
-    """Duration [s] of each stage, over all sessions."""
-
-    wall: dict[str, Seconds] = Field(default_factory=dict)
-    processor: dict[str, Seconds] = Field(default_factory=dict)
-    """Of this process and its children that ended within the stage."""
-    whole: bool = True
-    """False once a session was killed within a stage, whose time is then missing."""
-
-
-class Stages:
-    """Adds up in `times.json` what the stages take."""
-
-    def __init__(self, root: Path) -> None:
-        """Continue from the file in the folder, if there is one."""
-        self._path, self.times = root / "times.json", Times()
-        with suppress(OSError, ValueError):
-            self.times = Times.model_validate_json(text_of(self._path))
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Count the time until this is left.
-
-        Raises:
-            OutputError: the time cannot be written; an error of the stage itself goes first.
-        """
-        before, wall, processor = self.times, time.perf_counter(), _processor()
-        with suppress(OutputError):  # the end of the stage tries again
-            self._write(before.model_copy(update={"whole": False}))  # what a kill leaves
-
-        def end() -> None:
-            added = time.perf_counter() - wall, _processor() - processor
-            self.times = Times(
-                wall=before.wall | {name: round(before.wall.get(name, 0.0) + added[0], 1)},
-                processor=before.processor
-                | {name: round(before.processor.get(name, 0.0) + added[1], 1)},
-                whole=before.whole,
-            )
-            self._write(self.times)
-
-        try:
-            yield
-        except BaseException:
-            with suppress(OutputError):
-                end()
-            raise
-        end()
-
-    def _write(self, times: Times) -> None:
-        write_or_tell(self._path, times.to_json())
-
-
-def _processor() -> float:
-    """Seconds of processor of this process and of its children that have ended."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+@contextmanager
+def stage(name: str, times: dict[str, float]) -> Iterator[None]:
+    """Note in `times` how long a stage takes [s]."""
+    begin = time.perf_counter()
+    yield
+    times[name] = round(time.perf_counter() - begin, 1)

@@ -6,11 +6,11 @@ estimates, which is the same on all of these motions: other repetitions would ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from .records import ClassForms, FitRecord
 from .results import ALPHA, SMALL, AblationBand, ComparisonResult, EqualDataResult, Verdict
 
 Array = NDArray[np.float64]
-Kernels = Callable[[Array], Array]
 
 DRAWS: Final = 4000
 FEWEST: Final = 3
@@ -30,14 +29,6 @@ asked."""
 _CHUNK: Final = 500
 _SUBSETS: Final = 400
 _SEED, _BAND_SEED = 20140901, 20140902
-
-
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """An estimate by its key, with the estimates (r, p) of the repetitions it is the mean of."""
-
-    key: str
-    values: Array
 
 
 @dataclass(frozen=True)
@@ -86,42 +77,30 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
     return "slightly worse" if ratio - 1.0 < SMALL else "worse"
 
 
-def torque_kernels(forms: ClassForms, joint: int | None = None) -> Kernels:
-    """Inner products of the low-passed torque errors, as :func:`compared_on` needs them."""
-    return lambda values: forms.torque_kernels(values, joint)
-
-
-def own_kernels(forms: ClassForms, truth: Array) -> Kernels:
-    """The same of the errors of the estimates themselves."""
-    return lambda values: forms.own_kernels(values, truth)
-
-
 def compared_on(
     motion_class: str,
-    first: Estimated,
-    second: Estimated,
-    kernels: Kernels,
+    keys: tuple[str, str],
+    inner: tuple[Array, Array],
     *,
     joint: str | None = None,
     drifts: bool,
 ) -> ComparisonResult:
-    """Errors with `second` over errors with `first`, motion by motion; a table of one.
+    """Errors with the second estimate over errors with the first, motion by motion; a table of one.
 
-    `kernels` are the inner products (m, r, r) of the errors that r estimates leave, of one joint or
-    of all together; with `drifts`, repetitions may resemble their neighbours.
+    `inner` are the inner products (m, r, r) of the errors that the r repetitions of each estimate
+    leave, of one joint or of all; with `drifts`, repetitions may resemble their neighbours.
     """
-    inner = [kernels(one.values) for one in (first, second)]
     # The sum of a mean's squared errors: weights 1 / r on either side.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
     ratio, wins, p_value = compare(before, after)
-    known = spread(inner[0], inner[1], drifts=drifts, seed=_SEED)
+    known = spread(*inner, drifts=drifts, seed=_SEED)
     one = ComparisonResult(
         motion_class=motion_class,
         joint=joint,
-        first=first.key,
-        second=second.key,
+        first=keys[0],
+        second=keys[1],
         motions=len(before),
-        repetitions=[len(first.values), len(second.values)],
+        repetitions=[one.shape[1] for one in inner],
         ratio=ratio,
         error=None if known is None else known.error,
         freedom=None if known is None else known.freedom,
@@ -236,12 +215,12 @@ def _logs(kernels: Array, weights: Array) -> Array:
     return np.asarray(0.5 * np.log(np.maximum(found, np.finfo(float).tiny)))
 
 
-def equal_data(fits: Mapping[str, FitRecord], keys: Sequence[str]) -> EqualDataResult | None:
+def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
     """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
-    if len(keys) < 2:
+    if len(fits) < 2:
         return None
-    whole = {key: fits[key].duration * len(fits[key].values) for key in keys[:2]}
-    other, cut = sorted(keys[:2], key=lambda key: whole[key])
+    whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
+    other, cut = sorted(whole, key=lambda key: whole[key])
     count = max(1, round(whole[other] / fits[cut].duration))
     if count >= len(fits[cut].values):
         return None
@@ -279,32 +258,31 @@ def bands_of(
     if not 1 <= size < len(values):
         return []
     weights = _subsets(len(values), size)
-    figures: list[tuple[str, str | None, Array]] = []
+    found: list[AblationBand] = []
+
+    def add(
+        quantity: Literal["error", "own", "parameter_error"], name: str | None, some: Array
+    ) -> None:
+        # Figures that exist: of few subsets the smallest and the largest.
+        low, high = np.percentile(some, (2.5, 97.5), method="inverted_cdf").tolist()
+        found.append(
+            AblationBand(
+                method=method, repetitions=size, quantity=quantity, motion_class=name,
+                low=low, high=high, subsets=len(some),
+            )
+        )  # fmt: skip
+
     for name, one in forms.items():
         scale = one.torque_squared.sum(axis=1)
-        figures.append(("error", name, _medians(one.torque_kernels(values), weights, scale)))
+        add("error", name, _medians(one.torque_kernels(values), weights, scale))
         if truth is not None:
-            own = _medians(one.own_kernels(values, truth), weights, scale)
-            figures.append(("own", name, own))
+            add("own", name, _medians(one.own_kernels(values, truth), weights, scale))
     if truth is not None:
         errors = [parameter_error(estimate, reference, truth) for estimate in weights @ values]
         known = [error for error in errors if error is not None]
-        figures += [("parameter_error", None, np.array(known))] if known else []
-    return [
-        AblationBand.model_validate(
-            {
-                "method": method,
-                "repetitions": size,
-                "quantity": quantity,
-                "motion_class": name,
-                # Figures that exist: of few subsets the smallest and the largest.
-                "low": float(np.percentile(some, 2.5, method="inverted_cdf")),
-                "high": float(np.percentile(some, 97.5, method="inverted_cdf")),
-                "subsets": len(some),
-            }
-        )
-        for quantity, name, some in figures
-    ]
+        if known:
+            add("parameter_error", None, np.array(known))
+    return found
 
 
 def _subsets(count: int, size: int) -> Array:

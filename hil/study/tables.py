@@ -21,21 +21,12 @@ from .results import (
     ComparisonResult,
     ConditionResult,
     CrossCell,
-    EqualDataResult,
     MethodResult,
     MotionRow,
     StudyParameter,
 )
 from .searches import AP, B
-from .statistics import (
-    Estimated,
-    Kernels,
-    compared_on,
-    corrected,
-    equal_data,
-    own_kernels,
-    torque_kernels,
-)
+from .statistics import compared_on, corrected, equal_data
 
 Array = NDArray[np.float64]
 
@@ -105,17 +96,20 @@ def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
     ]
 
 
+def repetitions_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
+    """Estimates (r, p) of the repetitions of each method.
+
+    Among them those of the longer of the first two with as much motion as the other has.
+    """
+    found, equal = {key: np.array(one.values) for key, one in fits.items()}, equal_data(fits)
+    if equal is not None:
+        found[equal.name] = found[equal.cut][: equal.repetitions]
+    return found
+
+
 def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
     """The paper's estimate of each: the mean over the repetitions' own estimates (p,)."""
-    return {key: np.mean(one.values, axis=0) for key, one in fits.items()}
-
-
-def cut_estimate(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
-    """Estimate of the longer of the first two methods from as much motion as the other has."""
-    equal = equal_data(fits, list(fits))
-    if equal is None:
-        return {}
-    return {equal.name: np.mean(fits[equal.cut].values[: equal.repetitions], axis=0)}
+    return {key: values.mean(axis=0) for key, values in repetitions_of(fits).items()}
 
 
 def condition_result(
@@ -129,13 +123,10 @@ def condition_result(
 ) -> ConditionResult:
     """All tables of one condition.
 
-    `labels` of the methods are in the order of the tables, `scores` by class of motion, `others`
+    `fits` of the methods are in the order of the tables, `scores` by class of motion, `others`
     further estimates in the cross table, such as the planted parameters.
     """
-    keys, equal = list(labels), equal_data(fits, list(labels))
-    estimates = {key: np.array(fits[key].values) for key in keys}
-    if equal is not None:
-        estimates[equal.name] = estimates[equal.cut][: equal.repetitions]
+    keys, equal, estimates = list(fits), equal_data(fits), repetitions_of(fits)
     wanted = [*estimates, *others]
     classes = [_class_result(name, one, condition) for name, one in scores.items()]
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
@@ -144,14 +135,30 @@ def condition_result(
         truth = np.array([one.truth for one in parameters], dtype=np.float64)
 
     def pair(
-        name: str, first: str, second: str, kernels: Kernels, joint: str | None = None
+        name: str,
+        keys: tuple[str, str],
+        *,
+        joint: int | None = None,
+        truth: Array | None = None,
     ) -> ComparisonResult:
-        one, other = (Estimated(key, estimates[key]) for key in (first, second))
-        return compared_on(name, one, other, kernels, joint=joint, drifts=condition.drifts)
+        """Two estimates by the torque they miss, of one joint or all, or by their own error."""
+        one = forms[name]
+        first, second = (
+            one.torque_kernels(estimates[key], joint)
+            if truth is None
+            else one.own_kernels(estimates[key], truth)
+            for key in keys
+        )
+        named = None if joint is None else joint_names[joint]
+        return compared_on(name, keys, (first, second), joint=named, drifts=condition.drifts)
 
-    two = keys[:2] if len(keys) > 1 else None
-    own = truth if two and not condition.effects else None
-    by_joint = enumerate(joint_names if two and "fly-by" in forms else ())
+    two = (keys[0], keys[1]) if len(keys) > 1 else None
+    own = None if condition.effects else truth
+    if two is not None and equal is not None:
+        cut = tuple(equal.name if key == equal.cut else key for key in two)
+        rows = corrected([pair(name, (cut[0], cut[1])) for name in forms])
+        equal = equal.model_copy(update={"comparisons": rows})
+    joints = range(len(joint_names) if two and "fly-by" in forms else 0)
     example = scores.get("fly-by") or next(iter(scores.values()), None)
     return ConditionResult(
         key=condition.key,
@@ -161,35 +168,18 @@ def condition_result(
         classes=classes,
         cross=[_cell(one, key) for one in classes for key in wanted if key in one.overall],
         comparisons=corrected(
-            [
-                pair(name, first, second, torque_kernels(one))
-                for name, one in forms.items()
-                for first, second in compared_pairs(keys)
-            ]
+            [pair(name, some) for name in forms for some in compared_pairs(keys)]
         ),
         own_comparisons=[]
         if own is None or two is None
-        else corrected(
-            [pair(name, two[0], two[1], own_kernels(one, own)) for name, one in forms.items()]
-        ),
-        joint_comparisons=corrected(
-            [
-                pair("fly-by", keys[0], keys[1], torque_kernels(forms["fly-by"], j), joint)
-                for j, joint in by_joint
-            ]
-        ),
-        equal_data=None if equal is None else _with_equal(equal, keys, forms, pair),
+        else corrected([pair(name, two, truth=own) for name in forms]),
+        joint_comparisons=[]
+        if two is None
+        else corrected([pair("fly-by", two, joint=j) for j in joints]),
+        equal_data=equal,
         closeness=_closeness(fits, keys, parameters),
         examples=[] if example is None else example.examples,
     )
-
-
-def _with_equal(
-    equal: EqualDataResult, keys: Sequence[str], forms: Mapping[str, ClassForms], pair: Any
-) -> EqualDataResult:
-    first, second = (equal.name if key == equal.cut else key for key in keys[:2])
-    rows = [pair(name, first, second, torque_kernels(one)) for name, one in forms.items()]
-    return equal.model_copy(update={"comparisons": corrected(rows)})
 
 
 def _method(key: str, label: str, record: FitRecord) -> MethodResult:
@@ -225,7 +215,6 @@ def _cell(result: ClassResult, key: str) -> CrossCell:
         median=middle,
         lower=lower,
         upper=upper,
-        unfiltered_median=float(np.median(result.unfiltered[key])),
         all_rows_median=float(np.median(result.all_rows[key])),
         own_median=float(np.median(own)) if (own := result.own.get(key)) else None,
     )

@@ -16,7 +16,7 @@ rows of data: next to nothing. D is infinite at the edge of what is possible, so
 strictly inside.
 
 Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
-diagonal, is kept positive definite in place of I_im >= 0. What friction needs to take energy says
+diagonal, has to be positive definite in place of I_im >= 0. What friction needs to take energy says
 :mod:`identification.model.friction`: signs of the third friction term and of the offset are left
 open.
 """

@@ -405,7 +405,7 @@ class Program:
     def physical(self, u: Array) -> tuple[Array, Array]:
         """Return standard parameters (s,) and those of friction, springs and balancers (k,).
 
-        A solver holds inequalities to its tolerance. What is left beyond them is taken back.
+        A solver holds inequalities to its tolerance. What is left beyond them is moved back.
         """
         u = u.copy()
         u[self.not_negative] = np.maximum(u[self.not_negative], 0.0)

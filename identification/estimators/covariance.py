@@ -7,8 +7,8 @@ an order of magnitude. Here the covariance is the cluster-robust sandwich
     A^-1 (sum_b s_b s_b') A^-1,    s_b = (1 - A_b A^-1)^-1 W_b' w e_b
 
 over blocks b of consecutive time, which assumes nothing about what happens inside a block. The
-factor in front of the scores (Bell and McCaffrey 2002, "CR3") gives back what the fit has taken
-out of the residuals; the result is that of leaving one block out at a time. A direction that one
+factor in front of the scores (Bell and McCaffrey 2002, "CR3") gives back what the fit has removed
+from the residuals; the result is that of leaving one block out at a time. A direction that one
 block alone determines takes its variance from the other blocks. The kernel
 estimators that work on scores as they are (Newey and West 1987) were tried on simulated NS 16
 data: with noise correlated over 50 ms their nominal 95 % intervals covered 88 %, these 95 %.

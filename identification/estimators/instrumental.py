@@ -33,10 +33,9 @@ from identification.factor.factor import (
     Estimate,
     Factor,
     estimate,
+    estimate_of,
     joint_weights,
-    mark_undetermined,
     residual_variance,
-    undetermined_names,
 )
 from identification.factor.instruments import InstrumentFactor
 from identification.factor.phases import FINE_BLOCK, merged
@@ -193,19 +192,15 @@ def _with_covariance(
     cross = merged(cross, length)
     scores = merged(moments, length) - cross @ solution.values
     moved = spread(cross, scores, solution.right, solution.left)
-    covariance = moved.T @ moved
-    mark_undetermined(covariance, solution.determined)
-    variance = residual_variance(rows, solution.values, rows.solve(weights).root, weights)
-    return Estimate(
-        names=model.parameter_names,
-        units=model.units,
-        values=solution.values,
-        covariance=covariance,
-        noise_std=np.sqrt(variance),
-        samples=rows.samples,
-        method=f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
+    return estimate_of(
+        model,
+        rows,
+        rows.solve(weights)._replace(
+            values=solution.values, condition=solution.condition, determined=solution.determined
+        ),
+        moved.T @ moved,
+        weights,
+        f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
         f" {length * FINE_BLOCK:g} s",
-        condition=solution.condition,
-        undetermined=undetermined_names(model.parameter_names, solution.determined),
-        interval_factor=float(student_limit(0.025, max(1, len(scores) - 1))),
+        float(student_limit(0.025, max(1, len(scores) - 1))),
     )

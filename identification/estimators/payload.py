@@ -291,15 +291,8 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
     """The recording that carries something else than the first of its kind, if there is one.
 
     Bare recordings are compared with the first bare one and loaded ones with the first loaded
-    one; the most significant difference in mass and first moment is given.
-
-    Args:
-        model: the arm without payload.
-        runs: bare and loaded.
-
-    Raises:
-        PayloadError: there is no bare or no loaded recording.
-        IdentificationError: there is not one usable row.
+    one; the most significant difference in mass and first moment is given. Arguments and errors
+    are those of :func:`mass_difference`.
     """
     first = {kind: next((r for r in runs if r.loaded == kind), None) for kind in (False, True)}
     others = [run for run in runs if run not in first.values()]

@@ -24,13 +24,12 @@ from identification.factor.factor import (
     Estimate,
     Factor,
     JointFactor,
+    estimate_of,
     joint_weights,
     mark_undetermined,
     nothing_usable,
     reduced,
-    residual_variance,
     solve_rows,
-    undetermined_names,
 )
 from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.robot import RobotModel
@@ -194,22 +193,18 @@ def with_prior(
         np.concatenate([believed * (target - rows @ prior.mean), np.zeros(len(prior.root))]),
         _WORST_CONDITION,
     )
-    solution = posterior._replace(values=prior.mean + posterior.values)
-    covariance = posterior.inverse
-    mark_undetermined(covariance, posterior.determined)
-    estimate = Estimate(
-        names=model.parameter_names,
-        units=model.units,
-        values=solution.values,
-        covariance=covariance,
-        noise_std=np.sqrt(
-            residual_variance(factor, solution.values, solution.root, weights / design_effect)
-        ),
-        samples=factor.samples,
-        method=f"weighted least squares with a Gaussian prior ({prior.words}),"
-        " posterior covariance (white residuals)",
+    solution = posterior._replace(
+        values=prior.mean + posterior.values,
         condition=solve_rows(rows, target).condition if len(rows) else np.inf,
-        undetermined=undetermined_names(model.parameter_names, posterior.determined),
+    )
+    estimate = estimate_of(
+        model,
+        factor,
+        solution,
+        posterior.inverse,
+        weights / design_effect,
+        f"weighted least squares with a Gaussian prior ({prior.words}),"
+        " posterior covariance (white residuals)",
     )
     return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
 

@@ -114,7 +114,7 @@ def robust_estimate(
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once, one at a time.
 
-    Only the residuals, one number per row, are kept. Tukey's loss starts where Huber's ends, and
+    Only the residuals, one number per row, are stored. Tukey's loss starts where Huber's ends, and
     with its scales (Yohai 1987): looked for anew they can shrink with the rows that count.
     QR takes the place of Gram matrices where the condition demands it.
 

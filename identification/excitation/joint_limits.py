@@ -3,7 +3,7 @@
 A table of cubics tells its extremes from its roots. A sum of sines does so only at a price that a
 search over thousands cannot pay, so its samples decide first: a limit that a sample exceeds is
 broken, and one that is farther from all samples than the sum can swing between two of them
-(f <= max + M h²/8, M the sum's largest second derivative) is kept. Only what lies between is
+(f <= max + M h²/8, M the sum's largest second derivative) is satisfied. Only what lies between is
 looked at exactly. Either answer is rigorous.
 """
 

@@ -118,7 +118,7 @@ class SineGenome:
     def encode(self, amplitude: ArrayLike, frequency: ArrayLike) -> Array:
         """Return genes (n_genes,) of amplitudes and frequencies (n, W).
 
-        The inverse of `decode` but for rounding; what lies outside the genome's range is taken
+        The inverse of `decode` but for rounding; what lies outside the genome's range is moved
         to its nearest end.
         """
         shape = (self.limits.n_joints, self.harmonics)

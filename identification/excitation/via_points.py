@@ -92,7 +92,7 @@ class ViaPointGenome:
     def encode(self, via_points: ArrayLike, speed: ArrayLike) -> Array:
         """Return genes (n_genes,) of a motion through via points (n_points, n), home included.
 
-        The inverse of `decode` but for rounding; what lies outside the genome's range is taken
+        The inverse of `decode` but for rounding; what lies outside the genome's range is moved
         to its nearest end.
         """
         points = np.asarray(via_points, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Where the elements of an XML text stand, so that some can be changed and the rest kept.
+"""Where the elements of an XML text stand, so that some can be changed and no others.
 
 An XML library that writes a tree again loses comments, the order and spacing of attributes, and
 line ends. Here only the bytes of what changes are replaced.

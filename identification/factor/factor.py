@@ -497,9 +497,25 @@ def estimate(model: RobotModel, factor: JointFactor, weights: Array | None = Non
     if weights is None:
         weights = joint_weights(factor)
     solution = factor.solve(weights)
-    variance = residual_variance(factor, solution.values, solution.root, weights)
-    covariance = solution.inverse
+    method = f"weighted least squares{factor.words}, classical covariance (white residuals)"
+    return estimate_of(model, factor, solution, solution.inverse, weights, method)
+
+
+def estimate_of(
+    model: RobotModel,
+    factor: JointFactor,
+    solution: Solution,
+    covariance: Array,
+    weights: Array,
+    method: str,
+    interval_factor: float = 1.96,
+) -> Estimate:
+    """Estimate from a solution with weights (n,) per joint.
+
+    The `covariance` (p, p) is that on what is determined, and is marked in place elsewhere.
+    """
     mark_undetermined(covariance, solution.determined)
+    variance = residual_variance(factor, solution.values, solution.root, weights)
     return Estimate(
         names=model.parameter_names,
         units=model.units,
@@ -507,9 +523,10 @@ def estimate(model: RobotModel, factor: JointFactor, weights: Array | None = Non
         covariance=covariance,
         noise_std=np.sqrt(variance),
         samples=factor.samples,
-        method=f"weighted least squares{factor.words}, classical covariance (white residuals)",
+        method=method,
         condition=solution.condition,
         undetermined=undetermined_names(model.parameter_names, solution.determined),
+        interval_factor=interval_factor,
     )
 
 

@@ -5,7 +5,7 @@ r"""What instrumental variables need of the samples: per joint the Gram matrix o
 
 W is the regressor of the measured motion, whose noise it carries, and Z that of a motion without
 measurement noise (:mod:`identification.estimators.instrument_motion`), column by column the same
-functions. Sums are kept by short blocks of time, as in :mod:`identification.estimators.covariance`,
+functions. Sums are stored by short blocks of time (:mod:`identification.estimators.covariance`)
 and only over the columns that act on a joint: a third of all of them.
 """
 

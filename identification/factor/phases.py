@@ -5,7 +5,7 @@ r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in o
 
 Summed over the blocks b they are the :class:`identification.factor.factor.Factor`; block by block
 they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
-for any weights and parameters. Kept are only the columns that act on a joint, a third of all.
+for any weights and parameters. Stored are only the columns that act on a joint, a third of all.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class PhaseFactor:
         return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
 
     def restricted(self, chosen: NDArray[np.intp]) -> PhaseFactor:
-        """The same samples for a model that has only the parameters `kept` (k,), in that order."""
+        """The same samples for a model of the parameters `chosen` (k,) alone, in that order."""
         place = np.full(self.n_parameters, -1, dtype=np.intp)
         place[chosen] = np.arange(len(chosen))
         gram, columns = [], []

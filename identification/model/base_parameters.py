@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A column is kept when the part of it that no kept column explains is longer than this share of
-# the longest column of its unit. Exact geometry leaves 1e-15 of a dependent column; a URDF whose
+# A column is a base column if the part of it that no other one explains is longer than this share
+# of the longest column of its unit. Exact geometry leaves 1e-15 of a dependent column; a URDF whose
 # angles are rounded (1.5708 for pi/2) leaves up to 4e-6, which no measurement could use.
 TOLERANCE = 1e-5
 
 _ROUNDING = 1e-13
-# A gap as wide leaves room for a threshold; a kept share below the second hangs on the geometry's
-# last digits; dropped shares below the third are rounding alone.
+# A gap as wide leaves room for a threshold; a base column's share below the second depends on
+# the geometry's last digits; dropped shares below the third are rounding alone.
 _CLEAR = 100.0
 _WEAK = 1e-3
 _EXACT = 1e-9

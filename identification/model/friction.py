@@ -43,7 +43,7 @@ _EXPONENT: Final = {1: "", 2: "²", 3: "³"}
 
 
 class Sliding(NamedTuple):
-    """Where a column is taken.
+    """Where a column is evaluated.
 
     Attributes:
         v: speeds (...) [rad/s, m/s].

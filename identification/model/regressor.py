@@ -36,7 +36,7 @@ Rows = slice | NDArray[np.intp]
 # 512 takes a quarter longer, 256 two thirds.
 CHUNK = 1280
 
-# Working arrays kept for the next call: fresh memory costs more than the arithmetic on it. Sizes
+# Arrays reused by the next call: fresh memory costs more than the arithmetic on it. Their sizes
 # are multiples of the grain, so that a search over motions of all durations meets few different
 # ones: the six between half a chunk and a chunk, and some shorter (some 8 kB per sample).
 _SPARE = 8
@@ -68,7 +68,7 @@ class RegressorPlan:
     Args:
         chain: the robot.
         gravity: acceleration of gravity in base axes [m/s²], shape (3,).
-        links: per joint the kept :data:`identification.model.wrench.LINK_SYMBOLS` (0..9), rising.
+        links: per joint the used :data:`identification.model.wrench.LINK_SYMBOLS` (0..9), rising.
         rotors: joints whose rotor inertia has a column of its own.
         friction: of joints and coupled motors, None for none.
         couplings: pairs of joints whose coupling inertia has a column.

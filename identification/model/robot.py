@@ -90,7 +90,7 @@ class StandardLayout:
         return tuple(self._unit(standard) for standard in range(self.size))
 
     def split(self, pivots: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
-        """Return what of each joint is among `kept`: link symbols, rotor, and which couplings."""
+        """Return what of each joint is among `pivots`: link symbols, rotor, and which couplings."""
         links: list[list[int]] = [[] for _ in self.revolute]
         rotors = [False] * self.n_joints
         couplings: list[int] = []

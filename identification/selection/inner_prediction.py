@@ -61,7 +61,7 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 )
 # A candidate replaces the simpler one before it only if it predicts better by this share; a
 # low-pass of the torque, which can stand in for much else, by more. Of estimators and rows none is
-# simpler, and the best is taken; what differs by less than a tie is rounding.
+# simpler, and the best is chosen; what differs by less than a tie is rounding.
 TIE: Final = 1e-4
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
@@ -127,7 +127,7 @@ class Choice:
         candidates: in words.
         errors: ``||e|| / ||tau||`` of each candidate over all joints, mean over the stretches; of a
             low-pass the geometric mean of those of each joint.
-        chosen: index of the one that was taken.
+        chosen: index of the one that is used.
     """
 
     name: str

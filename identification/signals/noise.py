@@ -52,7 +52,7 @@ def difference_variance(time: Array, values: Array) -> Array:
     """Variance of the white noise on smooth channels (m, c), from the channels themselves.
 
     Divided differences of rising order, scaled to unit noise gain, remove ever more of the
-    smooth part and keep the noise (Gasser, Sroka and Jennen-Steinmetz 1986). Taken is the first
+    smooth part and keep the noise (Gasser, Sroka and Jennen-Steinmetz 1986). Used is the first
     order at which the next one changes the estimate by less than 5 %; a channel without white
     noise (filtered before it was logged) gives the highest order's, next to nothing.
 

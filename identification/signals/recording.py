@@ -139,7 +139,7 @@ class Recording:
         """Stretches without a gap, in order.
 
         A gap is where one was reported, and where the clock steps by more than `GAP_STEPS` of
-        its usual (median) step. Derivatives may not be taken across one.
+        its usual (median) step. Derivatives across one are wrong.
         """
         steps = np.diff(self.time)
         breaks = steps > GAP_STEPS * np.median(steps)

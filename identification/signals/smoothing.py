@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 
 ORDER: Final = 6  # quintic: six basis functions are non-zero on each knot interval
 SAMPLES_PER_KNOT: Final = 4
-# The penalty is kept, in knot units and per sample, where it still smooths something the knots
-# can show (lower end) and where the normal equations still have digits left (upper end).
+# The penalty is limited, in knot units and per sample, to where it still smooths something the
+# knots can show (lower end) and where the normal equations still have digits left (upper end).
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
 # Radians of a cutoff frequency per knot: the knots then follow far more than the smoother passes.
@@ -297,7 +297,7 @@ def _roughness(coefficients: Array) -> Array:
     """Penalty matrix times coefficients (k, c), by way of third differences.
 
     The third derivative is a quadratic spline whose coefficients are the third differences.
-    Taken this way the rounding has no part that a parabola could take up, however heavy the
+    Computed this way the rounding has no part that a parabola could take up, however heavy the
     penalty; the band times the coefficients would lose eleven digits there.
     """
     third = np.diff(coefficients, 3, axis=0)

@@ -45,7 +45,7 @@ Kind = Literal[
 # Standard errors over the blocks, and the share of the error, that make a mended fault better.
 SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
-# What is as good as that with fewer coefficients is taken in its place.
+# What is as good as that with fewer coefficients is used in its place.
 _ALIKE: Final = 1.05
 # Share of its torque that each joint of a mended sign or order may be mispredicted by: where more
 # is left, the sign explains less than what remains unexplained.

@@ -24,7 +24,7 @@ FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 class PredictionError:
     """Sums over the rows of a prediction error e = measured - predicted, per joint (n,).
 
-    Kept as sums, so that runs add up: the error over all runs is the sum of theirs.
+    They are sums, so that runs add up: the error over all runs is the sum of theirs.
 
     Attributes:
         rows: rows that counted.
@@ -173,7 +173,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
     Friction follows the temperature of the gears: between training and validation it may differ
     by some per cent without anything being wrong with the model. Each joint's whole friction
     torque may therefore be scaled, by one number within `FRICTION_CHANGE`, before the error is
-    taken.
+    computed.
 
     Args:
         model: the robot.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from hil.errors import OutputError
 from hil.study import study_settings
 from hil.study.records import Record, read_record, write_record
-from hil.study.settings import Stages, StudyFolder
+from hil.study.settings import StudyFolder
 from tests.disk.faults import REFUSALS, RENAME, SYNC, Rule
 from tests.disk.mounted import PlantedDisk, planted_disk
 
@@ -56,31 +55,3 @@ def test_a_record_is_written_whole_or_not_at_all(disk: PlantedDisk, rule: Rule) 
     assert read_record(path, Record, "these archives") is None
     write_record(path, record)
     assert read_record(path, Record, "these archives") == record
-
-
-def test_times_that_cannot_be_written_are_reported_when_the_stage_ends(disk: PlantedDisk) -> None:
-    stages = Stages(disk.root)
-    with stages.stage("searches"):
-        pass
-    times = disk.root / "times.json"
-    before = times.read_text()
-    disk.do_wrong(Rule((SYNC,), error="EDQUOT"))
-    with pytest.raises(OutputError, match=rf"times\.json {TOLD}"), stages.stage("plans"):
-        pass
-    disk.do_wrong()
-    assert times.read_text() == before
-    with stages.stage("campaigns"):
-        pass
-    assert {"searches", "plans", "campaigns"} == set(json.loads(times.read_text())["wall"])
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
-def test_what_ended_a_stage_is_not_hidden_by_times_that_cannot_be_written(
-    disk: PlantedDisk, error: type[BaseException]
-) -> None:
-    stages = Stages(disk.root)
-    disk.do_wrong(Rule((SYNC,), error="ENOSPC"))
-    with pytest.raises(error), stages.stage("searches"):
-        raise error
-    assert disk.do_wrong()
-    assert "searches" in stages.times.wall

@@ -12,7 +12,6 @@ from hil.study.records import (
     FitRecord,
     MotionForm,
     ScoreRecord,
-    packed,
 )
 
 Array = NDArray[np.float64]
@@ -60,7 +59,6 @@ def scored(errors: Mapping[str, Array]) -> ScoreRecord:
             for k, column in enumerate(table.T)
         ],
         overall={name: values.tolist() for name, values in errors.items()},
-        unfiltered={name: values.tolist() for name, values in errors.items()},
         all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
         own={},
         mean_abs={
@@ -78,8 +76,8 @@ def form(archive: str, gram: Array, joints: int = 2) -> MotionForm:
         archive=archive,
         torque_squared=[1.0 / joints] * joints,
         columns=[list(range(n))] * joints,
-        slow=[packed(gram / joints)] * joints,
-        whole=packed(gram[:n, :n]),
+        slow=[(gram / joints).tolist()] * joints,
+        whole=gram[:n, :n].tolist(),
     )
 
 

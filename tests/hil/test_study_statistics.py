@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -12,25 +11,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from hil.cell import Cell
-from hil.study.campaigns import EFFECT_SETTINGS, Execution, Plans, effects_of, with_only
-from hil.study.records import packed, unpacked
+from hil.study.campaigns import Execution, Plans
 from hil.study.results import ComparisonResult
 from hil.study.searches import AP, B0, A, B, Found, printed_sines
-from hil.study.settings import Stages, Times
 from hil.study.statistics import (
     FEWEST,
-    Estimated,
     bands_of,
     compared_on,
     corrected,
-    own_kernels,
     spread,
-    torque_kernels,
     verdict_of,
 )
 from hil.study.tables import compared_pairs
-from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.study_numbers import flagged, forms_of
 
 Array = NDArray[np.float64]
@@ -67,11 +59,6 @@ def test_a_form_gives_the_error_of_any_estimate_and_of_any_mean_of_estimates() -
     away = np.linalg.norm(phi @ (values.mean(axis=0) - 1.0))
     assert forms.own(values.mean(axis=0), np.ones(3)) == pytest.approx([away])
     assert np.sqrt(forms.own_kernels(values, np.ones(3)).mean()) == pytest.approx(away)
-
-
-def test_a_form_comes_back_from_its_text_to_the_last_bit() -> None:
-    table = np.random.default_rng(2).standard_normal((9, 6))
-    assert np.array_equal(unpacked(packed(table.T @ table)), table.T @ table)
 
 
 # Motions and repetitions drawn
@@ -120,15 +107,17 @@ def test_a_method_beside_itself_is_seldom_told_to_differ(repetitions: int, off: 
 def test_a_difference_that_is_there_is_told_when_repetitions_tell_it() -> None:
     forms = forms_of(grams(10, 12))
     random = np.random.default_rng(5)
-    near, far = (Estimated(key, off + 0.02 * random.standard_normal((10, 12)))
-                 for key, off in (("a", 1.0), ("b", 1.2)))  # fmt: skip
-    one = compared_on("fly-by", near, far, torque_kernels(forms), drifts=False)
+    near, far = (off + 0.02 * random.standard_normal((10, 12)) for off in (1.0, 1.2))
+    inner = forms.torque_kernels(near), forms.torque_kernels(far)
+    one = compared_on("fly-by", ("a", "b"), inner, drifts=False)
     assert one.ratio == pytest.approx(1.2, rel=0.02)
     assert one.low is not None and one.low > 1.15
     assert (one.verdict, one.repetitions) == ("worse", [10, 10])
-    back = compared_on("fly-by", far, near, torque_kernels(forms), drifts=False)
+    back = compared_on("fly-by", ("b", "a"), inner[::-1], drifts=False)
     assert back.verdict == "better"
-    own = compared_on("fly-by", near, far, own_kernels(forms, np.zeros(12)), drifts=False)
+    zero = np.zeros(12)
+    own_errors = forms.own_kernels(near, zero), forms.own_kernels(far, zero)
+    own = compared_on("fly-by", ("a", "b"), own_errors, drifts=False)
     assert own.ratio == pytest.approx(one.ratio)  # these torques are those of parameters of 0
 
 
@@ -147,8 +136,8 @@ def test_repetitions_like_their_neighbours_are_drawn_in_blocks() -> None:
 @pytest.mark.parametrize(("repetitions", "motions"), [(FEWEST - 1, 10), (1, 10), (5, 1)])
 def test_too_few_repetitions_or_motions_tell_nothing(repetitions: int, motions: int) -> None:
     forms = forms_of(grams(motions, 4))
-    values = [Estimated(key, flagged(k, 4, repetitions, 0.01)) for k, key in enumerate("ab")]
-    one = compared_on("fly-by", values[0], values[1], torque_kernels(forms), drifts=False)
+    a, b = (forms.torque_kernels(flagged(k, 4, repetitions, 0.01)) for k in range(2))
+    one = compared_on("fly-by", ("a", "b"), (a, b), drifts=False)
     assert (one.verdict, one.low, one.high, one.error) == ("too few", None, None, None)
     assert not one.differs
 
@@ -215,15 +204,6 @@ def test_the_band_holds_what_other_repetitions_of_one_motion_give() -> None:
     }
 
 
-def test_one_effect_leaves_the_others_at_nothing() -> None:
-    cell = Cell.load(CELL_PATH)
-    assert effects_of(cell) == list(EFFECT_SETTINGS)
-    for effect, (setting, _) in EFFECT_SETTINGS.items():
-        alone = with_only(cell, effect)
-        assert effects_of(alone) == [effect]
-        assert getattr(alone.simulation, setting) == getattr(cell.simulation, setting)
-
-
 def found(**log10_det: float) -> dict[str, Found]:
     """Searches of method A with what they found; names with underscores."""
     return {
@@ -244,38 +224,7 @@ def test_the_papers_own_sines_are_a_method_where_they_are_not_the_best() -> None
 
 def test_an_arm_that_does_not_bear_the_papers_sines_still_has_a_study(tmp_path: Path) -> None:
     one = cast(Execution, SimpleNamespace(root=tmp_path / AP))
-    plans = Plans("a-middle-fast", "a-home", {}, {"plain": {AP: one}}, {"sines": []})
+    plans = Plans("a-middle-fast", "a-home", {}, {"plain": {AP: one}}, [])
     left = plans.without({one.root: "joint 2: drive fault"})
     assert left.executions == {"plain": {}}
-    assert left.missing["sines"] == ["a-printed could not be run: joint 2: drive fault"]
-
-
-# How long it took
-
-
-def test_times_of_sessions_add_up_however_they_end(tmp_path: Path) -> None:
-    first = Stages(tmp_path)
-    with pytest.raises(KeyboardInterrupt), first.stage("searches"):
-        time.sleep(0.2)
-        raise KeyboardInterrupt
-    second = Stages(tmp_path)
-    with second.stage("searches"):
-        time.sleep(0.2)
-    with second.stage("campaigns"):
-        pass
-    found = Times.model_validate_json((tmp_path / "times.json").read_bytes())
-    assert found == second.times and found.whole
-    assert found.wall["searches"] >= 0.4
-    assert list(found.wall) == list(found.processor) == ["searches", "campaigns"]
-
-
-def test_a_session_that_was_killed_leaves_times_that_are_not_whole(tmp_path: Path) -> None:
-    with Stages(tmp_path).stage("searches"):
-        assert not Stages(tmp_path).times.whole  # what a kill at this moment leaves
-    assert Stages(tmp_path).times.whole
-
-
-@pytest.mark.parametrize("seconds", ["Infinity", "NaN", "-1.0", "1e300", '"inf"'])
-def test_times_that_are_none_are_begun_anew(seconds: str, tmp_path: Path) -> None:
-    (tmp_path / "times.json").write_text(f'{{"wall": {{"fitting": {seconds}}}}}')
-    assert not Stages(tmp_path).times.wall
+    assert left.missing == ["a-printed could not be run: joint 2: drive fault"]

@@ -182,7 +182,7 @@ def test_settings_outside_the_range_of_chance_are_named() -> None:
     )  # fmt: skip
     fly = AblationResult(
         key="fly", title="Fly-by share", variable="fly-by share", words="Varied.",
-        points=[point(0.0, 1.5e-3), point(0.5, 5e-3), point(1.0, 2.5e-3)], bands=[band], missing=[],
+        points=[point(0.0, 1.5e-3), point(0.5, 5e-3), point(1.0, 2.5e-3)], bands=[band],
     )  # fmt: skip
     (found,) = (one for one in study(condition(1.0), ablations=[fly]).reading if "fly" in one.key)
     assert any(text.endswith("0.100 % to 0.200 %; outside: 1.") for text in found.sentences)

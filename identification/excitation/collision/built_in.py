@@ -69,7 +69,7 @@ def always_close(pairs: Pairs, pair: int, margin: float) -> tuple[float, float] 
 
     Two links: two joints apart at most, and too close in every posture. An obstacle and a shape of
     the first link, which can but turn in it: too close at the same distance in every posture; one
-    that comes nearer and goes farther is kept clear by the motion.
+    that comes nearer and goes farther is checked along the motion.
     """
     near = min(margin, NEAR)
     if pairs.joints_between(pair) > (1 if pairs.with_obstacle(pair) else 2):

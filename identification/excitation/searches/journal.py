@@ -1,4 +1,4 @@
-"""What a search has scored so far, kept so that an interrupted search goes on where it was.
+"""What a search has scored so far, stored so that an interrupted search resumes.
 
 Nothing but scores is stored. A resumed search is the same search run once more: it asks for the
 same genes in the same order, and takes from the journal what is there. The last bit of its
@@ -136,7 +136,7 @@ class Journal:
         settings: of the search.
 
     Attributes:
-        recalled: how many motions were taken from the file so far.
+        recalled: how many motions were read from the file so far.
         damaged: how many bytes before the last whole record cannot be read.
         trouble: why records wait in memory, None while none do.
 

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 SAMPLE_COUNT: Final = 200
 """How many random motions to draw for a scale."""
 
-# Fewer feasible motions than this tell little of a spread; all motions are taken then, feasible
+# Fewer feasible motions than this tell little of a spread; all motions are used then, feasible
 # or not: what a step is worth is a matter of the arm rather than of its surroundings.
 _FEWEST_FEASIBLE: Final = 20
 _FEWEST: Final = 2
