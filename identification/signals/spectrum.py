@@ -16,8 +16,8 @@ _FEWEST: Final = 32  # samples
 _BINS: Final = 120
 # Share of a signal's power: that of noise of a thousandth of its amplitude.
 _NO_POWER: Final = 1e-6
-# Share of half the sampling rate: filters against aliases end above it.
-_LOW_PASSED: Final = 0.5
+# Share of half the sampling rate: filters against aliases usually cut at 0.8 of it.
+_LOW_PASSED: Final = 0.75
 
 
 class Spectrum(NamedTuple):
