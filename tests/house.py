@@ -19,7 +19,7 @@ PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil"
 TARGETS: Final[Mapping[str, int | None]] = {
     "product lines": 62_000,
     "product files": 380,
-    "test lines": 95_097,
+    "test lines": 55_000,
     "test files": 260,
     "import circles": 0,
     "imports inside functions": None,
@@ -207,7 +207,7 @@ def figures(sources: Sources) -> dict[str, int]:
     """The table."""
     return {name: len(one) for name, one in lists(sources).items()} | {
         "product lines": _lines([*sources.files.values()]),
-        "test lines": 95_097lines(_tests()),
+        "test lines": _lines(_tests()),
     }
 
 
