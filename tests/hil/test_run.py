@@ -261,13 +261,12 @@ class TestTimeLeft:
 
         campaign.run(link, operator=Clock(), durable=False)
         now, left = np.array(estimates).T
-        true = now[-1] - now
-        known = now - now[0] > 0.1 * true[0]
+        true, known = now[-1] - now, now - now[0] > 0.1 * (now[-1] - now[0])
         assert known.sum() >= 10, "updates come by the computer's own clock"
         off = np.abs(left - true)[known] / (0.2 * true[known] + 1.0)
         assert off.max() < 1.0, (true[known][off.argmax()], left[known][off.argmax()])
-        # What was learned since the last update arrives at once.
-        assert np.diff(left[known]).max() < 0.1 * true[0] + np.diff(now).max()
+        learned = np.diff(now).max()  # since the last update: it arrives at once
+        assert np.diff(left[known]).max() < 0.1 * true[0] + learned
 
 
 # --- what slow torques say
