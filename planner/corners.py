@@ -28,7 +28,7 @@ from planner.verify import jump_rounding
 
 _SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
 _STEPS = 60  # of Newton's method, four or five as a rule; halving alone would need about fifty
-_RESOLUTION = 1e-15  # share of the duration that a time is told to
+_RESOLUTION = 1e-15  # share of the duration: two times closer than this are one
 
 
 # Which versions of the corner solver (community ruckig) this package was measured with.

@@ -335,7 +335,7 @@ def require_replaceable(root: Path) -> None:
 def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campaign:
     """A campaign of a designed motion, made in the folder of the design.
 
-    One that is there already is kept if it is of this motion and cell, and replaced otherwise.
+    One that is there already stays if it is of this motion and cell, and is replaced otherwise.
 
     Raises:
         CampaignFolderError: something was recorded in the campaign that is there, or the folder

@@ -163,12 +163,7 @@ def judgement_result(
         in_sample=evidence.in_sample,
         nominal=None if evidence.nominal is None else nominal,
         findings=[
-            FindingResult(
-                check=finding.check,
-                level=finding.level,
-                words=finding.words,
-                next_step=finding.next_step,
-            )
+            FindingResult.model_validate(finding, from_attributes=True)
             for finding in verdict.findings
         ],
         next_steps=list(verdict.next_steps),

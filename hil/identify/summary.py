@@ -226,14 +226,7 @@ def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
         reason=elimination.reason,
         cut=elimination.cut,
         steps=[
-            EliminationStepResult(
-                removed=step.removed,
-                left=step.left,
-                spread=step.spread,
-                in_sample=step.in_sample,
-                held_out=step.held_out,
-                largest_relative_std=step.largest_relative_std,
-            )
+            EliminationStepResult.model_validate(step, from_attributes=True)
             for step in elimination.steps
         ],
         refused=list(elimination.refused),

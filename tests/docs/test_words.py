@@ -27,7 +27,7 @@ LITERAL = {
     "plain": "name of the rehearsal and the study without unmodelled effects, and of their folders",
     "doubts": "key of files that earlier versions wrote",
 }
-INDEX = re.compile(r"pypi\.org|pythonhosted|index-url|conda\.anaconda|registry\.npmjs")
+INDEX = re.compile(r"\bpypi\b|\bconda\b|\bnpm\b|https?://\S*/simple\b", re.IGNORECASE)
 MOST_TERMS = 60
 
 

@@ -190,9 +190,9 @@ def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
     rig.process.send(Close(1, "completed", "enough"))
     done = rig.closed(1)
     assert (done.late, done.untaken) == (7, 2)
-    kept = whole(path).outcome
-    assert kept is not None
-    assert (kept.late_replies, kept.replies_not_accepted) == (7, 2)
+    outcome = whole(path).outcome
+    assert outcome is not None
+    assert (outcome.late_replies, outcome.replies_not_accepted) == (7, 2)
 
 
 def test_a_motion_that_was_never_asked_for_leaves_a_void_archive(rig: Rig) -> None:

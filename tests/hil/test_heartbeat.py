@@ -31,8 +31,8 @@ def test_beats_end_where_a_motion_is_supervised_and_its_loop_stands_still() -> N
     heart.turn()
     beats_in(heart, clock, given, 2.0 * STALL)
     assert clock.now - given[-1] > 0.9 * STALL
-    told = heart.explained(f"the exchange process ended ({NO_SUPERVISOR})")
-    assert "looks at the motion (show, request) did not return for 2.0 s" in told
+    explained = heart.explained(f"the exchange process ended ({NO_SUPERVISOR})")
+    assert "looks at the motion (show, request) did not return for 2.0 s" in explained
     heart.turn()
     assert beats_in(heart, clock, given, 0.5) > 5, "and goes on with the loop"
     heart.rest()
