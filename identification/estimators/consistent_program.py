@@ -136,7 +136,7 @@ class Minimum(NamedTuple):
     steps: int = 0
 
 
-def polish(problem: Smooth, start: Array) -> Minimum:
+def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
     """Return the minimum, by Newton's method from a `start` (v,) inside."""
     u = start.copy()
     u[problem.not_negative] = np.maximum(u[problem.not_negative], 0.0)
@@ -144,7 +144,7 @@ def polish(problem: Smooth, start: Array) -> Minimum:
     if not np.isfinite(problem.value(u)):
         return Minimum(start, converged=False)
     decrement, steps = np.inf, 0
-    while steps < _STEPS:
+    while steps < most_steps:
         steps += 1
         gradient, hessian = problem.derivatives(u)
         bounded = problem.not_negative
@@ -239,8 +239,10 @@ _TOLERANCE: Final = 1e-4
 # Share of a bound on a mass within which the solver's answer is on it.
 
 
-# From a near solution: steps of the prior's weight, and its change at which they end.
+# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
+# so near the conic solver is quicker; and the change of that weight at which they end.
 _NEAR_STEPS: Final = 10
+_NEAR_NEWTON: Final = 20
 _NEAR_WEIGHT: Final = 0.01
 
 
@@ -465,7 +467,7 @@ def solve_program(
         found = Minimum(near, converged=True)
         for _ in range(_NEAR_STEPS):
             last = weight(found.u)
-            found = polish(free._replace(weight=last), found.u)
+            found = polish(free._replace(weight=last), found.u, _NEAR_NEWTON)
             if not found.converged:
                 break
             if abs(weight(found.u) - last) <= _NEAR_WEIGHT * last:

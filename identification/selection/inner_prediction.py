@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.estimators.consistent_program import SolverError
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, shrunk_values
 from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import Factor, joint_weights, solve
@@ -327,6 +328,7 @@ class _Trial:
         self._errors: dict[tuple[Columns, Preprocessing, Shrinkage], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
         self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
+        self._without_centre: set[tuple[tuple[str, ...], float]] = set()
 
     def decide(
         self,
@@ -360,6 +362,9 @@ class _Trial:
 
     def _predicted(self, settings: Settings) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
+        machine = settings.model.parameter_names, shrinkage.prior_weight
+        if shrinkage.strength > 0.0 and machine in self._without_centre:
+            return Errors()
         if not all(folds.without(k).samples.any() for k in range(FOLDS)):
             return Errors()
 
@@ -367,7 +372,7 @@ class _Trial:
             weights = joint_weights(factor)
             if shrinkage.strength == 0.0:
                 return solve(factor.weighted(weights)).values
-            key = settings.model.parameter_names, shrinkage.prior_weight, k
+            key = *machine, k
             if key not in self._centres:
                 near = self._near.get(settings.model.parameter_names)
                 found = consistent_centre(
@@ -379,12 +384,16 @@ class _Trial:
 
         try:
             return folds.errors(estimate)
+        except SolverError:  # after a long search, which is not repeated
+            self._without_centre.add(machine)
         except IdentificationError:
-            return Errors()
+            pass
+        return Errors()
 
     def renew_centres(self) -> None:
         """Find consistent solutions anew, with the settings that are asked for next."""
         self._centres.clear()
+        self._without_centre.clear()
         self._errors.clear()
 
     def _reduced(self, settings: Settings) -> Folds:
