@@ -1,0 +1,82 @@
+"""Golden results: what is identified and designed, and the numbers of it that must not move.
+
+The archives in `fast/` were recorded by an earlier version of this software, and have to stay
+readable. After a change that is meant to move numbers, ``python -m tests.golden`` writes the
+results again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from typer.testing import CliRunner
+
+from benchmarks.published import Published
+from hil.campaign.quick_design import design
+from hil.cli import app
+from hil.progress import Silent
+from hil.results import Results
+from tests.hil.fast_cell import fast_cell
+
+HERE: Final = Path(__file__).parent
+FAST: Final = HERE / "fast"
+RECORDINGS: Final = HERE.parents[2] / "shared" / "data"
+
+
+def identify(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Values, standard deviations, choices and verdict of an identification."""
+    status = CliRunner().invoke(app, ["identify", *arguments, "--output", str(folder)]).exit_code
+    found = Results.load(folder / "results.json")
+    return {
+        "names": [one.name for one in found.parameters],
+        "values": [one.estimate for one in found.parameters],
+        "std": [one.std for one in found.parameters],
+        "errors": [one.all_rows_relative_error for one in found.validation],
+        "choices": [one.candidates[one.chosen] for one in found.choices],
+        "checks": sorted({one.check for one in found.judgement.findings}),
+        "status": status,
+    }
+
+
+def campaign(scratch: Path) -> dict[str, Any]:
+    """The archives of `fast/` as one campaign."""
+    return identify(scratch, *sorted(map(str, FAST.glob("*.mcap"))))
+
+
+def batch(scratch: Path) -> dict[str, Any]:
+    """The same archives by a batch."""
+    arguments = ["reidentify", str(FAST), "--json", "--quiet", "--cache", "none", "--workers", "1"]
+    found = CliRunner().invoke(app, arguments)
+    (arm,) = json.loads(found.stdout)["arms"].values()
+    return {**next(iter(arm["campaigns"].values()))["parameters"], "status": found.exit_code}
+
+
+def quick_design(scratch: Path) -> dict[str, Any]:
+    """A motion for the small arm."""
+    motion = design(fast_cell(scratch), Silent()).excitation.trajectory
+    position, *_ = motion.sample(np.array([motion.duration / 3]))
+    return {"duration": motion.duration, "position": position[0].tolist()}
+
+
+def recording(name: str) -> Callable[[Path], dict[str, Any]]:
+    """The first log of a published robot, in sample."""
+
+    def case(scratch: Path) -> dict[str, Any]:
+        robot = Published.named(name)
+        log = next(iter(robot.logs))
+        archive = robot.imported(log, RECORDINGS / (robot.folder or name), scratch / "log.mcap")
+        return identify(scratch / "found", str(archive), "--in-sample")
+
+    return case
+
+
+CASES: Final[dict[str, Callable[[Path], dict[str, Any]]]] = {
+    "campaign": campaign,
+    "batch": batch,
+    "design": quick_design,
+}
+PUBLISHED: Final = {name: recording(name) for name in ("ur10_unisa", "tx40", "kr300")}

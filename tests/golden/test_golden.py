@@ -1,0 +1,44 @@
+"""Numbers, choices, checks and exit status stay as they were (see `tests/golden/cases.py`)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.golden.cases import CASES, HERE, PUBLISHED, RECORDINGS
+
+# Rounding, through the condition of the estimates.
+SAME = 1e-9
+
+
+def assert_same(found: Any, golden: Any, place: str) -> None:
+    """Words alike, numbers to rounding of the largest of their list."""
+    if isinstance(golden, dict):
+        assert found.keys() == golden.keys(), place
+        for key in golden:
+            assert_same(found[key], golden[key], f"{place}.{key}")
+    elif isinstance(golden, list) and golden and isinstance(golden[0], float):
+        scale = max(map(abs, golden))
+        assert found == pytest.approx(golden, rel=SAME, abs=SAME * scale), place
+    elif isinstance(golden, float):
+        assert found == pytest.approx(golden, rel=SAME), place
+    else:
+        assert found == golden, place
+
+
+class TestGoldenResults:
+    @pytest.mark.parametrize("name", CASES)
+    def test_they_stay(self, name: str, tmp_path: Path) -> None:
+        golden = json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))
+        assert_same(CASES[name](tmp_path), golden, name)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", PUBLISHED)
+    def test_those_of_published_recordings_stay(self, name: str, tmp_path: Path) -> None:
+        if not RECORDINGS.is_dir():
+            pytest.skip(f"there are no recordings below {RECORDINGS}")
+        golden = json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))
+        assert_same(PUBLISHED[name](tmp_path), golden, name)
