@@ -20,7 +20,7 @@ from identification.estimators.delay import DelayEstimate, estimate_delays
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import DELAY, Question, choose_settings
+from identification.selection.inner_prediction import Question, choose_settings
 from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.repetition_noise import repetition_noise
 from identification.signals.samples import Preprocessing, Samples
@@ -92,27 +92,32 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     sources = replace(sources, cell=stated.law(sources.cell))
     notes: list[str] = []
     settings, found = stated, _delays(sources, stated, options, reporter)
-    by_axis = options.delay == "auto"
-    if found is not None and (by_axis or (options.delay is None and _other(sources, found))):
-        settings, notes = _compensated(stated, found, by_axis=by_axis)
-    undelayed = (settings if by_axis else stated).preprocessing.torque_delay
-    chosen = _chosen(sources, settings, undelayed, options, reporter)
+    suggested: tuple[float, ...] = ()
+    if found is not None and options.delay == "auto":
+        settings, notes = _compensated(stated, found)
+    elif found is not None and options.delay is None and _other(sources, found):
+        notes = _described(found)
+        suggested = (found.common,) if found.significant else ()
+    assumed = settings.preprocessing.torque_delay
+    chosen = _chosen(sources, settings, suggested, options, reporter)
     how = chosen.preprocessing
     lags = how.torque_bandwidth is not None and how.torque_shape.causal
-    if any(one.name == DELAY for one in chosen.choices):
-        found, notes = (
-            None,
-            [f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"],
-        )
-    elif found is not None and (lags or how.torque_delay != settings.preprocessing.torque_delay):
+    compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
+    if found is not None and lags:
         # It was found without the low-pass, and may be nothing but the lag of that.
         found, notes = (
             None,
             [
-                f"no other delay than the assumed {undelayed * 1e3:.3g} ms was applied beside the"
+                f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied beside the"
                 " low-pass of the torque"
             ],
         )
+    elif how.torque_delay in suggested:
+        notes.append(compensated)
+    elif how.torque_delay != assumed:
+        found, notes = None, [compensated]
+    elif found is not None and suggested:
+        found, notes = None, [f"{notes[0]}: it does not predict better, and was not applied"]
     variance = found.variance if found is not None and notes else 0.0
     return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
 
@@ -142,10 +147,11 @@ def _figures(values: NDArray[np.float64] | None) -> tuple[float, ...] | None:
     return None if values is None else tuple(values.tolist())
 
 
-def _questions(sources: Sources, options: Options) -> set[Question]:
+def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:
     """What inner prediction has to decide."""
     recorded = [source.recording for source in sources.training]
     asked: dict[Question, bool] = {
+        "delay": bool(suggested),
         "bandwidth": options.bandwidth == "auto",
         "velocity": options.velocity == "auto"
         and options.smoother == "spline"
@@ -165,18 +171,22 @@ def _questions(sources: Sources, options: Options) -> set[Question]:
 
 
 def _chosen(
-    sources: Sources, settings: Settings, undelayed: float, options: Options, reporter: Reporter
+    sources: Sources,
+    settings: Settings,
+    suggested: Sequence[float],
+    options: Options,
+    reporter: Reporter,
 ) -> Settings:
     """Choose what is automatic.
 
     Args:
         sources: the recordings, with the stated friction law.
-        settings: what is known, and the delay that was found.
-        undelayed: delay of the torque beside a causal low-pass [s].
+        settings: what is known.
+        suggested: other delays of the torque [s].
         options: what is automatic.
         reporter: of progress.
     """
-    cell, questions = sources.cell, _questions(sources, options)
+    cell, questions = sources.cell, _questions(sources, options, suggested)
     if not questions:
         return settings
     read = [signals_of(source, settings) for source in _read_to_choose(sources)]
@@ -191,12 +201,14 @@ def _chosen(
             model,
             noise_variance=sources.noise_variance,
             options=how,
-            undelayed=undelayed,
+            undelayed=settings.preprocessing.torque_delay,
         )
 
     start = Candidate(cell.model, settings.preprocessing)
     with reporter.task("choosing settings by inner prediction", 1) as task:
-        best, choices = choose_settings(ready, start, questions, low_passes, _ripples(cell))
+        best, choices = choose_settings(
+            ready, start, questions, low_passes, suggested, _ripples(cell)
+        )
         task.advance(1)
     law, friction = best.model.friction.laws[0], dict(settings.friction)
     if "presliding" in questions:
@@ -257,19 +269,24 @@ def _delays(
     return found
 
 
-def _compensated(
-    stated: Settings, found: DelayEstimate, *, by_axis: bool
-) -> tuple[Settings, list[str]]:
-    """Settings that compensate the delays that were found, and words.
-
-    One delay of all axes moves the time at which the motion is read; delays axis by axis, where
-    somebody asked for them, move the torques.
-    """
+def _described(found: DelayEstimate) -> list[str]:
+    """What was found, in words."""
     notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
     if not found.significant:
         notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
+    return notes
+
+
+def _compensated(stated: Settings, found: DelayEstimate) -> tuple[Settings, list[str]]:
+    """Settings that compensate the delays that somebody asked for, and words.
+
+    One delay of all axes moves the time at which the motion is read; delays axis by axis move the
+    torques.
+    """
+    notes = _described(found)
+    if not found.significant:
         return stated, notes
-    if found.agree or not by_axis:
+    if found.agree:
         notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
         return stated.preprocessed(torque_delay=found.common), notes
     notes.append("each axis was compensated by its own delay")

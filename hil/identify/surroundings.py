@@ -172,7 +172,7 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     """A delay or a low-pass of the torque that prediction chose, and nobody stated."""
     chosen = [one.name for one in prepared.settings.choices if one.chosen]
     how = prepared.settings.preprocessing
-    if DELAY in chosen:
+    if DELAY in chosen and prepared.delays is None:
         yield Finding(
             "delay",
             "doubtful",

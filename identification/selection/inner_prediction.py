@@ -34,7 +34,15 @@ from identification.signals.samples import Preprocessing, Samples, VelocitySourc
 
 Array = NDArray[np.float64]
 Question = Literal[
-    "bandwidth", "velocity", "presliding", "rows", "friction", "ripple", "low-pass", "estimator"
+    "delay",
+    "bandwidth",
+    "velocity",
+    "presliding",
+    "rows",
+    "friction",
+    "ripple",
+    "low-pass",
+    "estimator",
 ]
 
 FOLDS: Final = 5
@@ -228,6 +236,7 @@ def choose_settings(
     start: Settings,
     questions: Collection[Question],
     low_passes: LowPasses,
+    delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
     """Choose settings one question after the other, each with what was chosen before it.
@@ -237,6 +246,8 @@ def choose_settings(
         start: what is not asked for stays as it is here.
         questions: what is chosen.
         low_passes: looked for where "low-pass" is among them.
+        delays: of the torque that were found [s], of which one is used where "delay" is among them
+            and it predicts better than that of `start`.
         ripples: of which one is added to the model where "ripple" is among them and it helps.
 
     Returns:
@@ -251,15 +262,20 @@ def choose_settings(
         now = _with(now, left_out=LEFT_OUT[0])
     if "presliding" in questions:
         now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
-    choices: list[Choice] = []
+    delay: list[Choice] = []
     if "estimator" in questions:
         # The consistent solution is found once: what is compared on the way has to follow the data.
         quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
+    if "delay" in questions:
+        late = [_with(now, torque_delay=delay) for delay in delays]
+        found = trial.decide(DELAY, [now, *late], share=0.0)
+        now, delay = found.settings, [found.choice]
     first = now
     now, choices = _sweep(trial, first, questions)
     if "low-pass" in questions:
         now, choices = _with_low_pass(trial, first, now, choices, questions, low_passes)
+    choices = [*delay, *choices]
     # Models with other columns are compared, each with a centre of its own: now it needs one, too.
     trial.renew_centres()
     if "friction" in questions:

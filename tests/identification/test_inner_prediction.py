@@ -56,7 +56,7 @@ def chosen(
         return [samples if leaks else samples.between(0, CUT)]
 
     start = Settings(MODEL, Preprocessing())
-    return choose_settings(ready, start, questions, lambda *_: low_passes, [ripple])
+    return choose_settings(ready, start, questions, lambda *_: low_passes, ripples=[ripple])
 
 
 class TestChosenSettings:
