@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hil.files import make_folder, write_or_tell
 from hil.io.digest import json_digest
 from hil.reading import text_of
-from hil.results.frozen import Frozen
+from hil.results import Frozen
 from identification import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass

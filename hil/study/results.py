@@ -11,7 +11,7 @@ from typing import Final, Literal, Self
 
 from pydantic import Field
 
-from hil.results.frozen import Frozen
+from hil.results import Frozen
 
 from .records import ClassErrors, ExampleRecord, Fitted
 from .settings import StudySettings, load_json

@@ -12,12 +12,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import AliasChoices, Field, ValidationError, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.reading import json_of, text_of
-from hil.results.frozen import Frozen
+
+
+class Frozen(BaseModel):
+    """A section of a file: unchangeable, without unknown fields; no finite number is a word."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    def to_json(self) -> str:
+        """As indented JSON, the text of a file."""
+        return self.model_dump_json(indent=1) + "\n"
 
 
 class StepResult(Frozen):
