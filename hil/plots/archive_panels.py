@@ -13,10 +13,20 @@ from numpy.typing import NDArray
 
 from hil.plots.archive_view import ArchiveView, runs
 from hil.plots.archive_view import Trace as Recorded
-from hil.report.figures.canvas import blank, footed, headed, place, ruled
-from hil.report.figures.palette import FIRST, INK, MUTED, OUTSIDE_3, ROUTES, SECOND
-from hil.report.figures.svg import Panel, drawing, label, to_panel
-from hil.report.figures.traces import Plot, Trace, even_traces_text
+from hil.report.figures.canvas import (
+    FIRST,
+    INK,
+    MUTED,
+    OUTSIDE_3,
+    ROUTES,
+    SECOND,
+    blank,
+    footed,
+    headed,
+    place,
+    ruled,
+)
+from hil.report.figures.svg import Panel, Plot, Trace, drawing, even_traces_text, label, to_panel
 from hil.report.rendering import environment, page_bytes
 
 Array = NDArray[np.float64]

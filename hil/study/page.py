@@ -13,11 +13,23 @@ from numpy.typing import NDArray
 from hil.files import write_together
 from hil.progress import Reporter
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
-from hil.report.figures.correlation import matrix_panel
-from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
-from hil.report.figures.svg import Panel, drawing, to_panel
-from hil.report.figures.traces import Plot, Trace, traces_text
+from hil.report.figures.canvas import (
+    BAND,
+    FIRST,
+    INK,
+    MUTED,
+    ROUTES,
+    SECOND,
+    TICK_SIZE,
+    WIDE,
+    blank,
+    footed,
+    headed,
+    place,
+    ruled,
+)
+from hil.report.figures.parameters import matrix_panel
+from hil.report.figures.svg import Panel, Plot, Trace, drawing, to_panel, traces_text
 from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord
