@@ -6,21 +6,26 @@ r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in o
 Summed over the blocks b they are the :class:`identification.factor.factor.Factor`; block by block
 they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
 for any weights and parameters. Stored are only the columns that act on a joint, a third of all.
+
+Instrumental variables need the same of [Z | W | y], a factor of twice the parameters: W is the
+regressor of the measured motion, whose noise it carries, and Z that of a motion without measurement
+noise (:mod:`identification.estimators.instrument_motion`), column by column the same functions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
+from identification.errors import IdentificationError, ShapeError
 from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import Factor
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -97,12 +102,16 @@ class PhaseFactor:
             gram, self.columns, _sum(self.samples, other.samples), self.parameter_names
         )
 
+    def places(self, joint: int) -> NDArray[np.intp]:
+        """Where the columns of a joint's Gram stand among all p + 1, the torque being last."""
+        return np.append(self.columns[joint], self.n_parameters)
+
     def weighted(self, weights: Array) -> Array:
         """Gram matrices of the blocks (B, p + 1, p + 1) with one weight per joint (n,)."""
         width = self.n_parameters + 1
         whole = np.zeros((len(self.samples), width * width))
-        for weight, gram, used in zip(weights, self.gram, self.columns, strict=True):
-            place = np.append(used, self.n_parameters)
+        for joint, (weight, gram) in enumerate(zip(weights, self.gram, strict=True)):
+            place = self.places(joint)
             flat = (place[:, None] * width + place).ravel()
             whole[:, flat] += weight * gram.reshape(len(gram), -1)
         return whole.reshape(-1, width, width)
@@ -134,8 +143,8 @@ class PhaseFactor:
         """Factor of all blocks."""
         width = self.n_parameters + 1
         whole = np.zeros((self.n_joints, width, width))
-        for joint, (gram, used) in enumerate(zip(self.gram, self.columns, strict=True)):
-            place = np.append(used, self.n_parameters)
+        for joint, gram in enumerate(self.gram):
+            place = self.places(joint)
             whole[joint][np.ix_(place, place)] = gram.sum(axis=0)
         return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
 
@@ -151,6 +160,52 @@ class PhaseFactor:
             columns.append(place[used[stays]])
         names = tuple(self.parameter_names[k] for k in chosen)
         return PhaseFactor(tuple(gram), tuple(columns), self.samples, names)
+
+
+def instrument_factor(
+    model: RobotModel,
+    samples: Samples,
+    instrument: Motion,
+    usable: NDArray[np.bool_] | None = None,
+) -> PhaseFactor:
+    """Reduce a recording to blocks of [Z | W | y]: columns of Z by name, then the same of W.
+
+    Args:
+        model: the robot.
+        samples: the measured motion and torque.
+        instrument: motion without measurement noise, in the rows of the samples.
+        usable: where the instrument is known (m, n); everywhere without it. Rows count in
+            which the samples are usable and the instrument moves as well: which rows count
+            must not depend on the noise.
+
+    Raises:
+        ShapeError: the instrument does not have the rows and joints of the samples.
+    """
+    shape = samples.torque.shape
+    if instrument.position.shape != shape:
+        raise ShapeError("instrument", instrument.position.shape, str(shape))
+    rows = samples.usable & model.moving(instrument.velocity)
+    if usable is not None:
+        rows &= usable
+    index = fine_blocks(samples)
+    count = int(index[-1]) + 1 if len(index) else 0
+    columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
+    gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
+    measured = augmented_rows(model, replace(samples, usable=rows))
+    # Of the same rows, and through the same torque channel.
+    planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
+    for (part, blocks), (_, clean) in zip(measured, planned, strict=True):
+        runs = equal_runs(index[part])
+        for total, noisy, quiet in zip(gram, blocks, clean, strict=True):
+            add_grams(total, np.concatenate([quiet[:-1], noisy]), runs)
+    names = (*(f"Z {name}" for name in model.parameter_names), *model.parameter_names)
+    return PhaseFactor(gram, columns, samples_by_cell(index, rows), names)
+
+
+def measured_part(factor: PhaseFactor) -> PhaseFactor:
+    """Of :func:`instrument_factor` the part [W | y]: what least squares on the same rows sees."""
+    p = factor.n_parameters // 2
+    return factor.restricted(np.arange(p, 2 * p))
 
 
 def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:
