@@ -26,6 +26,7 @@ from identification.errors import IdentificationError, ShapeError
 from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import Factor
 from identification.model.motion import Motion
+from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -33,6 +34,7 @@ Array = NDArray[np.float64]
 Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s
+_MOST_BLOCKS: Final = 400  # of one recording, for gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +208,58 @@ def measured_part(factor: PhaseFactor) -> PhaseFactor:
     """Of :func:`instrument_factor` the part [W | y]: what least squares on the same rows sees."""
     p = factor.n_parameters // 2
     return factor.restricted(np.arange(p, 2 * p))
+
+
+def gain_factor(
+    model: RobotModel,
+    samples: Samples,
+    motor_current: Array,
+    *,
+    payload: Payload | None = None,
+    transmission: Array | None = None,
+) -> PhaseFactor:
+    """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
+
+    Args:
+        model: the robot without payload.
+        samples: its motion, and which rows count; its torque is not used. A motor's row
+            counts where the rows of all joints it acts on count.
+        motor_current: (m, n) [A], in the rows of the samples.
+        payload: what the robot carried.
+        transmission: motors' angles per joint angle (n, n); identity: motors are joints, and
+            gains include the gear ratio.
+
+    Raises:
+        ShapeError: an array does not have the shape it should have.
+    """
+    n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
+    turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
+    if turns.shape != (n, n):
+        raise ShapeError("transmission", turns.shape, f"({n}, {n})")
+    if motor_current.shape != (m, n):
+        raise ShapeError("motor_current", motor_current.shape, f"({m}, {n})")
+    blocks, columns = samples.regressor(model)
+    load = model.elements.known(samples.motion.position)
+    if payload is not None:
+        load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
+    time = samples.motion.time - samples.motion.time[0]
+    index = np.floor(time / max(FINE_BLOCK, time[-1] / _MOST_BLOCKS) + 1e-9).astype(np.int64)
+    runs = equal_runs(index)
+    gram = tuple(np.zeros((int(index[-1]) + 1, p + 2, p + 2)) for _ in range(n))
+    usable = np.zeros((m, n), dtype=np.bool_)
+    for motor, share in enumerate(np.linalg.inv(turns).T):
+        acting = np.flatnonzero(share).tolist()
+        usable[:, motor] = samples.usable[:, acting].all(axis=1)
+        table = np.zeros((m, p + 2))
+        for joint in acting:
+            table[:, columns[joint]] += share[joint] * blocks[joint]
+            table[:, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
+        table[:, p + 1] = motor_current[:, motor]
+        table[~usable[:, motor]] = 0.0
+        add_grams(gram[motor], table.T, runs)
+    names = (*model.parameter_names, "torque of the payload")
+    every = (np.arange(p + 1),) * n
+    return PhaseFactor(gram, every, samples_by_cell(index, usable), names)
 
 
 def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:
