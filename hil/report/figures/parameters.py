@@ -290,7 +290,9 @@ def matrix_panel(
         axes = place(figure, _LABELS, _LABELS, side, side)
         axes.imshow(matrix, cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none", aspect="auto")
         _label_cells(axes, names, side / n)
-        _scale(place(figure, _LABELS + side + 22.0, _LABELS, 14.0, min(side, 200.0)))
+        scale = place(figure, _LABELS + side + 22.0, _LABELS, 14.0, min(side, 200.0))
+        shade_scale(scale)
+        scale.set_title("|ρ|", fontsize=TICK_SIZE, color=MUTED, pad=6.0)
         note = f"{above} of {n * (n - 1) // 2} pairs above 0.9" if title else ""
         return to_panel(figure, key=key, title=title, note=note, alt=alt)
 
@@ -310,7 +312,7 @@ def _label_cells(axes: Axes, names: list[str], cell: float) -> None:
         spine.set_color(MUTED)
 
 
-def _scale(axes: Axes) -> None:
+def shade_scale(axes: Axes, ink: str = INK, muted: str = MUTED) -> None:
     """The shade scale, as an image of its own (a colour bar would be 256 rectangles)."""
     shades = np.linspace(1.0, 0.0, 64)[:, None]
     axes.imshow(
@@ -319,11 +321,10 @@ def _scale(axes: Axes) -> None:
     axes.set_xticks([])
     axes.yaxis.tick_right()
     axes.set_yticks([0.0, 0.5, 1.0])
-    axes.set_yticklabels(["0", "0.5", "1"], color=INK)
-    axes.set_title("|ρ|", fontsize=TICK_SIZE, color=MUTED, pad=6.0)
+    axes.set_yticklabels(["0", "0.5", "1"], color=ink)
     for spine in axes.spines.values():
         spine.set_visible(True)
-        spine.set_color(MUTED)
+        spine.set_color(muted)
 
 
 _ELIMINATION_HEIGHT = 250.0
