@@ -93,7 +93,7 @@ class Element(ABC):
     def known(self, q: Array) -> Array:
         """Return the part of the torque [N·m] that is known (m,)."""
         known = [0.0 if one.identified else one.value or 0.0 for one in self.coefficients]
-        return self.shapes(q) @ np.array(known)
+        return np.asarray(self.shapes(q) @ np.array(known))
 
 
 @dataclass(frozen=True)
