@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
@@ -299,3 +301,10 @@ def test_of_two_alike_campaigns_few_are_said_to_differ(count: int, memory: float
 def test_holms_adjustment_is_that_of_the_book() -> None:
     found = holm(np.array([[np.nan, 0.01], [0.04, 0.03]]))
     np.testing.assert_allclose(found, [[np.nan, 0.03], [0.06, 0.06]])
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
+def test_holm_never_lowers_a_p_value_and_keeps_their_order(values: list[float]) -> None:
+    adjusted = holm(np.array(values))
+    assert np.all(adjusted >= values) and adjusted.max() <= 1.0
+    assert np.all(np.diff(adjusted[np.argsort(values, kind="stable")]) >= 0.0)

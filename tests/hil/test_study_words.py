@@ -25,8 +25,9 @@ from hil.study.results import (
     EqualDataResult,
     StudyParameter,
     StudyResults,
+    reading_of,
+    summary_of,
 )
-from hil.study.sentences import reading_of, summary_of
 from hil.study.tables import Condition, condition_result
 
 from .fast_cell import fast_cell

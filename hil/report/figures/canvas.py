@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -130,6 +131,22 @@ def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
     rows = [np.column_stack([v, v, gap]).ravel() for v in (x, y)]
     with mpl.rc_context({"path.simplify": False}):
         axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
+
+
+def boxed(axes: Axes, columns: Sequence[Array], width: float, **options: Any) -> None:
+    """A box for each column, side by side from 1 on: quartiles, median and whiskers."""
+    thin = {"color": MUTED, "linewidth": 1.1}
+    axes.boxplot(
+        columns,
+        positions=range(1, len(columns) + 1),
+        widths=width,
+        patch_artist=True,
+        boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
+        medianprops={"color": INK, "linewidth": 2.2},
+        whiskerprops=thin,
+        capprops=thin,
+        **options,
+    )
 
 
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:

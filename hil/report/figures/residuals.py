@@ -15,11 +15,11 @@ from hil.report.figures.canvas import (
     BAND,
     FIRST,
     GRID,
-    INK,
     MUTED,
     SECOND,
     WIDE,
     blank,
+    boxed,
     footed,
     headed,
     log_ticks,
@@ -264,7 +264,8 @@ def _box_panel(j: int, name: str, errors: NDArray[np.float64], expected: float) 
         axes = place(figure, 46.0, 24.0, _BOX_WIDTH - 54.0, _BOX_HEIGHT - 34.0)
         top = max(float(errors.max()), 1e-12)
         if errors.size >= _FEWEST_FOR_A_BOX:
-            _box(axes, errors)
+            # Every run is a dot of its own.
+            boxed(axes, [errors], 0.55, showfliers=False)
         axes.scatter(
             _spread(errors), errors, s=16.0, color=FIRST, alpha=0.85, linewidths=0.0, zorder=3
         )
@@ -279,21 +280,6 @@ def _box_panel(j: int, name: str, errors: NDArray[np.float64], expected: float) 
         headed(axes, "mean |e| [N·m]")
         note = f"median {numbers.significant(middle)} N·m"
         return to_panel(figure, key=f"b{j}", title=name, note=note, alt=alt)
-
-
-def _box(axes: Axes, errors: NDArray[np.float64]) -> None:
-    thin = {"color": MUTED, "linewidth": 1.1}
-    axes.boxplot(
-        errors,
-        positions=[1.0],
-        widths=0.55,
-        showfliers=False,  # every run is drawn as a dot of its own
-        patch_artist=True,
-        boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
-        medianprops={"color": INK, "linewidth": 2.2},
-        whiskerprops=thin,
-        capprops=thin,
-    )
 
 
 def _spread(errors: NDArray[np.float64]) -> NDArray[np.float64]:
