@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.factor.augmented_rows import augmented_rows
-from identification.factor.factor import Factor
+from identification.factor.factor import Factor, augmented_rows
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import (
     QR_CONDITION,
     Factor,
     QRFactor,
+    augmented_rows,
     estimate,
     joint_weights,
     reduced,

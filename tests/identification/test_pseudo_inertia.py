@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from identification.model.kinematics import FROM_PINOCCHIO
 from identification.model.pseudo_inertia import (
+    AS_GIVEN,
+    ASSUMED,
+    MADE_POSSIBLE,
     Body,
     NoMassError,
     body,
@@ -17,8 +20,8 @@ from identification.model.pseudo_inertia import (
     margin,
     pseudo_inertia,
     pseudo_inertia_map,
+    reference_bodies,
 )
-from identification.model.reference_bodies import AS_GIVEN, ASSUMED, MADE_POSSIBLE, reference_bodies
 
 Array = NDArray[np.float64]
 

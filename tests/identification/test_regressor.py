@@ -9,8 +9,7 @@ import pytest
 
 from identification import FrictionLaw, RobotModel
 from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
-from identification.model.link_motion import LinkMotion, _cos_sin
-from identification.model.regressor import CHUNK, joint_arrays
+from identification.model.regressor import CHUNK, LinkMotion, _cos_sin, joint_arrays
 from sim_fixtures.ns16 import urdf_text
 
 
