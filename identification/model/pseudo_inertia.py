@@ -11,8 +11,8 @@ this full physical consistency): the mass is positive, the tensor about the cent
 positive and obeys the triangle inequalities. J is linear in the parameters.
 
 Nominal parameters of a description are often no body at all: left out, typed with a slip, or of a
-rod without thickness. :func:`reference_bodies` keeps as much of each link as is possible, to hold on
-to where data leave its parameters open.
+rod without thickness. :func:`reference_bodies` keeps as much of each link as is possible, to hold
+on to where data leave its parameters open.
 
 The ten parameters stand in the order of :data:`identification.model.wrench.LINK_SYMBOLS`.
 """
