@@ -26,7 +26,6 @@ from hil.batch.workers import LocalWorkers
 from hil.campaign import design
 from hil.cell.text import replaced_value
 from hil.compare import compare_campaigns, gather
-from hil.compare.words import verdict
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -63,14 +62,16 @@ def measure(repetitions: int) -> dict[str, Any]:
         def compared(name: str) -> dict[str, Any]:
             pair = [str(places["first"]), str(places[name])]
             found = compare_campaigns(gather(pair, workers, Silent()))
-            prediction = found.prediction
             return {
-                "verdict": verdict(found),
+                "verdict": found.verdict,
                 "axes": {
-                    axis.joint: {"change": axis.relative(1), "changed": axis.changed[1]}
+                    axis.joint: {
+                        "change": [axis.change[1], *(axis.interval[1] or [])],
+                        "changed": axis.changed[1],
+                    }
                     for axis in found.axes
                 },
-                "prediction": None if prediction is None else prediction.overall,
+                "prediction": found.prediction.overall,
             }
 
         return {name: compared(name) for name in ("unchanged", "rubbing")}
@@ -84,7 +85,7 @@ def main() -> None:
     options = parser.parse_args()
     found = measure(options.repetitions)
     if options.json:
-        print(json.dumps(found, default=lambda array: array.tolist()))
+        print(json.dumps(found))
         return
     for name, one in found.items():
         print(f"{name}: {one['verdict']}; prediction error by model and campaign:")

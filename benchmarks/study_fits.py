@@ -19,7 +19,7 @@ from identification.estimators.losses import Huber, Tukey
 from identification.estimators.repetitions import estimate_repetitions
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate, Factor
-from identification.factor.instruments import InstrumentFactor
+from identification.factor.phases import instrument_factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
@@ -207,9 +207,7 @@ class Study:
     ) -> tuple[InstrumentalEstimate, EndogeneityTest]:
         assert commanded is not None
         instruments = planned_motion(samples, commanded)
-        factor = InstrumentFactor.from_samples(
-            self.model, samples, instruments.motion, instruments.usable
-        )
+        factor = instrument_factor(self.model, samples, instruments.motion, instruments.usable)
         result = estimate_instrumental(self.model, factor)
         return result, endogeneity_test(self.model, factor, result)
 

@@ -35,8 +35,7 @@ from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 from identification.factor.factor import Estimate, Factor, NormalEquations, QRFactor, estimate
-from identification.factor.instruments import InstrumentFactor
-from identification.factor.phases import PhaseFactor
+from identification.factor.phases import PhaseFactor, instrument_factor
 from identification.model.base_parameters import BaseParameters
 from identification.model.coupling import Coupling
 from identification.model.elements import (
@@ -102,7 +101,7 @@ __all__ = [
     "NormalEquations",
     "QRFactor",
     "PhaseFactor",
-    "InstrumentFactor",
+    "instrument_factor",
     # estimators: from recordings
     "Estimate",
     "fit_least_squares",

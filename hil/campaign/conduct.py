@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
-from hil.results.results import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.results import ConductResult, RecordedResult, StepResult, WarmUpResult
 from hil.terminal_text import plural
 
 from .dry_run import DryRun

@@ -12,7 +12,7 @@ from pydantic import StrictBool, model_validator
 
 from hil.files import write_or_tell
 from hil.reading import lies_there, text_of
-from hil.results.frozen import Frozen
+from hil.results import Frozen
 
 from .errors import CampaignFolderError
 from .folder import CampaignFolder, read_back

@@ -11,7 +11,6 @@ import typer
 from hil.batch.workers import LocalWorkers
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.compare import compare_campaigns, gather
-from hil.compare.words import caveat, findings, to_dict, verdict
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
@@ -57,14 +56,14 @@ def compare(
         write_together(output.parent, {output.name: comparison_bytes(found)})
         reporter.say(f"report: {output}")
     if json:
-        typer.echo(json_module.dumps(to_dict(found)))
+        typer.echo(json_module.dumps(found.model_dump()))
     else:
         if not quiet:
-            for one in findings(found):
+            for one in found.findings:
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
             for warning in found.warnings:
                 typer.echo(printable(f"note: {warning}"), err=True)
-            typer.echo(f"note: {caveat(found)}", err=True)
-        typer.echo(printable(f"{verdict(found)}."))
+            typer.echo(f"note: {found.caveat}", err=True)
+        typer.echo(printable(f"{found.verdict}."))
     if fail_on_change and found.changed:
         raise typer.Exit(CHANGED)

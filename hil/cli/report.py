@@ -12,8 +12,7 @@ from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
-from hil.report import csv_tables
-from hil.results import Results
+from hil.results import Results, csv_tables
 
 
 def report(

@@ -18,7 +18,7 @@ from hil.cli.arguments import JsonOption, QuietOption
 from hil.errors import InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_campaigns, study_settings
-from hil.study.sentences import summary_of
+from hil.study.results import summary_of
 
 _DEFAULT: Final = signal.SIG_DFL
 

@@ -1,24 +1,28 @@
-"""What changed from one campaign of an arm to another: pure, from estimates."""
+"""What changed from one campaign of an arm to another: numbers and sentences, from estimates."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hil.batch.estimates import errors, relative_error
 from hil.batch.types import LevelEstimate
+from hil.results import Frozen
 from identification import RobotModel
 
+from .findings import Finding, payload_findings
 from .gather import Gathered
 from .payload import PayloadTrend, freedom_of, payload_trend
 from .spread import Difference, Known, difference, holm, known
 from .trend import (
     FALSE_ALARMS,
+    FEWEST,
     LEAST_FRICTION,
+    campaign_names,
     friction_in,
     friction_weights,
     short_names,
@@ -26,242 +30,253 @@ from .trend import (
 )
 
 Array = NDArray[np.float64]
+Numbers = list[float | None]
+"""Null for what is not known."""
 
 CONFIDENCE: Final = 0.95
 """Of intervals, each by itself."""
 OTHER_SPEED: Final = 1.2
 """Ratio of typical speeds from which two campaigns count as having moved differently."""
+PREDICTS_WORSE: Final = 1.1
+"""Ratio of prediction errors from which a model is said to predict worse."""
 _SHARE: Final = FALSE_ALARMS / 2.0  # of comparisons, each for friction and for what it carries
+_LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
 
 
-@dataclass(frozen=True, eq=False)
-class AxisChange:
-    """Friction of an axis in k campaigns, at one speed, mean of both directions.
+class CampaignCompared(Frozen):
+    """One campaign: the last part of its folder with its day, and where it comes from."""
 
-    Attributes:
-        joint: its name.
-        unit: of the friction.
-        speed: that it is compared at; NaN if it does not depend on speed.
-        speed_unit: of the speed.
-        known: of each campaign.
-        repetitions: friction by each single repetition, campaign by campaign.
-        differences: of each campaign against the first; the first's is None.
-        p_values: adjusted for all axes and campaigns (k,); NaN of the first.
-        changed: which campaigns differ from the first by more than chance and enough to matter.
-        slight: which differ by more than chance, and too little to count as a change.
-        smallest: detection limit (k,), as a share; NaN of the first.
-    """
+    name: str
+    folder: str
+    when: str | None
+    repetitions: int
+    stated: str
+    """What its cell states, in words."""
+
+
+class AxisChange(Frozen):
+    """Friction of an axis, mean of both directions at one speed; lists follow the campaigns."""
 
     joint: str
     unit: str
-    speed: float
+    speed: float | None
+    """That it is compared at; null if it does not depend on speed."""
     speed_unit: str
-    known: tuple[Known, ...]
-    repetitions: tuple[Array, ...]
-    differences: tuple[Difference | None, ...]
-    p_values: Array
-    changed: tuple[bool, ...]
-    slight: tuple[bool, ...]
-    smallest: Array
+    friction: Numbers
+    std: Numbers
+    repetitions: list[Numbers]
+    """Friction by each single repetition, campaign by campaign."""
+    change: Numbers
+    """Against the first campaign, as a share; the first's is null."""
+    interval: list[Numbers | None]
+    """Of the change, 95 %."""
+    p_value: Numbers
+    """Of no change, adjusted for all axes and campaigns."""
+    changed: list[bool]
+    """Which campaigns differ from the first by more than chance and enough to matter."""
+    slight: list[bool]
+    """Which differ by more than chance, and too little to count as a change."""
+    smallest: Numbers
+    """Detection limit, as a share."""
 
-    def relative(self, k: int) -> tuple[float, float, float]:
-        """Change of campaign k against the first as a share, and its 95 % interval."""
-        one, size = self.differences[k], abs(self.known[0].value)
-        assert one is not None
-        half = one.half(1.0 - CONFIDENCE)
-        return one.value / size, (one.value - half) / size, (one.value + half) / size
+
+class PayloadChange(Frozen):
+    """What the last link carries beside what is stated; lists follow the campaigns."""
+
+    untested: str | None
+    """Why there is no test."""
+    changed: list[bool]
+    other_inertia: list[bool]
+    """Whether inertial parameters changed, but not as by a payload."""
+    mass: Numbers
+    """On top of the first campaign's, kg; null where it cannot be seen."""
+    mass_std: Numbers
+    p_value: Numbers
+    effect: Numbers
+    """RMS torque of the change, as a share of the torque error."""
 
 
-@dataclass(frozen=True, eq=False)
-class ParameterChange:
-    """One parameter in k campaigns; as :class:`AxisChange`."""
+class ParameterChange(Frozen):
+    """One parameter; lists follow the campaigns."""
 
     name: str
     unit: str
-    is_friction: bool
-    known: tuple[Known, ...]
-    differences: tuple[Difference | None, ...]
-    p_values: Array
-
-    def differs(self, k: int) -> bool:
-        """Whether campaign k differs from the first by more than chance."""
-        return bool(self.p_values[k] < FALSE_ALARMS)
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """How the model of one campaign predicts the validation motions of another.
-
-    Attributes:
-        overall: ||e|| / ||tau|| over all joints (k, k): of the model by row, motion by column; NaN
-            where a campaign has no validation motion.
-        joints: the same per joint (k, k, n).
-    """
-
-    overall: Array
-    joints: Array
+    friction: bool
+    value: Numbers
+    std: Numbers
+    change: Numbers
+    """Against the first campaign."""
+    change_std: Numbers
+    p_value: Numbers
+    changed: list[bool]
+    """Which campaigns differ from the first by more than chance."""
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """What changed over k campaigns of one arm, the first being what others are compared with.
+class Prediction(Frozen):
+    """||e|| / ||tau|| of the model by row on the validation motion by column, null without one."""
 
-    Attributes:
-        arm: its name.
-        joint_names: of the arm.
-        campaigns: as they were estimated.
-        dated: whether they are in order of time.
-        simulated: whether no robot moved.
-        axes: friction.
-        parameters: one by one.
-        payload: what the last link carries.
-        prediction: of each other's motions.
-        warnings: what a reader must know.
-    """
+    overall: list[Numbers]
+    joints: list[list[Numbers]]
+    """The same per joint, which is last."""
+
+
+class Comparison(Frozen):
+    """What changed over the campaigns of one arm, the first being what others are compared with."""
 
     arm: str
-    joint_names: tuple[str, ...]
-    campaigns: tuple[LevelEstimate, ...]
-    dated: bool
+    joint_names: list[str]
     simulated: bool
-    axes: tuple[AxisChange, ...]
-    parameters: tuple[ParameterChange, ...]
-    payload: PayloadTrend
+    dated: bool
+    """Whether campaigns are in order of time."""
+    changed: bool
+    friction_changed: bool
+    friction_slight: bool
+    """Whether friction of any axis differs, but by too little to count as a change."""
+    load_changed: bool
+    """Whether what the arm carries, or its inertial parameters, changed."""
+    verdict: str
+    findings: list[Finding]
+    """Everything in sentences, what changed first; never empty."""
+    caveat: str
+    """What few campaigns cannot show."""
+    warnings: list[str]
+    campaigns: list[CampaignCompared]
+    axes: list[AxisChange]
+    payload: PayloadChange
+    parameters: list[ParameterChange]
     prediction: Prediction
-    warnings: tuple[str, ...]
-
-    @property
-    def changed(self) -> bool:
-        """Whether anything has changed."""
-        return self.friction_changed or self.load_changed
-
-    @property
-    def friction_changed(self) -> bool:
-        """Whether friction of any axis is."""
-        return any(any(axis.changed) for axis in self.axes)
-
-    @property
-    def friction_slight(self) -> bool:
-        """Whether friction of any axis differs, but by too little to count as a change."""
-        return any(any(axis.slight) for axis in self.axes)
-
-    @property
-    def load_changed(self) -> bool:
-        """Whether what the arm carries, or its inertial parameters, are."""
-        return any(self.payload.changed) or any(self.payload.other)
 
 
 def compare_campaigns(gathered: Gathered) -> Comparison:
     """Compare the campaigns of one arm with the first of them."""
     model, campaigns = gathered.arm.cell.model, gathered.campaigns
-    broken = tuple(
-        f"{name} could not be used: {one.reason}"
-        for name, one in zip(
-            short_names([one.path for one in gathered.broken]), gathered.broken, strict=True
-        )
-    )
-    called = short_names([one.campaign for one in campaigns])
-    own = tuple(
-        f"{name}: {warning}"
-        for name, one in zip(called, campaigns, strict=True)
-        for warning in one.warnings
-    )
+    names = campaign_names(campaigns, days=gathered.dated)
+    axes, payload = _axes(model, gathered), payload_trend(model, campaigns, _SHARE)
+    prediction = _prediction(campaigns, model.n_joints)
+    friction_changed = any(any(axis.changed) for axis in axes)
+    load_changed = any(payload.changed) or any(payload.other)
     return Comparison(
         arm=gathered.arm.name,
-        joint_names=model.joint_names,
-        campaigns=campaigns,
-        dated=gathered.dated,
+        joint_names=list(model.joint_names),
         simulated=gathered.simulated,
-        axes=_axes(model, gathered),
+        dated=gathered.dated,
+        changed=friction_changed or load_changed,
+        friction_changed=friction_changed,
+        friction_slight=any(any(axis.slight) for axis in axes),
+        load_changed=load_changed,
+        verdict=_verdict(axes, payload),
+        findings=_findings(names, axes, payload, prediction),
+        caveat=_caveat(len(campaigns)),
+        warnings=_warnings(model, gathered),
+        campaigns=[
+            CampaignCompared(
+                name=name,
+                folder=one.campaign,
+                when=one.when or None,
+                repetitions=one.repetitions,
+                stated=one.setup,
+            )
+            for name, one in zip(names, campaigns, strict=True)
+        ],
+        axes=axes,
+        payload=PayloadChange(
+            untested=payload.untested or None,
+            changed=list(payload.changed),
+            other_inertia=list(payload.other),
+            mass=_numbers(payload.mass),
+            mass_std=_numbers(payload.mass_std),
+            p_value=[None if one is None else _number(one.p_value) for one in payload.changes],
+            effect=[None if one is None else _number(one.effect) for one in payload.changes],
+        ),
         parameters=_parameters(model, gathered),
-        payload=payload_trend(model, campaigns, _SHARE),
-        prediction=_prediction(campaigns, model.n_joints),
-        warnings=(*broken, *_few(gathered, called), *_other_motion(model, campaigns, called), *own),
+        prediction=prediction,
     )
 
 
-def _axes(model: RobotModel, gathered: Gathered) -> tuple[AxisChange, ...]:
-    campaigns, repetitions = gathered.campaigns, gathered.repetitions
+def _axes(model: RobotModel, gathered: Gathered) -> list[AxisChange]:
+    campaigns = gathered.campaigns
     speed = typical_speed(model, campaigns)
     weights = friction_weights(model, speed)
     pooled = [friction_in(one, weights) for one in campaigns]
-    single = [_per_repetition(own, weights) for own in repetitions]
+    single = [
+        np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), len(weights))
+        for own in gathered.repetitions
+    ]
     rows = [
-        tuple(
+        [
             known(
                 value[j], std[j] ** 2 if np.isfinite(std[j]) else np.inf, freedom_of(one), rep[:, j]
             )
             for one, (value, std), rep in zip(campaigns, pooled, single, strict=True)
-        )
+        ]
         for j in range(model.n_joints)
     ]
-    apart = [_differences(row) for row in rows]
-    adjusted = holm(np.array([[np.nan if d is None else d.p_value for d in row] for row in apart]))
+    apart, adjusted = _differences(rows)
     tests = int(np.isfinite(adjusted).sum())
     found = []
     for j, joint in enumerate(model.joint_names):
         turns, size = bool(model.chain.revolute[j]), abs(rows[j][0].value)
         least = LEAST_FRICTION * size
+        away = np.array([one.value for one in apart[j]])
+        half = np.array([one.half(1.0 - CONFIDENCE) for one in apart[j]])
         # What Holm's procedure asks of the first of all tests.
-        reach = np.array(
-            [np.nan if d is None else d.half(_SHARE / max(1, tests)) for d in apart[j]]
-        )
-        judged = [
-            (d is not None and bool(p < _SHARE), d is not None and bool(abs(d.value) >= least))
-            for d, p in zip(apart[j], adjusted[j], strict=True)
-        ]
+        reach = np.array([one.half(_SHARE / max(1, tests)) for one in apart[j]])
+        sure, large = adjusted[j] < _SHARE, np.abs(away) >= least
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change, low, high = (_numbers(one / size) for one in (away, away - half, away + half))
         found.append(
             AxisChange(
                 joint=joint,
                 unit="N·m" if turns else "N",
-                speed=float(speed[j]),
+                speed=_number(speed[j]),
                 speed_unit="rad/s" if turns else "m/s",
-                known=rows[j],
-                repetitions=tuple(rep[:, j] for rep in single),
-                differences=apart[j],
-                p_values=adjusted[j],
-                changed=tuple(sure and large for sure, large in judged),
-                slight=tuple(sure and not large for sure, large in judged),
-                smallest=np.maximum(reach, least) / (size or np.nan),
+                friction=[_number(one.value) for one in rows[j]],
+                std=[_number(one.std) for one in rows[j]],
+                repetitions=[_numbers(own[:, j]) for own in single],
+                change=[None, *change],
+                interval=[None, *([*ends] for ends in zip(low, high, strict=True))],
+                p_value=[None, *_numbers(adjusted[j])],
+                changed=[False, *(sure & large).tolist()],
+                slight=[False, *(sure & ~large).tolist()],
+                smallest=[None, *_numbers(np.maximum(reach, least) / (size or np.nan))],
             )
         )
-    return tuple(found)
+    return found
 
 
-def _parameters(model: RobotModel, gathered: Gathered) -> tuple[ParameterChange, ...]:
-    campaigns = gathered.campaigns
-    single = [np.array([one.values for one in own]) for own in gathered.repetitions]
-    unknown = [np.array([~np.isfinite(one.std) for one in own]) for own in gathered.repetitions]
-    single = [np.where(lost, np.nan, values) for values, lost in zip(single, unknown, strict=True)]
+def _parameters(model: RobotModel, gathered: Gathered) -> list[ParameterChange]:
+    single = [
+        np.array([np.where(np.isfinite(one.std), one.values, np.nan) for one in own])
+        for own in gathered.repetitions
+    ]
     rows = [
-        tuple(
+        [
             known(float(one.values[k]), float(one.std[k]) ** 2, freedom_of(one), own[:, k])
-            for one, own in zip(campaigns, single, strict=True)
-        )
+            for one, own in zip(gathered.campaigns, single, strict=True)
+        ]
         for k in range(model.n_parameters)
     ]
-    apart = [_differences(row) for row in rows]
-    adjusted = holm(np.array([[np.nan if d is None else d.p_value for d in row] for row in apart]))
-    return tuple(
+    apart, adjusted = _differences(rows)
+    return [
         ParameterChange(
             name=model.parameter_names[k],
             unit=model.units[k],
-            is_friction=k >= model.base.rank,
-            known=rows[k],
-            differences=apart[k],
-            p_values=adjusted[k],
+            friction=k >= model.base.rank,
+            value=[_number(one.value) for one in rows[k]],
+            std=[_number(one.std) for one in rows[k]],
+            change=[None, *(_number(one.value) for one in apart[k])],
+            change_std=[None, *(_number(one.std) for one in apart[k])],
+            p_value=[None, *_numbers(adjusted[k])],
+            changed=[False, *(adjusted[k] < FALSE_ALARMS).tolist()],
         )
         for k in range(model.n_parameters)
-    )
+    ]
 
 
-def _differences(row: Sequence[Known]) -> tuple[Difference | None, ...]:
-    return (None, *(difference(row[0], one) for one in row[1:]))
-
-
-def _per_repetition(own: Sequence[LevelEstimate], weights: Array) -> Array:
-    """Friction of each axis by each repetition (m, n)."""
-    return np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), len(weights))
+def _differences(rows: Sequence[Sequence[Known]]) -> tuple[list[list[Difference]], Array]:
+    """Differences of all others from the first campaign, and their adjusted p values."""
+    apart = [[difference(row[0], one) for one in row[1:]] for row in rows]
+    return apart, holm(np.array([[one.p_value for one in row] for row in apart]))
 
 
 def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction:
@@ -278,25 +293,39 @@ def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction
             left, torque = errors(motion.unseen, one.values)
             joints[row, column] = left / np.where(torque > 0.0, torque, np.nan)
             overall[row, column] = relative_error(left, torque, rows)
-    return Prediction(overall, joints)
+    return Prediction(overall=_numbers(overall), joints=_numbers(joints))
 
 
-def _few(gathered: Gathered, called: Sequence[str]) -> list[str]:
-    """Where single repetitions cannot say what repetitions differ by."""
-    single = [name for name, own in zip(called, gathered.repetitions, strict=True) if len(own) < 2]
-    if not single:
-        return []
-    return [
-        f"{', '.join(single)}: one repetition, so what repetitions differ by is not known, and "
-        "only noise is allowed for"
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: ArrayLike) -> Any:
+    """Nested lists of numbers (...), None for what is not finite."""
+    found = np.array(values, dtype=object)
+    found[~np.isfinite(np.asarray(values, dtype=np.float64))] = None
+    return found.tolist()
+
+
+# Warnings
+
+
+def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:
+    """What a reader must know: lost archives, few repetitions, other motions."""
+    campaigns = gathered.campaigns
+    called = short_names([one.campaign for one in campaigns])
+    lost = short_names([one.path for one in gathered.broken])
+    found = [
+        f"{name} could not be used: {one.reason}"
+        for name, one in zip(lost, gathered.broken, strict=True)
     ]
-
-
-def _other_motion(
-    model: RobotModel, campaigns: Sequence[LevelEstimate], called: Sequence[str]
-) -> list[str]:
+    single = [name for name, own in zip(called, gathered.repetitions, strict=True) if len(own) < 2]
+    if single:
+        found.append(
+            f"{', '.join(single)}: one repetition, so what repetitions differ by is not known, and "
+            "only noise is allowed for"
+        )
     first = campaigns[0].speed_rms
-    found = []
     for name, one in zip(called[1:], campaigns[1:], strict=True):
         if first is None or one.speed_rms is None:
             continue
@@ -308,4 +337,145 @@ def _other_motion(
                 f"{name} moved differently from {called[0]} (typical speed of "
                 f"{', '.join(fast)}): what the model leaves out can then look like a change"
             )
+    found += [
+        f"{name}: {warning}"
+        for name, one in zip(called, campaigns, strict=True)
+        for warning in one.warnings
+    ]
     return found
+
+
+# Sentences
+
+
+def _verdict(axes: Sequence[AxisChange], payload: PayloadTrend) -> str:
+    """One line."""
+    changed = [axis.joint for axis in axes if any(axis.changed)]
+    slight = [axis.joint for axis in axes if any(axis.slight)]
+    parts = [f"friction of {_joined(changed)}"] if changed else []
+    parts += ["what the arm carries"] if any(payload.changed) else []
+    parts += ["inertial parameters"] if any(payload.other) else []
+    if parts:
+        return f"Changed: {_joined(parts)}"
+    if slight:
+        return f"No change of {_LEAST} or more; friction of {_joined(slight)} differs by less"
+    return "No significant change"
+
+
+def _caveat(count: int) -> str:
+    text = (
+        f"{count} campaigns do not show how much this arm differs from day to day without "
+        "anything having happened to it: a cold arm has tens of per cent more friction. Compare "
+        "campaigns of an arm that was equally warm."
+    )
+    if count > FEWEST:
+        text += " `hil reidentify` on the same folders judges each by the scatter of those before."
+    return text
+
+
+def _findings(
+    names: list[str],
+    axes: Sequence[AxisChange],
+    payload: PayloadTrend,
+    prediction: Prediction,
+) -> list[Finding]:
+    changes = [
+        _axis_finding(axis, k, names)
+        for axis in axes
+        for k in range(1, len(names))
+        if axis.changed[k]
+    ]
+    for one in payload_findings(payload, names):
+        level: Literal["changed", "same"] = "same" if one.level == "quiet" else "changed"
+        changes.append(Finding(level, one.words, one.next_step))
+    same = [*_slight(axes, names), *_unchanged(axes), *_load(payload)]
+    same += _predictions(prediction, names)
+    changes += [Finding("same", words) for words in same]
+    return sorted(changes, key=lambda one: one.level)  # stable: "changed" comes first
+
+
+def _axis_finding(axis: AxisChange, k: int, names: list[str]) -> Finding:
+    change, interval = axis.change[k], axis.interval[k]
+    assert change is not None and interval is not None, "what has changed is known"
+    low, high = (f"{100.0 * (end or 0.0):+.1f}" for end in interval)
+    at = "" if axis.speed is None else f" at {axis.speed:.2g} {axis.speed_unit}"
+    higher = change > 0.0
+    return Finding(
+        "changed",
+        f"{axis.joint}: friction{at} is {100.0 * abs(change):.0f} % "
+        f"{'higher' if higher else 'lower'} in {names[k]} than in {names[0]}, "
+        f"{axis.friction[k]:.3g} against {axis.friction[0]:.3g} {axis.unit} "
+        f"(95 %: {low} to {high} %).",
+        "Check this axis' gear, brake and lubrication; was it colder?"
+        if higher
+        else "Was it warmer, or has gear or lubricant been changed?",
+    )
+
+
+def _slight(axes: Sequence[AxisChange], names: list[str]) -> list[str]:
+    """What differs by more than chance, and by less than counts as a change."""
+    sentences = []
+    for k in range(1, len(names)):
+        some = [axis for axis in axes if axis.slight[k]]
+        if some:
+            sizes = [100.0 * (axis.change[k] or 0.0) for axis in some]
+            low, high = (f"{pick(sizes):+.1f}" for pick in (min, max))
+            sentences.append(
+                f"Friction of {_joined([axis.joint for axis in some])} has changed by"
+                f" {low if low == high else f'{low} to {high}'} % from {names[0]} to {names[k]}:"
+                f" more than chance, and less than the {_LEAST} that count as a change."
+            )
+    return sentences
+
+
+def _unchanged(axes: Sequence[AxisChange]) -> list[str]:
+    same = [axis for axis in axes if not any(axis.changed) and not any(axis.slight)]
+    limits = {
+        axis.joint: max((one for one in axis.smallest if one is not None), default=math.nan)
+        for axis in same
+        if any(p is not None for p in axis.p_value)
+    }
+    silent = [axis.joint for axis in same if axis.joint not in limits]
+    sentences = []
+    if limits:
+        worst = max(limits, key=lambda joint: limits[joint])
+        sentences.append(
+            f"Friction of {_joined([*limits])} has not changed significantly; the detection limit"
+            f" is {100.0 * limits[worst]:.0f} %"
+            + (f" (of {worst}, the least well known)." if len(limits) > 1 else ".")
+        )
+    if silent:
+        sentences.append(f"Friction of {_joined(silent)} is not determined.")
+    return sentences
+
+
+def _load(payload: PayloadTrend) -> list[str]:
+    if payload.untested:
+        return [f"Whether it carries the same was not tested: {payload.untested}."]
+    if any(payload.changed) or any(payload.other):
+        return []
+    return ["The payload has not changed significantly."]
+
+
+def _predictions(prediction: Prediction, names: list[str]) -> list[str]:
+    """How the first model does on the motions of the others, beside their own models."""
+    sentences = []
+    for k in range(1, len(names)):
+        own, first = prediction.overall[k][k], prediction.overall[0][k]
+        if first is None or not own:
+            continue
+        ratio = first / own
+        how = (
+            f"with {ratio:.2g} times the error of that campaign's own model"
+            if ratio > PREDICTS_WORSE
+            else "as well as that campaign's own model"
+        )
+        sentences.append(
+            f"The model of {names[0]} predicts the validation motions of {names[k]} "
+            f"{how}: {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque."
+        )
+    return sentences
+
+
+def _joined(words: list[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

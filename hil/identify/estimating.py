@@ -25,8 +25,7 @@ from identification.estimators.repetitions import RepeatedEstimate, estimate_rep
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import QR_CONDITION, Estimate, joint_weights, nothing_usable
-from identification.factor.instruments import InstrumentFactor
-from identification.factor.phases import PhaseFactor, total_phase
+from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 
@@ -101,9 +100,7 @@ def fit_instrumental(
             planned = planned_motion(samples, commanded, lag=lag)
             if lag is None:
                 plans.append((plan, planned.lag))
-            factors.append(
-                InstrumentFactor.from_samples(model, samples, planned.motion, planned.usable)
-            )
+            factors.append(instrument_factor(model, samples, planned.motion, planned.usable))
         total = factors[0]
         for factor in factors[1:]:
             total = total + factor

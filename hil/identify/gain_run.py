@@ -14,7 +14,7 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.gains import GainMethod, Gains, identify_gains
-from identification.factor.gains import GainFactor
+from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
@@ -73,7 +73,7 @@ def find_gains(
             None, "there is no archive", remedy="name recordings with and without load"
         )
     options = replace(FIXED, delay="stated" if delay is None else delay)
-    total: GainFactor | None = None
+    factors: list[PhaseFactor] = []
     loads: dict[str, Payload | None] = {}
     first: tuple[Cell, RobotModel, Array] | None = None
     with reporter.task("reading recordings", len(paths)) as task:
@@ -91,20 +91,16 @@ def find_gains(
                 samples = samples_of(source, cell, settings, first[1])
             except RecordingError as error:
                 raise ArchiveError(path, str(error), remedy="leave it out") from error
-            assert source.recording.motor_current is not None
-            factor = GainFactor.from_samples(
-                first[1],
-                samples,
-                source.recording.motor_current,
-                payload=payload,
-                transmission=turns,
+            current = source.recording.motor_current
+            assert current is not None
+            factors.append(
+                gain_factor(first[1], samples, current, payload=payload, transmission=turns)
             )
-            total = factor if total is None else total + factor
             loads[path.name] = payload
             task.advance(1, path.name)
-    assert first is not None and total is not None
+    assert first is not None
     cell, model, turns = first
-    gains = identify_gains(total, model.joint_names, method=method)
+    gains = identify_gains(joined(factors), model.joint_names, method=method)
     return GainsFound(gains, cell, loads, not np.array_equal(turns, np.eye(len(turns))))
 
 

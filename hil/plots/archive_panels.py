@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jinja2 import ChoiceLoader, FileSystemLoader
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.plots.archive_view import ArchiveView, runs
 from hil.plots.archive_view import Trace as Recorded
-from hil.report.figures.canvas import blank, footed, headed, place, ruled
-from hil.report.figures.palette import FIRST, INK, MUTED, OUTSIDE_3, ROUTES, SECOND
-from hil.report.figures.svg import Panel, drawing, label, to_panel
-from hil.report.figures.traces import Plot, Trace, even_traces_text
+from hil.report.figures.canvas import (
+    FIRST,
+    INK,
+    MUTED,
+    OUTSIDE_3,
+    ROUTES,
+    SECOND,
+    blank,
+    footed,
+    headed,
+    place,
+    ruled,
+)
+from hil.report.figures.svg import Panel, Plot, Trace, drawing, even_traces_text, label, to_panel
 from hil.report.rendering import environment, page_bytes
+from hil.terminal_text import plural
 
 Array = NDArray[np.float64]
 
@@ -141,9 +150,6 @@ def _draw(axes: Axes, grid: Array, plot: Plot) -> None:
     headed(axes, plot.heading)
 
 
-_TEMPLATES: Final = Path(__file__).parent / "templates"
-
-
 def archive_page(view: ArchiveView) -> bytes:
     """The page; the same archive gives the same bytes.
 
@@ -151,9 +157,8 @@ def archive_page(view: ArchiveView) -> bytes:
         view: read with `BINS`, so that there is something to zoom into.
     """
     facts = view.facts
-    known = environment()
-    assert known.loader is not None  # where macros and style sheet of all pages lie
-    known.loader = ChoiceLoader([FileSystemLoader(_TEMPLATES), known.loader])
+    # Also where none were missed, for a person looks for it; not where they were not counted.
+    missed = f"at {plural(len(view.gaps), 'place')}" if len(view.gaps) else "none"
     shown = f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"
     rows = [
         ("shown", shown),
@@ -161,26 +166,22 @@ def archive_page(view: ArchiveView) -> bytes:
         ("joints", ", ".join(facts.joint_names)),
         ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
         ("samples", str(facts.samples)),
-        *_missed(view),
+        *([("packets missed", missed)] if view.states else []),
         ("lost", facts.lost or "nothing"),
         ("damage", facts.damage or "none"),
         ("attachments", ", ".join(facts.attachments)),
         *facts.metadata.items(),
     ]
-    text = known.get_template("archive.html.j2").render(
-        facts=facts,
-        joints=archive_panels(view),
-        events=view.events,
-        states=view.states,
-        simulated=facts.metadata.get("simulated") == "yes",
-        rows=rows,
+    text = (
+        environment()
+        .get_template("archive.html.j2")
+        .render(
+            facts=facts,
+            joints=archive_panels(view),
+            events=view.events,
+            states=view.states,
+            simulated=facts.metadata.get("simulated") == "yes",
+            rows=rows,
+        )
     )
     return page_bytes(text)
-
-
-def _missed(view: ArchiveView) -> list[tuple[str, str]]:
-    """Where packets were missed; nothing where they were not counted them."""
-    if not view.states:
-        return []
-    places = f"at {len(view.gaps)} place{'s' * (len(view.gaps) > 1)}"
-    return [("packets missed", places if len(view.gaps) else "none")]

@@ -23,6 +23,7 @@ from hil.cell import AngleFrame, Cell
 from hil.plots import style
 from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
+from hil.report.figures.parameters import shade_scale
 from hil.report.figures.svg import label
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
 from identification.excitation.constraints import sampled
@@ -39,10 +40,6 @@ _MARKERS = "DsP^vX"
 _MARGIN = 0.09
 _LEAST = (0.1, 2.0)
 """The page shows at least this share of I_c, and so many powers of ten of the determinant."""
-_INSET, _QUEUE, _TO_EDGE = 0.05, 0.12, 11.0
-"""Of marks beyond an edge: share of the axes to it and to the next mark; the arrow [pt]."""
-_ROOM = 0.2
-"""Share of the front's size that is left free for them."""
 _ARROW = 15.0
 """pt; shorter ways from the point that a motion grew from get no arrow."""
 _LETTER, _KEY, _LINE = 0.062, 0.36, 0.145
@@ -151,11 +148,11 @@ class FrontView:
         middle = (low + high) / 2.0
         low, high = middle - size / 2.0, middle + size / 2.0
         others = np.array([m.measures[::-1] for m in self.marks if m.compared]).reshape(-1, 2)
-        below, above = others < low - size, others > high + size
-        shown = np.concatenate((np.where(below | above, np.nan, others), [low, high]))
+        far = (others < low - size) | (others > high + size)
+        shown = np.concatenate((np.where(far, np.nan, others), [low, high]))
         low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
-        room = np.where([below.any(axis=0), above.any(axis=0)], _ROOM, _MARGIN) * (high - low)
-        return np.stack((low - room[0], high + room[1]), axis=1)
+        room = _MARGIN * (high - low)
+        return np.stack((low - room, high + room), axis=1)
 
     def placed(self, mark: _Mark) -> Array:
         """Return where a mark is, from 0 to 1 across and up the page if it has room there (2,)."""
@@ -206,14 +203,11 @@ def draw_front(axes: Axes, view: FrontView, width: float) -> None:
         axes.set_xlim(*view.window[0])
         axes.set_ylim(*view.window[1])
     handles = [_line(axes, view.front)] if view.front is not None and view.has_line else []
-    beyond = 0
     for mark in view.marks:
         look = {"linestyle": "none", "markeredgewidth": 1.0, "clip_on": False, **mark.look}
-        if view.is_beyond(mark):
-            handles += _at_edge(axes, view.placed(mark), beyond, look)
-            beyond += 1
-        else:
-            handles += axes.plot(mark.measures[1], mark.measures[0], **look)
+        # What has no room stands at the edge beyond which it is; the legend says so.
+        at = np.clip(view.placed(mark), 0.0, 1.0)
+        handles += axes.plot(*at, transform=axes.transAxes, **look)
     _growth(axes, view)
     axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], min_n_ticks=3))
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], min_n_ticks=3))
@@ -258,32 +252,6 @@ def _line(axes: Axes, front: FrontPoints) -> Any:
         clip_on=False,
     )
     return line
-
-
-def _at_edge(axes: Axes, place: Array, number: int, look: Mapping[str, Any]) -> list[Any]:
-    """Draw a mark that has no room inside the edge, with an arrow to where it is.
-
-    Args:
-        axes: where.
-        place: of the mark as a share of the axes (2,).
-        number: how many marks are at an edge already: each stands farther from it.
-        look: of the mark.
-    """
-    away = np.where(place > 1.0, 1.0, np.where(place < 0.0, -1.0, 0.0))
-    # In a corner all arrows point the same way: side by side, none hits the next mark.
-    queue = np.array([0.0, 1.0]) if np.all(away) else np.ones(2)
-    inset = _INSET + _QUEUE * number * queue
-    at = np.where(away == 0.0, place, 0.5 + (0.5 - inset) * away)
-    axes.annotate(
-        "",
-        (float(at[0]), float(at[1])),
-        xycoords="axes fraction",
-        xytext=tuple(_TO_EDGE * away),
-        textcoords="offset points",
-        arrowprops={"arrowstyle": "<|-,head_width=0.18,head_length=0.35", "color": style.INK},
-        zorder=2.9,
-    )
-    return axes.plot(*at, transform=axes.transAxes, **look)
 
 
 def _growth(axes: Axes, view: FrontView) -> None:
@@ -341,7 +309,7 @@ def draw_correlation(axes: Axes, scale: Axes, matrix: Array, names: Sequence[str
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
         )
     _blocks(axes, names)
-    _scale(scale)
+    shade_scale(scale, style.INK, style.MUTED)
 
 
 def blocks(names: Sequence[str]) -> list[tuple[str, int, int]]:
@@ -368,20 +336,6 @@ def _blocks(axes: Axes, names: Sequence[str]) -> None:
         axis.set_ticks(middles, [label for label, _, _ in found], color=style.INK)
     axes.tick_params(length=0.0, pad=3.0)
     axes.set_xlabel("parameters by joint, friction left out")
-    for spine in axes.spines.values():
-        spine.set_color(style.MUTED)
-
-
-def _scale(axes: Axes) -> None:
-    """The shades as an image of their own: a colour bar would be 256 rectangles."""
-    shades = np.linspace(1.0, 0.0, 64)[:, None]
-    axes.imshow(
-        shades, cmap="gray_r", vmin=0.0, vmax=1.0, aspect="auto", extent=(0.0, 1.0, 0.0, 1.0)
-    )
-    axes.set_xticks([])
-    axes.yaxis.tick_right()
-    axes.set_yticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
-    axes.tick_params(length=0.0, pad=2.0)
     for spine in axes.spines.values():
         spine.set_color(style.MUTED)
 

@@ -33,12 +33,12 @@ def draw_motion(
     limits: JointLimits,
     joint_names: Sequence[str],
     frame: AngleFrame,
-    postures: Array,
+    postures: Sequence[float] | Array = (),
 ) -> None:
-    """Draw one row per joint: position and velocity over a time axis that all share.
+    """Draw one row per joint: position, velocity and, in a third column, acceleration.
 
     Args:
-        rows: two axes per joint.
+        rows: two or three axes per joint.
         trajectory: what to draw.
         limits: its limits, URDF angles.
         joint_names: one per joint.
@@ -46,28 +46,26 @@ def draw_motion(
         postures: times that are numbered (k,) [s].
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
-    q, qd, _ = trajectory.sample(time)
+    q, *rates = trajectory.sample(time)
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
-    fastest = np.degrees(limits.velocity)
-    for joint, (name, (position, velocity)) in enumerate(zip(joint_names, rows, strict=True)):
-        for axes, values, low, high, colour in (
-            (position, frame.shown(q), ends[0], ends[1], style.POSITION),
-            (velocity, frame.shown_rate(qd), -fastest, fastest, style.VELOCITY),
-        ):
-            least, most = float(low[joint]), float(high[joint])
-            lowest, highest = float(values[:, joint].min()), float(values[:, joint].max())
-            shown = min(least, lowest), max(most, highest)
-            _against_limits(axes, least, most, shown, 0.1, 2.0)
+    fastest, most = np.degrees(limits.velocity), np.degrees(limits.acceleration)
+    columns = (
+        (f"position [deg, {frame.name} angles]", frame.shown(q), *ends, style.POSITION),
+        ("velocity [deg/s]", frame.shown_rate(rates[0]), -fastest, fastest, style.VELOCITY),
+        ("acceleration [deg/s²]", frame.shown_rate(rates[1]), -most, most, style.ACCELERATION),
+    )
+    for joint, (name, row) in enumerate(zip(joint_names, rows, strict=True)):
+        for axes, (_, values, low, high, colour) in zip(row, columns, strict=False):
+            _against_limits(axes, float(low[joint]), float(high[joint]), values[:, joint])
             for at in postures:
                 axes.axvline(at, color=style.RULE, linewidth=0.8)
             axes.plot(*thinned(time, values[:, joint], 400), color=colour, linewidth=1.1)
-            axes.set_xlim(0.0, trajectory.duration)
+            axes.set_xlim(0.0, max(trajectory.duration, 1e-9))
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
             style.bare(axes)
             axes.grid(False, axis="x")
-        _name(position, broken(name))
-    titles = (f"position [deg, {frame.name} angles]", "velocity [deg/s]")
-    for axes, title in zip(rows[0], titles, strict=True):
+        _name(row[0], broken(name))
+    for axes, (title, *_) in zip(rows[0], columns, strict=False):
         axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
         for number, at in enumerate(postures, 1):
             _number(axes, number, at, fontweight="bold", annotation_clip=False)
@@ -104,20 +102,18 @@ def _shortened(text: str) -> str:
     return text if len(text) <= _LETTERS else f"{text[:half]}…{text[half + 1 - _LETTERS :]}"
 
 
-def _against_limits(
-    axes: Axes, low: float, high: float, shown: tuple[float, float], share: float, apart: float
-) -> None:
-    """Show both limits, with a share of room about what is `shown`.
+def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
+    """Show both limits and all values, with some room about them.
 
-    Zero, or the middle where it lies outside, has a tick too, if that lies `apart` times the room
-    from both limits.
+    Zero, or the middle where it lies outside, has a tick too, if that lies apart from both limits.
     """
     for bound in (low, high):
         axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
-    room = share * (shown[1] - shown[0])
-    axes.set_ylim(shown[0] - room, shown[1] + room)
+    least, most = min(low, float(values.min())), max(high, float(values.max()))
+    room = 0.1 * (most - least)
+    axes.set_ylim(least - room, most + room)
     middle = 0.0 if low < 0.0 < high else (low + high) / 2.0
-    inside = min(abs(middle - low), abs(high - middle)) > apart * room
+    inside = min(abs(middle - low), abs(high - middle)) > 2.0 * room
     axes.set_yticks([low, middle, high] if inside else [low, high])
     axes.yaxis.set_major_formatter("{x:.4g}")
 
@@ -140,31 +136,12 @@ def _number(axes: Axes, number: int, at: float, **words: Any) -> None:
 def draw_joints(
     rows: Sequence[Sequence[Axes]], plan: MotionPlan, joint_names: Sequence[str], frame: AngleFrame
 ) -> None:
-    """Draw a plan into one row of three axes per joint."""
-    time = np.linspace(0.0, plan.trajectory.duration, _SAMPLES)
-    q, qd, qdd = plan.trajectory.sample(time)
-    ends = np.sort([frame.shown(plan.limits.lower), frame.shown(plan.limits.upper)], axis=0)
-    quantities = (
-        (frame.shown(q), ends[0], ends[1], style.POSITION),
-        *(
-            (frame.shown_rate(rate), -np.degrees(limit), np.degrees(limit), colour)
-            for rate, limit, colour in (
-                (qd, plan.limits.velocity, style.VELOCITY),
-                (qdd, plan.limits.acceleration, style.ACCELERATION),
-            )
-        ),
-    )
+    """Draw a plan into one row of three axes per joint, with its targets and corners."""
+    draw_motion(rows, plan.trajectory, plan.limits, joint_names, frame)
     targets = np.array([frame.shown(move.target) for move in plan.moves])
-    for joint, (name, row) in enumerate(zip(joint_names, rows, strict=True)):
-        for axes, (values, low, high, colour) in zip(row, quantities, strict=True):
-            least, most = float(low[joint]), float(high[joint])
-            _against_limits(axes, least, most, (least, most), 0.08, 1.0)
+    for joint, row in enumerate(rows):
+        for axes in row:
             _corners(axes, plan)
-            axes.plot(*thinned(time, values[:, joint], 250), color=colour, linewidth=1.2)
-            axes.set_xlim(0.0, max(float(time[-1]), 1e-9))
-            axes.tick_params(labelbottom=joint == len(rows) - 1)
-            style.bare(axes)
-        row[0].set_ylabel(name, color=style.INK)
         row[0].plot(
             [target.time for target in plan.targets],
             targets[:, joint],
@@ -177,12 +154,8 @@ def draw_joints(
             clip_on=False,
             zorder=4.0,
         )
-    titles = (f"position [deg, {frame.name} angles]", "velocity [deg/s]", "acceleration [deg/s²]")
-    for axes, title in zip(rows[0], titles, strict=True):
-        axes.set_title(title, loc="left", color=style.MUTED, pad=14.0)
+    for axes in rows[0]:
         _numbers(axes, plan)
-    for axes in rows[-1]:
-        axes.set_xlabel("time [s]")
 
 
 def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
@@ -200,7 +173,7 @@ def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
 
 def _corners(axes: Axes, plan: MotionPlan) -> None:
     for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
-        axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0)
+        axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0, zorder=0.5)
         axes.axvline(target.time, color=style.MUTED, linewidth=0.7, linestyle=_LINES[target.how])
 
 

@@ -7,6 +7,6 @@ from __future__ import annotations
 
 from hil.report.page import render_report, report_bytes
 from hil.report.series import ReportSeries, SeriesError
-from hil.report.tables import csv_tables
+from hil.results import csv_tables
 
 __all__ = ["report_bytes", "render_report", "ReportSeries", "SeriesError", "csv_tables"]

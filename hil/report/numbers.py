@@ -70,18 +70,18 @@ def percent(fraction: float | None, decimals: int | None = None) -> str:
     return fixed(100.0 * fraction, 0 if size >= 99.5 else 1 if size >= 9.95 else 2)
 
 
-def with_std(value: float, std: float) -> str:
+def with_std(value: float | None, std: float | None) -> str:
     """`value ± std`; the value alone without a usable one."""
-    if not math.isfinite(value):
+    if value is None or not math.isfinite(value):
         return MISSING
-    if not std > 0.0:
+    if std is None or not std > 0.0:
         return significant(value)
     return f"{beside(value, std)} ± {significant(std, 2)}"
 
 
-def speed_text(speed: float, unit: str) -> str:
-    """A speed at which friction is compared; NaN is any."""
-    return f"{speed:.2g} {unit}" if math.isfinite(speed) else "any speed"
+def speed_text(speed: float | None, unit: str) -> str:
+    """A speed at which friction is compared; None or NaN is any."""
+    return "any speed" if speed is None or math.isnan(speed) else f"{speed:.2g} {unit}"
 
 
 def unit_text(unit: str) -> str:

@@ -13,14 +13,22 @@ from typing import Any, Final
 import numpy as np
 
 from hil.archive.header import ArchiveName
-from hil.report import figures, numbers, parameters, validation
-from hil.report.figures.conduct import warm_up_panels
-from hil.report.figures.elimination import elimination_panels
-from hil.report.figures.parameters import shift_panels
+from hil.report import numbers, parameters, validation
+from hil.report.figures.friction import friction_curve_panels, warm_up_panels
+from hil.report.figures.motion import excitation_panels, replay_panels, split_panels, torque_panels
+from hil.report.figures.parameters import (
+    correlation_matrix,
+    deviation_panels,
+    elimination_panels,
+    shift_panels,
+    uncertainty_panels,
+)
 from hil.report.figures.residuals import (
     autocorrelation_panels,
+    error_boxes,
     friction_panels,
     position_panels,
+    spectrum_panels,
     speed_panels,
 )
 from hil.report.rendering import environment, page_bytes
@@ -97,17 +105,17 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
-        "excitation_panels": figures.excitation_panels(series, results.joint_names),
+        "excitation_panels": excitation_panels(series, results.joint_names),
         "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
-        "deviation_panels": figures.deviation_panels(results),
-        "uncertainty_panels": figures.uncertainty_panels(results, routes),
-        "correlation": figures.correlation_matrix(results),
-        "box_panels": figures.error_boxes(results),
-        "torque_panels": figures.torque_panels(series, errors),
-        "split_panels": figures.split_panels(series, errors),
-        "spectrum_panels": figures.spectrum_panels(series, errors),
-        "replay_panels": figures.replay_panels(series, errors),
-        "curve_panels": figures.friction_curve_panels(series, errors),
+        "deviation_panels": deviation_panels(results),
+        "uncertainty_panels": uncertainty_panels(results, routes),
+        "correlation": correlation_matrix(results),
+        "box_panels": error_boxes(results),
+        "torque_panels": torque_panels(series, errors),
+        "split_panels": split_panels(series, errors),
+        "spectrum_panels": spectrum_panels(series, errors),
+        "replay_panels": replay_panels(series, errors),
+        "curve_panels": friction_curve_panels(series, errors),
         **validation.validation_context(results),
         **judgement_context(results),
         **trust_context(results),

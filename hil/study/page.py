@@ -13,11 +13,22 @@ from numpy.typing import NDArray
 from hil.files import write_together
 from hil.progress import Reporter
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, headed, place, ruled
-from hil.report.figures.correlation import matrix_panel
-from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
-from hil.report.figures.svg import Panel, drawing, to_panel
-from hil.report.figures.traces import Plot, Trace, traces_text
+from hil.report.figures.canvas import (
+    FIRST,
+    MUTED,
+    ROUTES,
+    SECOND,
+    TICK_SIZE,
+    WIDE,
+    blank,
+    boxed,
+    footed,
+    headed,
+    place,
+    ruled,
+)
+from hil.report.figures.parameters import matrix_panel
+from hil.report.figures.svg import Panel, Plot, Trace, drawing, to_panel, traces_text
 from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord
@@ -111,27 +122,16 @@ def _error_panels(condition: ConditionResult, joint_names: Sequence[str]) -> lis
 def _boxes(condition: ConditionResult, j: int, name: str, columns: Sequence[Array]) -> Panel:
     labels = [one.label.replace(" ", "\n") for one in condition.methods]
     medians = [float(np.median(column)) for column in columns]
-    thin = {"color": MUTED, "linewidth": 1.1}
-    places = range(1, len(columns) + 1)
     with drawing():
         figure = blank(220.0, 226.0 + 11.0 * max(label.count("\n") for label in labels))
         axes = place(figure, 46.0, 24.0, 164.0, 172.0)
-        axes.boxplot(
-            columns,
-            positions=places,
-            widths=0.6,
-            patch_artist=True,
-            boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
-            medianprops={"color": INK, "linewidth": 2.2},
-            whiskerprops=thin,
-            capprops=thin,
-            flierprops={"marker": "+", "markeredgecolor": MUTED, "markersize": 6.0},
-        )
+        fliers = {"marker": "+", "markeredgecolor": MUTED, "markersize": 6.0}
+        boxed(axes, columns, 0.6, flierprops=fliers)
         for k, middle in enumerate(medians):
             colour, marker = COLOURS[k % 4], MARKERS[k % 4]
             axes.scatter([k + 1], [middle], s=34.0, marker=marker, color=colour, zorder=4)
         ruled(axes, "y", y_ticks=5)
-        axes.set_xticks(places, labels, fontsize=TICK_SIZE)
+        axes.set_xticks(range(1, len(columns) + 1), labels, fontsize=TICK_SIZE)
         axes.tick_params(axis="x", length=0.0)
         # A scale that shows every motion, and never makes a small change look large.
         every = np.concatenate(columns)

@@ -25,21 +25,30 @@ from hil.io.digest import digest
 from hil.progress import Reporter
 from identification.excitation import Excitation
 
-from .ablations import Evidence, repetition_ablation
-from .analysis import Run, class_in, fit_all, plan_in, score_all
 from .campaigns import workers_of
 from .page import write_outcome
-from .records import CLASSES, PLANTED, FitRecord, ScoreRecord
-from .results import MotionRow, StudyResults
+from .records import (
+    CLASSES,
+    PLANTED,
+    FitRecord,
+    Run,
+    ScoreRecord,
+    class_in,
+    fit_all,
+    plan_in,
+    score_all,
+)
+from .results import MotionRow, StudyResults, study_results
 from .searches import AP, B0, LABELS, A, B
-from .sentences import study_results
 from .settings import StudyFolder
 from .tables import (
     Condition,
+    Evidence,
     condition_result,
     estimates_of,
     parameters_of,
     printed_rows,
+    repetition_ablation,
 )
 
 Array = NDArray[np.float64]

@@ -18,8 +18,6 @@ from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from sim_fixtures.ns16 import CELL_PATH
 
-from .ablations import Evidence, ablations
-from .analysis import Run, fit_all, score_all
 from .campaigns import (
     ABLATION,
     EFFECTS,
@@ -31,13 +29,14 @@ from .campaigns import (
     workers_of,
 )
 from .page import write_outcome
-from .records import PLANTED, FitRecord, ScoreRecord
-from .results import ConditionResult, MotionRow, StudyResults
+from .records import PLANTED, FitRecord, Run, ScoreRecord, fit_all, score_all
+from .results import ConditionResult, MotionRow, SearchResult, StudyResults, study_results
 from .searches import AP, B0, LABELS, A, B, Found, run_searches, searches
-from .sentences import study_results
 from .settings import StudyFolder, StudySettings, stage
 from .tables import (
     Condition,
+    Evidence,
+    ablations,
     condition_result,
     estimates_of,
     parameters_of,
@@ -143,7 +142,7 @@ class _Analysis:
             quick=settings.effort_b.tried < sizes.population * sizes.generations,
             settings=settings,
             searches=[
-                one.result(chosen=key in (self.plans.sines, B, B0))
+                SearchResult.of(one, chosen=key in (self.plans.sines, B, B0))
                 for key, one in self.found.items()
             ],
             table1=self._table1() + printed_rows(cell),

@@ -16,7 +16,6 @@ from hil.progress import Reporter
 from identification.excitation import RESCORE_PERIOD, Excitation, Objective
 from planner import PlannerError, plan_in_child
 
-from .results import SearchResult
 from .settings import Effort, StudyFolder, StudySettings
 
 A, B, B0, AP = "a", "b", "b0", "a-printed"
@@ -64,20 +63,6 @@ class Found:
 
     search: Search
     excitation: Excitation | None
-
-    def result(self, *, chosen: bool) -> SearchResult:
-        """The same for `results.json`."""
-        one = self.excitation
-        return SearchResult(
-            key=self.search.key,
-            words=self.search.words,
-            chosen=chosen,
-            tried=0 if one is None else one.tried,
-            infeasible={} if one is None else {name: int(n) for name, n in one.rejected.items()},
-            log10_det=None if one is None else one.criteria.log10_det,
-            coupling_index=None if one is None else one.criteria.coupling_index,
-            duration=None if one is None else float(one.trajectory.duration),
-        )
 
 
 def searches(settings: StudySettings, n_joints: int) -> list[Search]:

@@ -14,7 +14,7 @@ from pydantic import Field
 from hil.errors import InputError
 from hil.files import exclusive_folder, write_or_tell
 from hil.reading import text_of
-from hil.results.frozen import Frozen
+from hil.results import Frozen
 
 M = TypeVar("M", bound=Frozen)
 Count = Annotated[int, Field(strict=True, ge=1)]

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from hil.compare.spread import holm
+
 from .records import ClassForms, FitRecord
 from .results import ALPHA, SMALL, AblationBand, ComparisonResult, EqualDataResult, Verdict
 
@@ -55,15 +57,6 @@ def compare(first: Array, second: Array) -> tuple[float, int, float]:
     logs = np.log(second / first)
     p_value = float(stats.wilcoxon(logs).pvalue) if np.any(logs) else 1.0
     return float(np.exp(logs.mean())), int(np.count_nonzero(logs < 0.0)), p_value
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p values corrected for their number after Holm (1979), in the order given."""
-    corrected, largest = [0.0] * len(p_values), 0.0
-    for rank, index in enumerate(np.argsort(p_values, kind="stable").tolist()):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[index]))
-        corrected[index] = largest
-    return corrected
 
 
 def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
@@ -121,7 +114,7 @@ def corrected(comparisons: Sequence[ComparisonResult]) -> list[ComparisonResult]
     Intervals and verdicts after Bonferroni, so that all intervals of the table hold together and
     a verdict is exactly that of its interval; signed ranks after Holm.
     """
-    after = holm([one.p_value for one in comparisons])
+    after = holm(np.array([one.p_value for one in comparisons])).tolist()
     return [
         _judged(one, len(comparisons)).model_copy(update={"p_corrected": p})
         for one, p in zip(comparisons, after, strict=True)

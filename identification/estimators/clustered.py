@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.estimators.covariance import Clustered, block_length, leverage_corrected
 from identification.estimators.losses import LeastSquares, Loss
-from identification.factor.augmented_rows import augmented_rows
-from identification.factor.factor import Solution, mark_undetermined
+from identification.factor.factor import Solution, augmented_rows, mark_undetermined
 from identification.factor.phases import FINE_BLOCK, block_runs, fine_blocks, merged
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError, ShapeError
 from identification.factor.factor import WORST_CONDITION, NormalEquations
 from identification.model.friction import dissipation
-from identification.model.pseudo_inertia import inertial_from_pseudo
-from identification.model.reference_bodies import ReferenceBodies, reference_bodies
+from identification.model.pseudo_inertia import (
+    ReferenceBodies,
+    inertial_from_pseudo,
+    reference_bodies,
+)
 from identification.model.robot import RobotModel
 from identification.model.wrench import LINK_SYMBOLS
 

@@ -2,7 +2,7 @@ r"""Current-to-torque gains of all drives at once, from a payload whose torque i
 
 Without a payload, parameters and gains can all be scaled by one number. A recording with a known
 payload fixes it (Gautier and Briot 2014, "Global identification of joint drive gains and dynamic
-parameters of robots"). Two estimators on one :class:`identification.factor.gains.GainFactor`:
+parameters of robots"). Two estimators on one :func:`identification.factor.phases.gain_factor`:
 
 *weighted* least squares of what was measured, the current:
 
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.covariance import cluster_covariance
 from identification.factor.factor import NormalEquations, Solution, mark_undetermined, solve
-from identification.factor.gains import GainFactor
+from identification.factor.phases import PhaseFactor
 
 Array = NDArray[np.float64]
 GainMethod = Literal["weighted", "total"]
@@ -91,7 +91,7 @@ class Gains:
 
 
 def identify_gains(
-    factor: GainFactor,
+    factor: PhaseFactor,
     motor_names: Sequence[str],
     *,
     method: GainMethod = "weighted",
@@ -100,7 +100,7 @@ def identify_gains(
     """Estimate the gain of each motor, with its confidence.
 
     Args:
-        factor: recordings with a known payload, and without or with another.
+        factor: blocks of recordings with a known payload, and without or with another.
         motor_names: (n,), in the order of the factor.
         method: see the module.
         worst_relative_std: gains less well known than this are not determined.
@@ -108,8 +108,9 @@ def identify_gains(
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
     """
-    total = factor.gram.sum(axis=0)
-    p, rows = factor.n_parameters, factor.rows.sum(axis=0)
+    grams = np.stack(factor.gram, axis=1)
+    total, rows = grams.sum(axis=0), factor.samples.sum(axis=0)
+    p = factor.n_parameters - 1
     if not rows.any():
         raise IdentificationError("there is not one usable sample to identify gains from")
     if not total[:, p, p].any():
@@ -120,9 +121,9 @@ def identify_gains(
     fit = _gauss_newton(total, noise, inverses)
     if method == "total":
         fit = _total_least_squares(total, rows, fit)
-        blocks = _errors_in_currents(factor.gram, factor.rows, fit)
+        blocks = _errors_in_currents(grams, factor.samples, fit)
     else:
-        blocks = _currents_predicted(factor.gram, fit)
+        blocks = _currents_predicted(grams, fit)
     clustered = cluster_covariance(*blocks, fit.solution)
     covariance = clustered.covariance
     reasons = _reasons(total, rows, fit, np.sqrt(np.diag(covariance)[p:]), worst_relative_std)

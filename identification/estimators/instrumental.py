@@ -37,8 +37,7 @@ from identification.factor.factor import (
     joint_weights,
     residual_variance,
 )
-from identification.factor.instruments import InstrumentFactor
-from identification.factor.phases import FINE_BLOCK, merged
+from identification.factor.phases import FINE_BLOCK, PhaseFactor, measured_part, merged
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -112,24 +111,25 @@ def solve_cross(total: Array) -> CrossSolution:
 
 
 def estimate_instrumental(
-    model: RobotModel, factor: InstrumentFactor, weights: Array | None = None
+    model: RobotModel, factor: PhaseFactor, weights: Array | None = None
 ) -> InstrumentalEstimate:
     """Estimate with instrumental variables.
 
     Args:
         model: the robot.
-        factor: the samples; of one repetition, or a sum.
+        factor: see :func:`identification.factor.phases.instrument_factor`; of one repetition,
+            or a sum.
         weights: per joint (n,); by default the inverse residual variances of an instrumental fit
             whose weights are those of least squares.
 
     Raises:
         IdentificationError: the factor holds no rows, or belongs to another model.
     """
-    if factor.parameter_names != model.parameter_names:
+    if factor.parameter_names[model.n_parameters :] != model.parameter_names:
         raise IdentificationError("the samples belong to a model of other parameters")
     if not factor.samples.any():
         raise IdentificationError("there is not one row in which samples and instruments move")
-    measured = factor.measured
+    measured = measured_part(factor)
     rows = measured.total
     if weights is None:
         weights = _weights(factor, rows)
@@ -171,10 +171,10 @@ def _inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1.0 / WORST_CONDITION**2, hermitian=True))
 
 
-def _weights(factor: InstrumentFactor, rows: Factor) -> Array:
+def _weights(factor: PhaseFactor, rows: Factor) -> Array:
     """Inverse residual variance per joint (n,) of an instrumental fit, zero without rows."""
     first = joint_weights(rows)
-    solution = solve_cross(factor.total(first))
+    solution = solve_cross(factor.weighted(first).sum(axis=0))
     variance = residual_variance(rows, solution.values, rows.solve(first).root, first)
     return np.where(np.isnan(variance), 0.0, 1.0 / variance)
 

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.clustered import clustered_covariance
 from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
-from identification.factor.augmented_rows import augmented_rows
 from identification.factor.factor import (
     Estimate,
     Factor,
     JointFactor,
     Solution,
+    augmented_rows,
     nothing_usable,
     reduced,
     undetermined_names,

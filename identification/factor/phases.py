@@ -6,21 +6,26 @@ r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in o
 Summed over the blocks b they are the :class:`identification.factor.factor.Factor`; block by block
 they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
 for any weights and parameters. Stored are only the columns that act on a joint, a third of all.
+
+Instrumental variables need the same of [Z | W | y], a factor of twice the parameters: W is the
+regressor of the measured motion, whose noise it carries, and Z that of a motion without measurement
+noise (:mod:`identification.estimators.instrument_motion`), column by column the same functions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
-from identification.factor.augmented_rows import augmented_rows
-from identification.factor.factor import Factor
+from identification.errors import IdentificationError, ShapeError
+from identification.factor.factor import Factor, augmented_rows
+from identification.model.motion import Motion
+from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -28,6 +33,7 @@ Array = NDArray[np.float64]
 Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s
+_MOST_BLOCKS: Final = 400  # of one recording, for gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +103,16 @@ class PhaseFactor:
             gram, self.columns, _sum(self.samples, other.samples), self.parameter_names
         )
 
+    def places(self, joint: int) -> NDArray[np.intp]:
+        """Where the columns of a joint's Gram stand among all p + 1, the torque being last."""
+        return np.append(self.columns[joint], self.n_parameters)
+
     def weighted(self, weights: Array) -> Array:
         """Gram matrices of the blocks (B, p + 1, p + 1) with one weight per joint (n,)."""
         width = self.n_parameters + 1
         whole = np.zeros((len(self.samples), width * width))
-        for weight, gram, used in zip(weights, self.gram, self.columns, strict=True):
-            place = np.append(used, self.n_parameters)
+        for joint, (weight, gram) in enumerate(zip(weights, self.gram, strict=True)):
+            place = self.places(joint)
             flat = (place[:, None] * width + place).ravel()
             whole[:, flat] += weight * gram.reshape(len(gram), -1)
         return whole.reshape(-1, width, width)
@@ -134,8 +144,8 @@ class PhaseFactor:
         """Factor of all blocks."""
         width = self.n_parameters + 1
         whole = np.zeros((self.n_joints, width, width))
-        for joint, (gram, used) in enumerate(zip(self.gram, self.columns, strict=True)):
-            place = np.append(used, self.n_parameters)
+        for joint, gram in enumerate(self.gram):
+            place = self.places(joint)
             whole[joint][np.ix_(place, place)] = gram.sum(axis=0)
         return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
 
@@ -151,6 +161,104 @@ class PhaseFactor:
             columns.append(place[used[stays]])
         names = tuple(self.parameter_names[k] for k in chosen)
         return PhaseFactor(tuple(gram), tuple(columns), self.samples, names)
+
+
+def instrument_factor(
+    model: RobotModel,
+    samples: Samples,
+    instrument: Motion,
+    usable: NDArray[np.bool_] | None = None,
+) -> PhaseFactor:
+    """Reduce a recording to blocks of [Z | W | y]: columns of Z by name, then the same of W.
+
+    Args:
+        model: the robot.
+        samples: the measured motion and torque.
+        instrument: motion without measurement noise, in the rows of the samples.
+        usable: where the instrument is known (m, n); everywhere without it. Rows count in
+            which the samples are usable and the instrument moves as well: which rows count
+            must not depend on the noise.
+
+    Raises:
+        ShapeError: the instrument does not have the rows and joints of the samples.
+    """
+    shape = samples.torque.shape
+    if instrument.position.shape != shape:
+        raise ShapeError("instrument", instrument.position.shape, str(shape))
+    rows = samples.usable & model.moving(instrument.velocity)
+    if usable is not None:
+        rows &= usable
+    index = fine_blocks(samples)
+    count = int(index[-1]) + 1 if len(index) else 0
+    columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
+    gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
+    measured = augmented_rows(model, replace(samples, usable=rows))
+    # Of the same rows, and through the same torque channel.
+    planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
+    for (part, blocks), (_, clean) in zip(measured, planned, strict=True):
+        runs = equal_runs(index[part])
+        for total, noisy, quiet in zip(gram, blocks, clean, strict=True):
+            add_grams(total, np.concatenate([quiet[:-1], noisy]), runs)
+    names = (*(f"Z {name}" for name in model.parameter_names), *model.parameter_names)
+    return PhaseFactor(gram, columns, samples_by_cell(index, rows), names)
+
+
+def measured_part(factor: PhaseFactor) -> PhaseFactor:
+    """Of :func:`instrument_factor` the part [W | y]: what least squares on the same rows sees."""
+    p = factor.n_parameters // 2
+    return factor.restricted(np.arange(p, 2 * p))
+
+
+def gain_factor(
+    model: RobotModel,
+    samples: Samples,
+    motor_current: Array,
+    *,
+    payload: Payload | None = None,
+    transmission: Array | None = None,
+) -> PhaseFactor:
+    """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
+
+    Args:
+        model: the robot without payload.
+        samples: its motion, and which rows count; its torque is not used. A motor's row
+            counts where the rows of all joints it acts on count.
+        motor_current: (m, n) [A], in the rows of the samples.
+        payload: what the robot carried.
+        transmission: motors' angles per joint angle (n, n); identity: motors are joints, and
+            gains include the gear ratio.
+
+    Raises:
+        ShapeError: an array does not have the shape it should have.
+    """
+    n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
+    turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
+    if turns.shape != (n, n):
+        raise ShapeError("transmission", turns.shape, f"({n}, {n})")
+    if motor_current.shape != (m, n):
+        raise ShapeError("motor_current", motor_current.shape, f"({m}, {n})")
+    blocks, columns = samples.regressor(model)
+    load = model.elements.known(samples.motion.position)
+    if payload is not None:
+        load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
+    time = samples.motion.time - samples.motion.time[0]
+    index = np.floor(time / max(FINE_BLOCK, time[-1] / _MOST_BLOCKS) + 1e-9).astype(np.int64)
+    runs = equal_runs(index)
+    gram = tuple(np.zeros((int(index[-1]) + 1, p + 2, p + 2)) for _ in range(n))
+    usable = np.zeros((m, n), dtype=np.bool_)
+    for motor, share in enumerate(np.linalg.inv(turns).T):
+        acting = np.flatnonzero(share).tolist()
+        usable[:, motor] = samples.usable[:, acting].all(axis=1)
+        table = np.zeros((m, p + 2))
+        for joint in acting:
+            table[:, columns[joint]] += share[joint] * blocks[joint]
+            table[:, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
+        table[:, p + 1] = motor_current[:, motor]
+        table[~usable[:, motor]] = 0.0
+        add_grams(gram[motor], table.T, runs)
+    names = (*model.parameter_names, "torque of the payload")
+    every = (np.arange(p + 1),) * n
+    return PhaseFactor(gram, every, samples_by_cell(index, usable), names)
 
 
 def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:

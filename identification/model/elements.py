@@ -31,9 +31,25 @@ class ElementError(ModelError):
     """An element whose parameters the others stand for already."""
 
 
+class Coefficient(NamedTuple):
+    """A factor of one shape of torque.
+
+    Attributes:
+        symbol: name of the parameter, without the number of the joint.
+        unit: its unit.
+        value: as given; None where it is not.
+        identified: whether it is a parameter.
+    """
+
+    symbol: str
+    unit: str
+    value: float | None
+    identified: bool
+
+
 @dataclass(frozen=True)
 class Element(ABC):
-    """A torque on one joint: c parameters that are identified, and a part that is known.
+    """A torque on one joint: coefficients times shapes, c of them identified, the others known.
 
     Attributes:
         joint: name.
@@ -48,26 +64,36 @@ class Element(ABC):
 
     @property
     @abstractmethod
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """All k coefficients."""
+
+    @abstractmethod
+    def shapes(self, q: Array) -> Array:
+        """Return the torque per unit of each coefficient, at angles (m,): (m, k)."""
+
+    @property
     def symbols(self) -> tuple[str, ...]:
         """Names of the c identified parameters, without the number of the joint."""
+        return tuple(one.symbol for one in self.coefficients if one.identified)
 
     @property
-    @abstractmethod
     def units(self) -> tuple[str, ...]:
         """Their units (c,)."""
+        return tuple(one.unit for one in self.coefficients if one.identified)
 
     @property
-    @abstractmethod
     def nominal(self) -> tuple[float, ...]:
         """Their values (c,) as far as they are given, else zero."""
+        return tuple(one.value or 0.0 for one in self.coefficients if one.identified)
 
-    @abstractmethod
     def columns(self, q: Array) -> Array:
         """Return the torque per unit of each identified parameter, at angles (m,): (m, c)."""
+        return self.shapes(q)[:, [one.identified for one in self.coefficients]]
 
-    @abstractmethod
     def known(self, q: Array) -> Array:
         """Return the part of the torque [N·m] that is known (m,)."""
+        known = [0.0 if one.identified else one.value or 0.0 for one in self.coefficients]
+        return np.asarray(self.shapes(q) @ np.array(known))
 
 
 @dataclass(frozen=True)
@@ -140,29 +166,13 @@ class TorsionSpring(Element):
         _require_stiffness(self.stiffness, identified=self.identified)
 
     @property
-    def symbols(self) -> tuple[str, ...]:
-        """``spring``, where it is identified."""
-        return ("spring",) if self.identified else ()
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """The stiffness."""
+        return (Coefficient("spring", "N·m/rad", self.stiffness, self.identified),)
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Unit of the stiffness, where it is identified."""
-        return ("N·m/rad",) if self.identified else ()
-
-    @property
-    def nominal(self) -> tuple[float, ...]:
-        """The stiffness, where it is identified."""
-        return (self.stiffness or 0.0,) if self.identified else ()
-
-    def columns(self, q: Array) -> Array:
-        """Return the deflection (m, 1) [rad], (m, 0) of a known spring."""
-        return (q - self.rest)[:, None] if self.identified else np.zeros((len(q), 0))
-
-    def known(self, q: Array) -> Array:
-        """Return the torque (m,) of a known spring [N·m]."""
-        if self.identified or self.stiffness is None:
-            return np.zeros(len(q))
-        return self.stiffness * (q - self.rest)
+    def shapes(self, q: Array) -> Array:
+        """Return the deflection (m, 1) [rad]."""
+        return np.asarray(q - self.rest)[:, None]
 
 
 @dataclass(frozen=True)
@@ -193,32 +203,18 @@ class ExtensionSpring(Element):
         _require_stiffness(self.stiffness, identified=self.identified)
 
     @property
-    def symbols(self) -> tuple[str, ...]:
-        """``spring``, and ``preload`` unless that is given."""
-        if not self.identified:
-            return ()
-        return ("spring", "preload") if self.preload is None else ("spring",)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Units of stiffness and preload."""
-        return ("N/m", "N")[: len(self.symbols)]
-
-    @property
-    def nominal(self) -> tuple[float, ...]:
+    def coefficients(self) -> tuple[Coefficient, ...]:
         """Stiffness and preload."""
-        return (self.stiffness or 0.0, 0.0)[: len(self.symbols)]
+        free = self.identified and self.preload is None
+        return (
+            Coefficient("spring", "N/m", self.stiffness, self.identified),
+            Coefficient("preload", "N", self.preload, free),
+        )
 
-    def columns(self, q: Array) -> Array:
-        """Return lever times extension [m²/rad], and the lever [m/rad] (m, c)."""
+    def shapes(self, q: Array) -> Array:
+        """Return lever times extension [m²/rad], and the lever [m/rad] (m, 2)."""
         lever, extension = self.anchors.lever(q), self.anchors.length(q) - self.free_length
-        return np.column_stack([lever * extension, lever])[:, : len(self.symbols)]
-
-    def known(self, q: Array) -> Array:
-        """Return the torque (m,) of what is given: the preload, and a known stiffness [N·m]."""
-        stiffness = 0.0 if self.identified or self.stiffness is None else self.stiffness
-        tension = stiffness * (self.anchors.length(q) - self.free_length) + (self.preload or 0.0)
-        return np.asarray(self.anchors.lever(q) * tension)
+        return np.column_stack([lever * extension, lever])
 
 
 @dataclass(frozen=True)
@@ -265,33 +261,16 @@ class GasCylinder(Element):
             )
 
     @property
-    def symbols(self) -> tuple[str, ...]:
-        """``balancer`` or ``gas_spring``, where it is identified."""
-        return (("balancer" if self.pulls else "gas_spring"),) if self.identified else ()
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """A factor of the stated law."""
+        return (Coefficient("balancer" if self.pulls else "gas_spring", "1", 1.0, self.identified),)
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """One, where it is identified: a factor has no unit."""
-        return ("1",) if self.identified else ()
-
-    @property
-    def nominal(self) -> tuple[float, ...]:
-        """The factor one, where it is identified."""
-        return (1.0,) if self.identified else ()
-
-    def columns(self, q: Array) -> Array:
-        """Return the torque of the stated law (m, 1) [N·m], (m, 0) where it is known."""
-        return self.torque(q)[:, None] if self.identified else np.zeros((len(q), 0))
-
-    def known(self, q: Array) -> Array:
-        """Return the torque (m,) [N·m] where it is known."""
-        return np.zeros(len(q)) if self.identified else self.torque(q)
-
-    def torque(self, q: Array) -> Array:
-        """Return the torque of the stated law (m,) [N·m]."""
+    def shapes(self, q: Array) -> Array:
+        """Return the torque of the stated law (m, 1) [N·m]."""
         left = self._volume_left(self.anchors.length(q))
         force = self.area * self.pressure * self.volume / left
-        return np.asarray((1.0 if self.pulls else -1.0) * self.anchors.lever(q) * force)
+        torque = (1.0 if self.pulls else -1.0) * self.anchors.lever(q) * force
+        return np.asarray(torque)[:, None]
 
     def _volume_left(self, length: Array) -> Array:
         """Volume of the gas [m³] at a distance between the anchors."""
@@ -322,28 +301,18 @@ class TorqueRipple(Element):
         return dict(self.motor)
 
     @property
-    def symbols(self) -> tuple[str, ...]:
-        """``ripple_cos2`` and ``ripple_sin2`` of the second order."""
-        return tuple(f"ripple_{wave}{order}" for order in self.orders for wave in ("cos", "sin"))
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """``ripple_cos2`` and ``ripple_sin2`` of the second order; no maker states them."""
+        return tuple(
+            Coefficient(f"ripple_{wave}{order}", "N·m", None, True)
+            for order in self.orders
+            for wave in ("cos", "sin")
+        )
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Unit of an amplitude."""
-        return ("N·m",) * len(self.symbols)
-
-    @property
-    def nominal(self) -> tuple[float, ...]:
-        """Zeros: no maker states them."""
-        return (0.0,) * len(self.symbols)
-
-    def columns(self, q: Array) -> Array:
-        """Return cosine and sine of each order (m, c)."""
+    def shapes(self, q: Array) -> Array:
+        """Return cosine and sine of each order (m, 2 orders)."""
         angles = q[:, None] * np.array(self.orders, dtype=np.float64)
         return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(q), -1)
-
-    def known(self, q: Array) -> Array:
-        """Return zeros (m,)."""
-        return np.zeros(len(q))
 
 
 class PlacedElement(NamedTuple):

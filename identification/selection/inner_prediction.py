@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from identification.errors import IdentificationError
 from identification.estimators.consistent_program import SolverError
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, shrunk_values
-from identification.factor.augmented_rows import augmented_rows
-from identification.factor.factor import Factor, joint_weights, solve
+from identification.factor.factor import Factor, augmented_rows, joint_weights, solve
 from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
-from identification.factor.augmented_rows import augmented_rows
-from identification.factor.factor import Estimate, Factor
+from identification.factor.factor import Estimate, Factor, augmented_rows
 from identification.factor.phases import (
     FINE_BLOCK,
     PhaseFactor,

@@ -22,8 +22,7 @@ from identification.estimators.consistent import (
 )
 from identification.estimators.consistent_program import link_parameters
 from identification.factor.factor import Estimate, Factor
-from identification.model.pseudo_inertia import pseudo_inertia
-from identification.model.reference_bodies import reference_bodies
+from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
 from identification.selection.essential_choice import relative_error
 from identification.validation.findings.finding import joined

@@ -32,8 +32,7 @@ from identification.distributions import fisher_tail, student_limit
 from identification.estimators.covariance import block_length, left_out, spread
 from identification.estimators.instrumental import InstrumentalEstimate, solve_cross
 from identification.factor.factor import NormalEquations, solve
-from identification.factor.instruments import InstrumentFactor
-from identification.factor.phases import merged
+from identification.factor.phases import PhaseFactor, merged
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -93,7 +92,7 @@ class EndogeneityTest:
 
 
 def endogeneity_test(
-    model: RobotModel, factor: InstrumentFactor, result: InstrumentalEstimate
+    model: RobotModel, factor: PhaseFactor, result: InstrumentalEstimate
 ) -> EndogeneityTest:
     """Test whether noise in the regressor has biased least squares.
 
@@ -110,7 +109,7 @@ def endogeneity_test(
     coefficient[:, active] = gamma, gamma_std
     p_value = float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan
     shift, shift_std, count = _shift(blocks)
-    names, known = factor.parameter_names, shift_std > 0.0
+    names, known = model.parameter_names, shift_std > 0.0
     critical = student_limit(LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
     shifted = tuple(
         names[k] for k in np.flatnonzero(known & (np.abs(shift) > critical * shift_std))
@@ -132,7 +131,7 @@ def endogeneity_test(
 
 
 def _noise_columns(
-    factor: InstrumentFactor, total: Array, result: InstrumentalEstimate, used: NDArray[np.bool_]
+    factor: PhaseFactor, total: Array, result: InstrumentalEstimate, used: NDArray[np.bool_]
 ) -> tuple[tuple[Array, Array], list[int], Array]:
     """One column per joint: what the instruments leave of W, times the parameters.
 
@@ -141,7 +140,7 @@ def _noise_columns(
         (B, k, 2 p + 1), and with themselves (B, k); which k joints these are; and the size of all
         n as a share of the torque (n,).
     """
-    p = factor.n_parameters
+    p = factor.n_parameters // 2
     values = result.estimate.values
     explained = solve(NormalEquations(total[:p, :p], total[:p, p : 2 * p] @ values, 0.0, 0)).values
     combination = np.concatenate([-explained, values, [0.0]])
@@ -157,7 +156,7 @@ def _noise_columns(
     return (products, squares), active, noise
 
 
-def _share(factor: InstrumentFactor, combination: Array) -> Array:
+def _share(factor: PhaseFactor, combination: Array) -> Array:
     """RMS of a combination (2 p + 1,) of [Z | W | y] as a share of each joint's torque (n,)."""
     shares = np.zeros(factor.n_joints)
     for joint, gram in enumerate(factor.gram):

@@ -30,8 +30,8 @@ from hil.report import (
     report_bytes,
     validation,
 )
-from hil.report.figures import correlation_matrix
 from hil.report.figures.canvas import thinned
+from hil.report.figures.parameters import correlation_matrix
 from hil.results import Results
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 

@@ -11,13 +11,9 @@ import numpy as np
 import pytest
 
 from hil.report import ReportSeries, SeriesError, render_report
-from hil.report.figures import (
-    excitation_panels,
-    friction_curve_panels,
-    spectrum_panels,
-    split_panels,
-    torque_panels,
-)
+from hil.report.figures.friction import friction_curve_panels
+from hil.report.figures.motion import excitation_panels, split_panels, torque_panels
+from hil.report.figures.residuals import spectrum_panels
 from hil.report.page import shown_candidates
 from hil.report.validation import error_rows, every_row_errors, example_errors
 from hil.results import ChoiceResult, Results

@@ -16,7 +16,7 @@ from hil.identify.summary import (
     essential_warnings,
 )
 from hil.report import page
-from hil.report.figures.elimination import elimination_panels
+from hil.report.figures.parameters import elimination_panels
 from hil.report.rendering import environment
 from hil.results import BlindResult, ConsistencyResult, EssentialResult, ParameterResult
 

@@ -22,7 +22,6 @@ from hil.errors import InputError, OperatorStopError
 from hil.progress import Silent
 from hil.simulation import planted_values
 from hil.study import StudyResults, StudySettings, run_study, study_campaigns, study_settings
-from hil.study.analysis import Run, class_of, classes_of
 from hil.study.campaigns import (
     Execution,
     StudyError,
@@ -30,10 +29,10 @@ from hil.study.campaigns import (
     plan_study,
     workers_of,
 )
-from hil.study.records import ClassForms, ScoreRecord
+from hil.study.records import ClassForms, Run, ScoreRecord, class_of, classes_of
 from hil.study.searches import SINES, run_searches, searches
 from hil.study.settings import Effort, StudyFolder
-from hil.study.statistics import compare, equal_data, holm, parameter_error
+from hil.study.statistics import compare, equal_data, parameter_error
 from hil.study.tables import estimates_of, parameters_of
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
@@ -44,7 +43,6 @@ Array = NDArray[np.float64]
 errors = st.lists(
     st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_size=1, max_size=30
 ).map(lambda pairs: tuple(np.array(column) for column in zip(*pairs, strict=True)))
-p_values = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12)
 
 
 # Paired statistics
@@ -64,20 +62,6 @@ def test_comparing_the_other_way_round_inverts_the_ratio_and_keeps_the_p_value(
 def test_equal_errors_are_no_difference() -> None:
     same = np.array([0.1, 0.2, 0.3])
     assert compare(same, same) == (1, 0, 1)
-
-
-@given(p_values)
-def test_holm_never_lowers_a_p_value_and_keeps_their_order(values: list[float]) -> None:
-    corrected = holm(values)
-    assert all(after >= before for before, after in zip(values, corrected, strict=True))
-    assert max(corrected) <= 1.0
-    order = np.argsort(values, kind="stable")
-    assert list(np.array(corrected)[order]) == sorted(corrected)
-
-
-def test_holm_on_the_example_of_every_textbook() -> None:
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.03]) == [0.03]
 
 
 # Estimates

@@ -21,8 +21,7 @@ from identification.estimators.nominal_prior import nominal_prior
 from identification.estimators.prior import fit_with_prior
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate
-from identification.factor.instruments import InstrumentFactor
-from identification.factor.phases import PhaseFactor, joined, total_phase
+from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase
 from identification.model.motion import Motion
 from identification.selection.essential import eliminate
 from identification.signals.samples import Samples
@@ -68,8 +67,8 @@ def recordings(pieces: Pieces) -> list[Samples]:
     return [samples for samples, _ in pieces]
 
 
-def instruments(pieces: Pieces) -> InstrumentFactor:
-    factors = [InstrumentFactor.from_samples(MODEL, *piece) for piece in pieces]
+def instruments(pieces: Pieces) -> PhaseFactor:
+    factors = [instrument_factor(MODEL, *piece) for piece in pieces]
     total = factors[0]
     for factor in factors[1:]:
         total = total + factor

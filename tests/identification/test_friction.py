@@ -1,43 +1,27 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from identification.errors import ModelError
-from identification.model.friction import TERMS, FrictionLaw, FrictionTerm, Stribeck
-
-SPEED = np.array([-2.0, -1e-9, 0.0, 1e-9, 0.5])
-
-
-def columns(law: FrictionLaw) -> np.ndarray:
-    return law.columns(SPEED, law.sign(SPEED))
-
-
-def test_the_default_law_is_coulomb_viscous_and_quadratic() -> None:
-    law = FrictionLaw()
-    assert law.symbols == ("f0", "f1", "f2")
-    assert np.array_equal(columns(law)[0], [-1, -1, 0, 1, 1])
-    assert np.array_equal(columns(law)[1], SPEED)
-    assert np.allclose(columns(law)[2], [-4.0, -1e-18, 0.0, 1e-18, 0.25], rtol=1e-15)
-
-
-def test_the_sign_has_no_dead_zone() -> None:
-    # Standstill is left to the mask; a dead zone here would fit it silently.
-    assert columns(FrictionLaw(standstill=1.0))[0][3] == 1.0
-
-
-def test_the_cubic_third_term_and_the_offset() -> None:
-    law = FrictionLaw(coulomb=False, viscous=False, third="cubic", offset=True)
-    assert law.symbols == ("f2", "fo")
-    assert np.allclose(columns(law)[0], SPEED**3, rtol=1e-15)
-    assert np.array_equal(columns(law)[1], np.ones(5))
-
-
-def test_a_law_without_any_term_has_no_columns() -> None:
-    law = FrictionLaw(coulomb=False, viscous=False, third=None)
-    assert law.symbols == ()
+from identification import ModelError, RobotModel, ShapeError
+from identification.model.coupling import Coupling
+from identification.model.friction import (
+    TERMS,
+    FrictionLaw,
+    FrictionTerm,
+    JointFriction,
+    Stribeck,
+    dissipation,
+    presliding_state,
+)
+from sim_fixtures.ns16 import urdf_text
+from tests.identification.two_link import MODEL, a_motion, truth
 
 
 @pytest.mark.parametrize(
@@ -57,17 +41,6 @@ def test_a_joint_moves_above_the_standstill_speed_in_either_direction() -> None:
     law = FrictionLaw(standstill=0.01)
     speeds = np.array([[0.0, 0.01], [0.011, -0.02]])
     assert law.moving(speeds).tolist() == [[False, False], [True, True]]
-
-
-@pytest.mark.parametrize("speed", [-1.0, np.nan, np.inf])
-def test_a_senseless_standstill_speed_is_refused(speed: float) -> None:
-    with pytest.raises(ModelError, match="standstill"):
-        FrictionLaw(standstill=speed)
-
-
-def test_an_unknown_third_term_is_refused_with_what_is_known() -> None:
-    with pytest.raises(ModelError, match=r"quadratic.*cubic"):
-        FrictionLaw(third="stribeck")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", TERMS)
@@ -108,3 +81,212 @@ class TestFrictionTable:
         assert FrictionLaw.from_table({"stribeck": 0.0}).stribeck is None
         with pytest.raises(ModelError, match="Stribeck speed"):
             FrictionLaw(stribeck=0.0)
+
+
+Array = NDArray[np.float64]
+
+TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
+LAWS = st.builds(
+    FrictionLaw,
+    coulomb=st.booleans(),
+    viscous=st.booleans(),
+    third=st.sampled_from([None, "quadratic", "cubic"]),
+    offset=st.booleans(),
+    standstill=st.sampled_from([0.01, 0.2]),
+    stribeck=st.sampled_from([None, 0.3]),
+    asymmetric=st.booleans(),
+    zone=st.sampled_from(["exclude", "linear"]),
+)
+
+
+def torque_of(law: FrictionLaw, coefficients: dict[str, float], v: float) -> float:
+    """Friction of one joint, written out as in the documentation."""
+    sign = np.sign(v)
+    if law.zone == "linear" and abs(v) < law.standstill:
+        sign = v / law.standstill
+    terms = {
+        "f0": sign,
+        "f1": v,
+        "fd": abs(v),
+        "f2": v**3 if law.third == "cubic" else np.sign(v) * v**2,
+        "fs": sign * np.exp(-((v / (law.stribeck or 1.0)) ** 2)),
+        "fo": 1.0,
+    }
+    return float(sum(value * terms[symbol] for symbol, value in coefficients.items()))
+
+
+@given(st.lists(LAWS, min_size=6, max_size=6), st.integers(0, 2**16))
+@settings(max_examples=25, deadline=None)
+def test_every_joint_obeys_its_own_law(laws: list[FrictionLaw], seed: int) -> None:
+    names = [f"joint_{j}" for j in range(1, 7)]
+    model = RobotModel.from_urdf(
+        urdf_text(), friction=laws[0], joint_friction=dict(zip(names[1:], laws[1:], strict=True))
+    )
+    random = np.random.default_rng(seed)
+    friction = random.normal(size=len(model.friction.terms))
+    values = np.concatenate([np.zeros(model.base.rank), friction])
+    qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
+    torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
+    own: list[dict[str, float]] = [{} for _ in names]
+    for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
+        symbol, joint = name.split("_")
+        own[int(joint) - 1][symbol] = value
+    expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
+    np.testing.assert_allclose(torque, expected, atol=1e-11)
+
+
+def test_names_go_term_by_term_over_the_joints_that_have_it() -> None:
+    model = RobotModel.from_urdf(
+        TWO_LINK,
+        friction=FrictionLaw(third=None),
+        joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", stribeck=0.1)},
+    )
+    assert model.friction.names == ("f0_1", "f0_2", "f1_1", "f2_2", "fs_2")
+    assert model.friction.units == ("N·m", "N·m", "N·m·s/rad", "N·m·s³/rad³", "N·m")
+    table = model.friction.table(np.arange(5.0))
+    assert table == ({"f0": 0.0, "f1": 2.0}, {"f0": 1.0, "f2": 3.0, "fs": 4.0})
+    with pytest.raises(ShapeError):
+        model.friction.table(np.arange(4.0))
+
+
+def test_asymmetric_friction_brings_the_offset_that_its_coulomb_part_is() -> None:
+    law = FrictionLaw(third=None, asymmetric=True)
+    assert law.symbols == ("f0", "f1", "fd", "fo")
+    forwards = law.columns(np.array([2.0]), np.ones(1))
+    backwards = law.columns(np.array([-2.0]), -np.ones(1))
+    f0, f1, fd, fo = 5.0, 3.0, 0.5, 1.0
+    values = np.array([f0, f1, fd, fo])
+    assert (values @ forwards)[0] == (f0 + fo) + (f1 + fd) * 2.0
+    assert (values @ backwards)[0] == -(f0 - fo) - (f1 - fd) * 2.0
+
+
+def test_only_joints_with_an_excluded_zone_stand() -> None:
+    model = RobotModel.from_urdf(
+        TWO_LINK,
+        friction=FrictionLaw(standstill=0.1),
+        joint_friction={"elbow": FrictionLaw(standstill=0.1, zone="linear")},
+    )
+    assert model.moving(np.zeros((1, 2))).tolist() == [[False, True]]
+    np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
+
+
+def test_offsets_are_no_friction() -> None:
+    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
+    friction = [n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f]
+    assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"stribeck": 0.0}, "Stribeck"),
+        ({"stribeck": np.inf}, "Stribeck"),
+        ({"zone": "dead"}, "exclude"),
+        ({"zone": "linear", "standstill": 0.0}, "standstill"),
+        ({"standstill": -1.0}, "standstill"),
+        ({"standstill": np.nan}, "standstill"),
+        ({"standstill": np.inf}, "standstill"),
+        ({"third": "stribeck"}, "quadratic.*cubic"),
+    ],
+)
+def test_senseless_settings_are_refused(settings: dict[str, object], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        FrictionLaw(**settings)  # type: ignore[arg-type]
+
+
+def test_a_law_for_a_joint_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
+        RobotModel.from_urdf(TWO_LINK, joint_friction={"wrist": FrictionLaw()})
+
+
+@given(st.lists(LAWS, min_size=2, max_size=2), st.booleans(), st.integers(0, 2**16))
+@settings(max_examples=30, deadline=None)
+def test_dissipative_combinations_take_energy_at_rest_and_at_speed(
+    laws: list[FrictionLaw], coupled: bool, seed: int
+) -> None:
+    coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]])) if coupled else None
+    friction = JointFriction(tuple(laws), (True, True), coupling)
+    combine, not_negative = dissipation(friction)
+    assert np.linalg.matrix_rank(combine) == len(friction.terms)
+    g = np.random.default_rng(seed).exponential(size=len(friction.terms))
+    g[~not_negative] = 0.0
+    values = dict(zip(friction.names, combine @ g, strict=True))
+    for joint, law in enumerate(laws, start=1):
+        own = {s: values[f"{s}_{joint}"] for s in law.symbols}
+        for v in (-3.0, -0.01, 0.01, 3.0):
+            assert torque_of(law, own, v) * v >= -1e-12
+
+
+def test_no_friction_that_takes_energy_is_left_out() -> None:
+    law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
+    friction = JointFriction((law,), (True,))
+    combine, not_negative = dissipation(friction)
+    possible = {"f0": 2.0, "f1": 1.0, "fd": -0.9, "fs": -1.8, "fo": -5.0}
+    g = np.linalg.solve(combine, [possible[term.symbol] for term in friction.terms])
+    assert np.all(g[not_negative] >= 0.0)
+    for beyond in ({"fd": -1.1}, {"fs": -2.1}, {"f0": -0.1}, {"fd": 1.1}):
+        values = possible | beyond
+        g = np.linalg.solve(combine, [values[term.symbol] for term in friction.terms])
+        assert np.any(g[not_negative] < 0.0), beyond
+
+
+steps = st.lists(st.sampled_from([-3e-4, -1e-5, 0.0, 1e-5, 2e-3]), min_size=2, max_size=60)
+distances = st.sampled_from([1e-5, 1e-4, 1e-3])
+
+
+class TestPreslidingState:
+    @given(steps=steps, distance=distances)
+    def test_it_is_dahls_recursion(self, steps: list[float], distance: float) -> None:
+        """z <- s + (z - s) exp(-|dq| / d), from zero."""
+        position = 0.3 + np.cumsum([0.0, *steps])
+        state, expected = 0.0, [0.0]
+        for step in np.diff(position):
+            state = np.sign(step) + (state - np.sign(step)) * np.exp(-abs(step) / distance)
+            expected.append(state)
+        np.testing.assert_allclose(presliding_state(position, distance), expected, atol=1e-12)
+
+    @given(steps=steps, distance=distances)
+    def test_it_never_exceeds_full_friction(self, steps: list[float], distance: float) -> None:
+        state = presliding_state(np.cumsum(steps), distance)
+        assert np.all(np.abs(state) <= 1.0)
+
+    def test_at_rest_it_keeps_what_the_motion_left(self) -> None:
+        position = np.array([0.0, 0.1, 0.1, 0.1, 0.1])
+        np.testing.assert_allclose(presliding_state(position, 1e-4)[1:], 1.0, rtol=1e-12)
+
+
+class TestDirectionOfFriction:
+    def test_without_presliding_it_is_the_sign(self) -> None:
+        motion = a_motion()
+        direction = MODEL.friction.direction(*motion[:3])
+        np.testing.assert_array_equal(direction, np.sign(motion.velocity))
+
+    def test_a_short_displacement_is_the_sign_away_from_reversals(self) -> None:
+        motion = a_motion()
+        sliding = MODEL.with_friction(presliding=1e-7)
+        moved = motion._replace(direction=sliding.friction.direction(*motion[:3]))
+        fast = np.abs(motion.velocity).min(axis=1) > 0.3  # as much as changes in one step
+        fast[0] = False  # nothing is known of what was before
+        np.testing.assert_allclose(
+            sliding.torque(truth(), *moved[1:])[fast],
+            MODEL.torque(truth(), *motion[1:])[fast],
+            rtol=1e-9,
+        )
+
+    def test_the_torque_of_a_motion_takes_its_direction(self) -> None:
+        motion = a_motion()
+        half = motion._replace(direction=0.5 * np.sign(motion.velocity))
+        dry = np.zeros_like(truth())
+        dry[MODEL.parameter_names.index("f0_1")] = 4.0
+        dry[MODEL.parameter_names.index("f0_2")] = 2.0
+        np.testing.assert_allclose(
+            MODEL.torque(dry, *half[1:]), 0.5 * MODEL.torque(dry, *motion[1:]), atol=1e-12
+        )
+
+
+class TestOtherFriction:
+    def test_a_model_with_other_friction_names_its_parameters(self) -> None:
+        changed = MODEL.with_friction(third="cubic", offset=True)
+        assert changed.friction.laws[0] == FrictionLaw(third="cubic", offset=True)
+        assert changed.parameter_names == MODEL.base.names + changed.friction.names
+        assert len(changed.units) == changed.n_parameters

@@ -20,7 +20,7 @@ from identification.estimators.instrumental import (
     partial_r2,
 )
 from identification.factor.factor import Factor
-from identification.factor.instruments import InstrumentFactor
+from identification.factor.phases import PhaseFactor, instrument_factor, measured_part
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -112,8 +112,8 @@ def samples_of(model: RobotModel, motion: Motion, torque: Array) -> Samples:
 
 def fit(
     model: RobotModel, samples: Samples, plan: Motion = PLAN
-) -> tuple[InstrumentFactor, InstrumentalEstimate]:
-    factor = InstrumentFactor.from_samples(model, samples, plan)
+) -> tuple[PhaseFactor, InstrumentalEstimate]:
+    factor = instrument_factor(model, samples, plan)
     return factor, estimate_instrumental(model, factor)
 
 
@@ -152,7 +152,7 @@ def test_it_solves_the_stacked_weighted_instrumental_equations(
     weights = np.array([0.3, 20.0])
     z = z * weights[:, None]
     expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
-    factor = InstrumentFactor.from_samples(model, samples, PLAN)
+    factor = instrument_factor(model, samples, PLAN)
     result = estimate_instrumental(model, factor, weights)
     np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
 
@@ -194,7 +194,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(
 
 def test_repetitions_and_pieces_add_up(model: RobotModel, truth: Array) -> None:
     runs = [executed(model, truth, seed, position_noise=LARGE) for seed in (1, 2)]
-    one, two = (InstrumentFactor.from_samples(model, run, PLAN) for run in runs)
+    one, two = (instrument_factor(model, run, PLAN) for run in runs)
     both = estimate_instrumental(model, one + two, np.ones(2)).estimate
     parts = [dense(model, run) for run in runs]
     z, w, y = (np.concatenate([part[k] for part in parts]) for k in range(3))
@@ -207,11 +207,13 @@ def test_the_part_without_instruments_is_what_least_squares_reads(
     model: RobotModel, truth: Array
 ) -> None:
     samples = executed(model, truth, 1)
-    factor = InstrumentFactor.from_samples(model, samples, PLAN)
+    factor = instrument_factor(model, samples, PLAN)
     same_rows = replace(samples, usable=samples.usable & model.moving(PLAN.velocity))
     expected = Factor.of(model, same_rows)
-    np.testing.assert_allclose(factor.measured.total.gram, expected.gram, rtol=1e-9, atol=1e-7)
-    np.testing.assert_array_equal(factor.measured.total.samples, expected.samples)
+    np.testing.assert_allclose(
+        measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
+    )
+    np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
 
 
 # Strength of the instruments
@@ -404,7 +406,7 @@ def test_on_the_ns16_noisy_encoders_bias_least_squares_and_not_the_instruments()
     samples = samples_of(arm, Motion(TIME, *(spline(TIME, k) for k in range(3))), torque)
     plan = planned_motion(samples, motion.position)
     assert np.all(np.abs(plan.lag) < 1e-4)
-    factor = InstrumentFactor.from_samples(arm, samples, plan.motion, plan.usable)
+    factor = instrument_factor(arm, samples, plan.motion, plan.usable)
     result = estimate_instrumental(arm, factor)
     still_to_predict = arm.torque(true, *motion[1:])
     errors = [
@@ -488,7 +490,7 @@ def test_rows_without_a_command_and_recordings_without_any(model: RobotModel, tr
     with pytest.raises(ShapeError, match="commanded"):
         planned_motion(samples, command[1:])
     with pytest.raises(ShapeError, match="instrument"):
-        InstrumentFactor.from_samples(model, samples, sines(1)._replace(position=command[1:]))
+        instrument_factor(model, samples, sines(1)._replace(position=command[1:]))
 
 
 SERVO = JointServo(np.array([4000.0, 1500.0]), np.array([300.0, 60.0]))

@@ -8,9 +8,8 @@ import pinocchio as pin
 import pytest
 
 from identification import FrictionLaw, RobotModel
-from identification.model.kinematics import FROM_PINOCCHIO
-from identification.model.regressor import CHUNK, joint_arrays
-from identification.model.wrench import LINK_SYMBOLS
+from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
+from identification.model.regressor import CHUNK, LinkMotion, _cos_sin, joint_arrays
 from sim_fixtures.ns16 import urdf_text
 
 
@@ -134,10 +133,6 @@ def test_a_model_without_friction_or_rotors_has_inertial_columns_only() -> None:
     assert [len(c) for c in model.regressor(*states(2)).columns] == [36, 35, 28, 21, 14, 7]
 
 
-def test_standard_symbols_are_the_ten_of_a_rigid_body() -> None:
-    assert len(LINK_SYMBOLS) == len(set(LINK_SYMBOLS)) == 10
-
-
 def test_lists_are_taken_as_arrays() -> None:
     (array,) = joint_arrays(2, q=[[0, 1], [2, 3]])  # type: ignore[arg-type]
     assert array.dtype == np.float64
@@ -154,3 +149,21 @@ def test_the_working_arrays_go_with_their_model() -> None:
         assert plan() is None
     finally:
         gc.enable()
+
+
+def test_a_shorter_block_leaves_nothing_of_the_block_before_it() -> None:
+    state = np.random.default_rng(2).uniform(-3.0, 3.0, (3, 25, 6))
+    links = LinkMotion(chain_from_urdf(urdf_text()), np.zeros(3), 25)
+    with np.errstate(invalid="ignore"):
+        links.update(*np.full((3, 25, 6), np.inf))
+    links.update(*state[:, :10])
+    assert np.all(np.isfinite(links.motion))
+
+
+def test_cosine_and_sine_are_exact_to_rounding() -> None:
+    special = np.array([0.0, np.pi / 2, np.pi, -np.pi, 2.0 * np.pi, 1e-300, 1e6])
+    angle = np.concatenate([special, np.random.default_rng(0).uniform(-20.0, 20.0, 100_000)])
+    cosine, sine = np.empty_like(angle), np.empty_like(angle)
+    _cos_sin(angle, cosine, sine)
+    assert np.abs(cosine - np.cos(angle)).max() < 1e-15
+    assert np.abs(sine - np.sin(angle)).max() < 1e-15

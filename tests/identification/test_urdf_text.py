@@ -8,6 +8,7 @@ import math
 import struct
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -17,8 +18,8 @@ from identification import ModelError, RobotModel
 from identification.excitation import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
 from identification.export.urdf import write_urdf
-from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
-from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal
+from identification.model.kinematics import MOST_JOINTS, chain_from_urdf, urdf_fault
+from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 
 INERTIAL = (
     '<inertial><mass value="6"/><origin xyz="0.2 0 0"/>'
@@ -301,3 +302,94 @@ def test_a_description_that_was_read_is_not_kept(text: str) -> None:
         assert gc.collect() == 0
     finally:
         gc.enable()
+
+
+DRAKE = 'xmlns="http://drake.mit.edu"'
+
+
+def drakes(text: str) -> str:
+    return text.replace("<robot ", f"<robot {DRAKE} ")
+
+
+def test_elements_have_the_names_that_are_written() -> None:
+    text = (
+        f'<robot {DRAKE} xmlns:gazebo="x" name="r"><!-- kept --><link name="a&amp;b" />'
+        '<gazebo:link gazebo:name="c">1 &lt; 2</gazebo:link></robot>'
+    )
+    root = urdf_tree(text, comments=True)
+    assert [link.get("name") for link in root.findall("link")] == ["a&b"]
+    assert ElementTree.tostring(root, encoding="unicode") == text
+    assert [child.tag for child in urdf_tree(text)] == ["link", "gazebo:link"]
+
+
+@pytest.mark.parametrize("text", ["", "<robot>", "<robot a='\ud800'/>"])
+def test_what_is_no_xml_is_refused(text: str) -> None:
+    with pytest.raises(ModelError, match="no XML"):
+        urdf_tree(text)
+
+
+def test_in_a_namespace_a_shape_that_was_left_out_is_noticed() -> None:
+    CollisionChecker(drakes(ARM), Workspace(floor=-1.0))
+    second = arm("</robot>", f'<link name="l"/>{HINGE.format("j", "revolute", "upper", "l")}')
+    second = second.replace('<link name="l"/>', f'<link name="l">{SHAPE}</link>') + "</robot>"
+    with pytest.raises(CollisionModelError, match="of link 'upper' 0 could be read"):
+        CollisionChecker(drakes(second.replace("<box ", "<capsule ", 1)), Workspace(floor=-1.0))
+
+
+def test_in_a_namespace_a_closed_chain_is_refused() -> None:
+    closed = arm("</robot>", HINGE.format("again", "revolute", "base", "upper") + "</robot>")
+    with pytest.raises(ModelError, match="child of 2 joints: a closed chain"):
+        RobotModel.from_urdf(drakes(closed))
+
+
+def test_in_a_namespace_a_fault_is_still_told() -> None:
+    with pytest.raises(ModelError, match="'shoulder' is of type 'revolut'"):
+        RobotModel.from_urdf(drakes(arm('"revolute"', '"revolut"')))
+
+
+LINKS = '<link name="a"/><link name="b"/>'
+JOINT = (
+    '<joint name="j" type="{}"><parent link="a"/><child link="{}"/><axis xyz="0 0 1"/>{}</joint>'
+)
+LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+
+
+def robot(inside: str, head: str = ' name="r"') -> str:
+    return f"<robot{head}>{inside}</robot>"
+
+
+def xacro(inside: str) -> str:
+    return robot(inside, ' name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"')
+
+
+FAULTS = {
+    "no xml": "no XML",
+    "<sdf/>": "<sdf>",
+    xacro('<xacro:include filename="x"/>'): "expand it with: xacro",
+    robot(LINKS, ""): "no name",
+    robot(""): "no <link>",
+    robot(LINKS): "'a', 'b' hang on nothing",
+    robot(LINKS + '<link name="a"/>'): "2 of its links are called 'a'",
+    robot(LINKS + JOINT.format("revolut", "b", LIMIT)): "'j' is of type 'revolut'",
+    robot(LINKS + JOINT.format("revolute", "b", "")): "'j' is revolute and has no <limit>",
+    robot(LINKS + JOINT.format("revolute", "c", LIMIT)): "child link 'c'",
+    robot(LINKS + '<joint name="j" type="fixed"><parent link="a"/></joint>'): "no <child",
+    robot(LINKS + JOINT.format("fixed", "b", "") + JOINT.format("fixed", "b", "").replace(
+        '"j"', '"k"'
+    )): "child of 2 joints",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", FAULTS)
+def test_what_cannot_be_read_is_said_in_a_sentence(text: str) -> None:
+    with pytest.raises(ModelError) as caught:
+        RobotModel.from_urdf(text)
+    message = str(caught.value)
+    assert FAULTS[text] in message
+    assert message.count("\n") == 0
+
+
+def test_what_xacro_leaves_in_the_header_is_no_fault() -> None:
+    text = xacro(LINKS + JOINT.format("continuous", "b", ""))
+    assert urdf_fault(text) is None
+    assert RobotModel.from_urdf(text).n_joints == 1

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hil.archive import Archive, ArchiveHeader
-from hil.study.analysis import class_of, plan_in
+from hil.study.records import class_of, plan_in
 
 HEADER = {"kind": "move", "joint_names": '["a"]', "attachments": "[]"}
 

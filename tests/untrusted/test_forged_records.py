@@ -13,8 +13,7 @@ import pytest
 
 from hil.archive import Archive
 from hil.errors import ArchiveError
-from hil.study.analysis import class_in
-from hil.study.records import Record, read_record, write_record
+from hil.study.records import Record, class_in, read_record, write_record
 from identification.excitation import Journal, SearchSettings
 from tests.identification.searching import problem
 

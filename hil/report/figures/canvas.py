@@ -1,9 +1,10 @@
-"""Axes placed by the pixel and styled alike, and lines thinned without losing their peaks."""
+"""Colours by role, axes placed by the pixel, and lines thinned without losing their peaks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -13,9 +14,39 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from hil.report.figures.palette import GRID, INK, MUTED
-
 Array = NDArray[np.float64]
+
+# Figures draw with stand-ins, colours that no one would draw with: each becomes a CSS variable when
+# the figure enters the page, so that light, dark and print need no second drawing.
+INK = "#010201"
+MUTED = "#010202"
+GRID = "#010203"
+BAND = "#010204"
+PAPER = "#010205"
+FIRST = "#010206"
+SECOND = "#010207"
+WIDE = "#010208"
+"""A light, broad line that another one may lie upon."""
+ROUTES = ("#010209", "#01020a", "#01020b", "#01020c")
+INSIDE, OUTSIDE_2, OUTSIDE_3 = "#01020d", "#01020e", "#01020f"
+
+CSS_VARIABLES = {
+    INK: "var(--ink)",
+    MUTED: "var(--muted)",
+    GRID: "var(--grid)",
+    BAND: "var(--band)",
+    PAPER: "var(--paper)",
+    FIRST: "var(--first)",
+    SECOND: "var(--second)",
+    WIDE: "var(--wide)",
+    ROUTES[0]: "var(--route-0)",
+    ROUTES[1]: "var(--route-1)",
+    ROUTES[2]: "var(--route-2)",
+    ROUTES[3]: "var(--route-3)",
+    INSIDE: "var(--inside)",
+    OUTSIDE_2: "var(--outside-2)",
+    OUTSIDE_3: "var(--outside-3)",
+}
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0
 PANEL_WIDTH = 370.0
@@ -100,6 +131,22 @@ def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
     rows = [np.column_stack([v, v, gap]).ravel() for v in (x, y)]
     with mpl.rc_context({"path.simplify": False}):
         axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
+
+
+def boxed(axes: Axes, columns: Sequence[Array], width: float, **options: Any) -> None:
+    """A box for each column, side by side from 1 on: quartiles, median and whiskers."""
+    thin = {"color": MUTED, "linewidth": 1.1}
+    axes.boxplot(
+        columns,
+        positions=range(1, len(columns) + 1),
+        widths=width,
+        patch_artist=True,
+        boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
+        medianprops={"color": INK, "linewidth": 2.2},
+        whiskerprops=thin,
+        capprops=thin,
+        **options,
+    )
 
 
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:

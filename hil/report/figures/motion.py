@@ -10,10 +10,23 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from hil.report import numbers
-from hil.report.figures.canvas import blank, footed, headed, place, plot_panel, ruled, thinned
-from hil.report.figures.palette import BAND, FIRST, INK, MUTED, ROUTES, SECOND, WIDE
-from hil.report.figures.svg import Panel, drawing, to_panel
-from hil.report.figures.traces import MOST_POINTS, Plot, Trace, traces_text
+from hil.report.figures.canvas import (
+    BAND,
+    FIRST,
+    INK,
+    MUTED,
+    ROUTES,
+    SECOND,
+    WIDE,
+    blank,
+    footed,
+    headed,
+    place,
+    plot_panel,
+    ruled,
+    thinned,
+)
+from hil.report.figures.svg import MOST_POINTS, Panel, Plot, Trace, drawing, to_panel, traces_text
 from hil.report.series import ReportSeries
 from hil.report.validation import TorqueError
 

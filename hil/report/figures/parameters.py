@@ -1,4 +1,4 @@
-"""Parameters as dots: how far from the truth, and how far the routes to a std disagree."""
+"""Parameters: how far from the truth and how certain, their correlations, and elimination."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
+from numpy.typing import NDArray
 
 from hil.report import numbers
-from hil.report.figures.canvas import TICK_SIZE, blank, footed, log_ticks, place
-from hil.report.figures.palette import (
+from hil.report.figures.canvas import (
     BAND,
     FIRST,
     GRID,
@@ -23,10 +23,19 @@ from hil.report.figures.palette import (
     OUTSIDE_3,
     PAPER,
     ROUTES,
+    SECOND,
+    TICK_SIZE,
+    blank,
+    footed,
+    headed,
+    log_ticks,
+    place,
+    plot_panel,
+    ruled,
 )
 from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.report.parameters import Route
-from hil.results import ConsistencyResult, Results
+from hil.results import ConsistencyResult, EliminationStepResult, EssentialResult, Results
 
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 370.0, 92.0, 14.0, 8.0, 40.0
 _ROW = 14.5
@@ -245,6 +254,171 @@ def _shift_number(axes: Axes, end: float, row: int, z: float) -> None:
         textcoords="offset points",
         ha="right" if end > 0.0 else "left",
         va="center",
+        fontsize=TICK_SIZE,
+        color=INK,
+    )
+
+
+_LABELS, _SCALE = 84.0, 78.0
+_SIDE = 560.0
+_SMALLEST_CELL, _LARGEST_CELL = 11.0, 26.0
+
+
+def correlation_matrix(results: Results) -> Panel | None:
+    """|Ψ_ij| / sqrt(Ψ_ii Ψ_jj): 0 white, 1 black; friction left out, as in the paper."""
+    n = results.n_base
+    if n == 0:
+        return None
+    matrix = np.array(results.correlation, dtype=np.float64)[:n, :n]
+    return matrix_panel(matrix, [p.label for p in results.parameters[:n]], key="c")
+
+
+def matrix_panel(
+    matrix: NDArray[np.float64], labels: Sequence[str], *, key: str, title: str = ""
+) -> Panel:
+    """|ρ| of a normalised matrix (n, n), one label for each row; `key` is the panel's own."""
+    n, matrix = len(labels), np.abs(matrix)
+    names = [label(text) for text in labels]
+    above = int(np.sum(np.triu(matrix, 1) > 0.9))
+    alt = (
+        f"Absolute correlation between {n} base parameters, white for 0 and black for 1;"
+        f" {above} of {n * (n - 1) // 2} pairs exceed 0.9."
+    )
+    side = n * min(max(_SIDE / n, _SMALLEST_CELL), _LARGEST_CELL)
+    with drawing():
+        figure = blank(_LABELS + side + _SCALE, _LABELS + side + 6.0)
+        axes = place(figure, _LABELS, _LABELS, side, side)
+        axes.imshow(matrix, cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none", aspect="auto")
+        _label_cells(axes, names, side / n)
+        scale = place(figure, _LABELS + side + 22.0, _LABELS, 14.0, min(side, 200.0))
+        shade_scale(scale)
+        scale.set_title("|ρ|", fontsize=TICK_SIZE, color=MUTED, pad=6.0)
+        note = f"{above} of {n * (n - 1) // 2} pairs above 0.9" if title else ""
+        return to_panel(figure, key=key, title=title, note=note, alt=alt)
+
+
+def _label_cells(axes: Axes, names: list[str], cell: float) -> None:
+    size = min(TICK_SIZE, 0.76 * cell)
+    axes.xaxis.tick_top()
+    axes.set_xticks(range(len(names)))
+    axes.set_xticklabels(
+        names, rotation=90, rotation_mode="anchor", ha="left", va="center", fontsize=size
+    )
+    axes.set_yticks(range(len(names)))
+    axes.set_yticklabels(names, fontsize=size)
+    axes.tick_params(length=0.0, pad=4.0)
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color(MUTED)
+
+
+def shade_scale(axes: Axes, ink: str = INK, muted: str = MUTED) -> None:
+    """The shade scale, as an image of its own (a colour bar would be 256 rectangles)."""
+    shades = np.linspace(1.0, 0.0, 64)[:, None]
+    axes.imshow(
+        shades, cmap="gray_r", vmin=0.0, vmax=1.0, aspect="auto", extent=(0.0, 1.0, 0.0, 1.0)
+    )
+    axes.set_xticks([])
+    axes.yaxis.tick_right()
+    axes.set_yticks([0.0, 0.5, 1.0])
+    axes.set_yticklabels(["0", "0.5", "1"], color=ink)
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color(muted)
+
+
+_ELIMINATION_HEIGHT = 250.0
+# The last few parameters leave errors of 100 %, beside which nothing else could be distinguished.
+_HIGHEST_ERROR = 4.0  # times the lowest
+
+
+def elimination_panels(essential: EssentialResult) -> list[Panel]:
+    """Torque error, and largest relative standard deviation, over the number of parameters."""
+    steps = essential.steps
+    if len(steps) < 2:
+        return []
+    return [_errors(essential, steps), _deviations(essential, steps)]
+
+
+def _errors(essential: EssentialResult, steps: list[EliminationStepResult]) -> Panel:
+    left = np.array([step.left for step in steps])
+    held_out = 100.0 * np.array([step.held_out for step in steps])
+    in_sample = 100.0 * np.array([step.in_sample for step in steps])
+    chosen = steps[essential.cut]
+    top = _HIGHEST_ERROR * max(float(np.nanmin(held_out)), 1e-9)
+    top = max(top, 1.15 * float(held_out[0]), 1.15 * 100.0 * essential.by_spread_held_out)
+    alt = (
+        f"Torque error over the number of parameters: on held-out motion {held_out[0]:.2f} % with"
+        f" all {left[0]}, {100.0 * chosen.held_out:.2f} % with the {chosen.left} at the cut,"
+        f" {100.0 * essential.by_spread_held_out:.2f} % with the {essential.by_spread_left} that"
+        " relative standard deviations alone leave."
+    )
+    with drawing():
+        figure, axes = _elimination_axes(left)
+        axes.plot(left, in_sample, color=SECOND, linewidth=1.4, linestyle=(0, (5, 3)))
+        axes.plot(left, held_out, color=FIRST, linewidth=1.8)
+        axes.set_ylim(0.0, top)
+        ruled(axes, "y", x_ticks=6, y_ticks=5)
+        _cut(axes, chosen.left, 100.0 * chosen.held_out, top)
+        axes.scatter(
+            [essential.by_spread_left],
+            [100.0 * essential.by_spread_held_out],
+            s=40.0,
+            marker="D",
+            facecolor=PAPER,
+            edgecolor=FIRST,
+            linewidths=1.5,
+            zorder=5,
+        )
+        headed(axes, "torque error [%]")
+        note = f"cut at {chosen.left} of {left[0]}"
+        return to_panel(figure, key="el0", title="Torque error", note=note, alt=alt)
+
+
+def _deviations(essential: EssentialResult, steps: list[EliminationStepResult]) -> Panel:
+    left = np.array([step.left for step in steps])
+    largest = 100.0 * np.array([step.largest_relative_std for step in steps])
+    usable = np.isfinite(largest) & (largest > 0.0)
+    chosen = steps[essential.cut]
+    worst = 100.0 * chosen.largest_relative_std
+    alt = (
+        "Largest relative standard deviation over the number of parameters,"
+        f" {worst:.3g} % with the {chosen.left} at the cut."
+    )
+    with drawing():
+        figure, axes = _elimination_axes(left)
+        axes.set_yscale("log")
+        axes.plot(left[usable], largest[usable], color=FIRST, linewidth=1.8)
+        low = float(largest[usable].min(initial=1.0)) / 2.0
+        high = 2.0 * min(float(largest[usable].max(initial=1.0)), 1e5)
+        axes.set_ylim(low, high)
+        decades = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+        log_ticks(axes.yaxis, FixedLocator([10.0**k for k in decades]))
+        axes.grid(True, axis="y", color=GRID, linewidth=0.8)
+        _cut(axes, chosen.left, worst if math.isfinite(worst) else high, high)
+        headed(axes, "largest std / |estimate| [%]")
+        note = f"{worst:.3g} % at the cut" if math.isfinite(worst) else ""
+        return to_panel(figure, key="el1", title="Worst known parameter", note=note, alt=alt)
+
+
+def _elimination_axes(left: NDArray[np.intp]) -> tuple[Figure, Axes]:
+    """Axes on which parameters go from all of them on the left to one on the right."""
+    figure, axes = plot_panel(_ELIMINATION_HEIGHT, right=12.0, bottom=42.0)
+    axes.set_xlim(float(left[0]) + 0.5, 0.0)
+    footed(axes, "parameters left")
+    return figure, axes
+
+
+def _cut(axes: Axes, left: int, value: float, top: float) -> None:
+    """A line at the cut, and the point on the curve there."""
+    axes.axvline(left, color=MUTED, linewidth=1.0, linestyle=(0, (3, 3)))
+    axes.scatter([left], [min(value, top)], s=44.0, color=FIRST, linewidths=0.0, zorder=5)
+    axes.annotate(
+        "cut",
+        (left, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(4.0, -9.0),
+        textcoords="offset points",
         fontsize=TICK_SIZE,
         color=INK,
     )

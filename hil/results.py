@@ -7,17 +7,28 @@ Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import AliasChoices, Field, ValidationError, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.reading import json_of, text_of
-from hil.results.frozen import Frozen
+
+
+class Frozen(BaseModel):
+    """A section of a file: unchangeable, without unknown fields; no finite number is a word."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    def to_json(self) -> str:
+        """As indented JSON, the text of a file."""
+        return self.model_dump_json(indent=1) + "\n"
 
 
 class StepResult(Frozen):
@@ -624,3 +635,47 @@ def _lists(results: Results) -> Iterator[tuple[str, Sequence[Any] | None, int]]:
         yield "repetition_values", row, p
     for name in get_args(UncertaintyResult.model_fields["reported"].annotation):
         yield f"uncertainty.{name}", getattr(results.uncertainty, name), p
+
+
+def csv_tables(results: Results) -> dict[str, str]:
+    """CSV in full precision: the text of each table, by file name: the path of its field.
+
+    A list with a number for each joint has a column for each, `field.joint`; a matrix with a
+    column for each parameter has their names. What is neither stays in `results.json`.
+    """
+    fields = results.model_dump(mode="json")
+    names = [parameter["name"] for parameter in fields["parameters"]]
+    tables = {}
+    for path, rows in _tables(fields, ""):
+        if isinstance(rows[0], dict):
+            records = [dict(_cells(row, fields["joint_names"])) for row in rows]
+        else:
+            heads = names if len(rows[0]) == len(names) else range(len(rows[0]))
+            records = [dict(zip(map(str, heads), row, strict=True)) for row in rows]
+        text = StringIO()
+        columns = dict.fromkeys(key for row in records for key in row)
+        writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(records)
+        tables[f"{path}.csv"] = text.getvalue()
+    return tables
+
+
+def _tables(value: dict[str, Any], path: str) -> Iterator[tuple[str, list[Any]]]:
+    """Lists of records and of rows of equal length, however deep, and where they are."""
+    for name, item in value.items():
+        if isinstance(item, dict):
+            yield from _tables(item, f"{path}{name}.")
+        elif isinstance(item, list) and item:
+            records = all(isinstance(row, dict) for row in item)
+            matrix = all(isinstance(row, list) and len(row) == len(item[0]) > 0 for row in item)
+            if records or matrix:
+                yield f"{path}{name}", item
+
+
+def _cells(record: dict[str, Any], joints: list[str]) -> Iterator[tuple[str, Any]]:
+    for name, item in record.items():
+        if not isinstance(item, list | dict):
+            yield name, item
+        elif isinstance(item, list) and len(item) == len(joints):
+            yield from ((f"{name}.{joint}", cell) for joint, cell in zip(joints, item, strict=True))

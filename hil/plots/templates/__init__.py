@@ -1,1 +1,0 @@
-"""Templates of pages that show pictures."""
