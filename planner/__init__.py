@@ -7,7 +7,7 @@ set-point per controller cycle, at an override that may change, and stops it on 
 
 from __future__ import annotations
 
-from planner.batch import PlanningPool, plan_many
+from planner.batch import plan_chunk
 from planner.children import chunks_of, map_in_children, stream_in_children
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
@@ -57,8 +57,7 @@ __all__ = [
     "Overrides",
     "MotionPlan",
     "TargetPassage",
-    "plan_many",
-    "PlanningPool",
+    "plan_chunk",
     "plan_in_child",
     "in_child",
     "close_child",

@@ -2,7 +2,7 @@
 
 The solver behind the corners can crash its process on legal input. Whatever must not die, such
 as the process that supervises a live arm, plans through `plan_in_child` or `in_child`: the child
-is started once, held ready, and started anew after a crash. Search workers (`planner.batch`) are
+is started once, held ready, and started anew after a crash. Search workers (`planner.children`) are
 made of the same children.
 
 The child is a new interpreter, not a fork: it shares no locks, threads or memory with its parent

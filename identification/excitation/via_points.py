@@ -16,9 +16,15 @@ from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genome import between, checked_genes, share_between
 from identification.excitation.straight_paths import free_segments, is_inside, straight_way
-from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError, plan_in_child
+from planner import (
+    FourierSeries,
+    JointLimits,
+    PiecewiseCubic,
+    PlannerError,
+    plan_chunk,
+    plan_in_child,
+)
 from planner.arrays import read_only
-from planner.batch import plan_chunk
 
 Array = NDArray[np.float64]
 
