@@ -36,15 +36,13 @@ from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import Interpolator
 from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
-from planner.motion_csv import from_csv, to_csv
 from planner.motion_plan import MotionPlan, TargetPassage
 from planner.moves import plan_moves
 from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 from planner.plan import plan
-from planner.plan_file import PlanFile
+from planner.plan_file import PlanFile, to_csv
 from planner.player import TrajectoryPlayer
 from planner.remote import load, pack
-from planner.sampled import SampledTrajectory
 from planner.verify import check_limits, check_rest
 
 __all__ = [
@@ -75,12 +73,10 @@ __all__ = [
     "Extrema",
     "FourierSeries",
     "harmonic_bounds",
-    "SampledTrajectory",
     "TrajectoryPlayer",
     "Interpolator",
     "PlanFile",
     "to_csv",
-    "from_csv",
     "PlannerError",
     "InvalidLimits",
     "InvalidSetting",

@@ -30,9 +30,8 @@ from planner.errors import (
     PlanningTimedOut,
 )
 from planner.isolation import in_child
-from planner.motion_csv import to_csv
 from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, Move, plan_moves
-from planner.plan_file import PlanFile
+from planner.plan_file import PlanFile, to_csv
 
 Array = NDArray[np.float64]
 P = ParamSpec("P")
