@@ -6,13 +6,15 @@ runs, one move after the other, and comes out the same.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from planner.arrays import Array
 from planner.commands import Fly, FlyDistance, FlyPercent, Move, Overrides
-from planner.corners import STOP, Corner, fly_by, fly_within
+from planner.corners import Corner, fly_by_all, fly_within
 from planner.errors import InvalidSetting
 from planner.limits import Allowance, Bounds, JointLimits
 from planner.piecewise_cubic import PiecewiseCubic
@@ -96,19 +98,30 @@ def leg(start: Array, move: Move, limits: JointLimits, overrides: Overrides) -> 
 
 
 def corner(before: Leg, after: Leg, fly: Fly) -> Corner:
-    """Plan how the target of `before` is passed on the way to that of `after`.
+    """Plan how the target of `before` is passed on the way to that of `after`."""
+    return corners_between([before, after], [fly])[0]
+
+
+def corners_between(legs: Sequence[Leg], flies: Sequence[Fly]) -> list[Corner]:
+    """Plan how the target of each leg but the last is passed on the way to that of the next.
 
     Within a corner each joint may use what the more generous of the two moves grants: the
     deceleration of the one before or the acceleration of the one after.
     """
-    bounds = before.bounds
-    if after.bounds is not bounds or before.deceleration is not bounds.acceleration:
-        bounds = wider(bounds, after.bounds, before.deceleration)
-    if isinstance(fly, FlyPercent):
-        return fly_by(before.segment, after.segment, bounds, fly.share)
-    if isinstance(fly, FlyDistance):
-        return fly_within(before.segment, after.segment, bounds, fly.distance)
-    return STOP
+    pairs = list(pairwise(legs))
+    segments = [(before.segment, after.segment) for before, after in pairs]
+    bounds = [
+        before.bounds
+        if after.bounds is before.bounds and before.deceleration is before.bounds.acceleration
+        else wider(before.bounds, after.bounds, before.deceleration)
+        for before, after in pairs
+    ]
+    shares = [fly.share if isinstance(fly, FlyPercent) else 0.0 for fly in flies]
+    corners = fly_by_all(segments, bounds, shares)
+    for index, fly in enumerate(flies):
+        if isinstance(fly, FlyDistance):
+            corners[index] = fly_within(*segments[index], bounds[index], fly.distance)
+    return corners
 
 
 def wider(before: Bounds, after: Bounds, deceleration: Array) -> Bounds:

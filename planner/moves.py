@@ -26,7 +26,7 @@ from planner.errors import (
     ViaPointOutOfLimits,
     WrongShape,
 )
-from planner.legs import Leg, Shares, between, corner, leg_with, shares_of
+from planner.legs import Leg, Shares, between, corners_between, leg_with, shares_of
 from planner.limits import Allowance, Bounds, JointLimits
 from planner.motion_plan import MotionPlan, TargetPassage
 from planner.piecewise_cubic import PiecewiseCubic, concatenate
@@ -113,7 +113,7 @@ def planned(
     """Plan moves through points (n_moves + 1, n) [rad] that were checked; see `plan_moves`."""
     shares = _shares(moves, limits, overrides)
     legs = [leg_with(a, b, each) for (a, b), each in zip(pairwise(points), shares, strict=True)]
-    corners = [corner(a, b, move.fly) for (a, b), move in zip(pairwise(legs), moves, strict=False)]
+    corners = corners_between(legs, [move.fly for move in moves[:-1]])
     motion = assembled(legs, corners)
     check(motion, legs)
     return MotionPlan(

@@ -17,7 +17,6 @@ import planner.isolation
 from planner import ViaPointOutOfLimits, plan
 from planner.batch import plan_chunk
 from planner.children import chunks_of, map_in_children
-from planner.corners import join
 from planner.errors import (
     PlannerCrashed,
     PlannerNotStarted,
@@ -114,7 +113,7 @@ def test_the_solver_crashes_on_legal_input():
     assert done.returncode == -signal.SIGSEGV
 
 
-def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked():
+def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked(join):
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
