@@ -2,22 +2,65 @@
 
 Fields of eight bytes, each with one writer, read without locks: a store of eight aligned bytes
 is seen whole or not at all. Times are those of CLOCK_MONOTONIC, the same in every process.
+
+With it what is read from it: percentiles of latencies, and whether another process lives (`Pulse`).
 """
 
 from __future__ import annotations
 
 import ctypes
+import math
+import time
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TypeAlias
 
 from drivers.exchange import memory
-from drivers.exchange.latency import BINS
 
 STALE: Final = 0.5
 """s after which a heartbeat counts as that of a dead process."""
 PATIENCE: Final = 5.0
 """The same where no motion was requested: a busy computer may keep a supervisor waiting, and the
 death of one is shown by its end of the pipe at once."""
+
+
+# How long answers take is counted in bins, so that other processes can tell percentiles: that costs
+# a logarithm and a store per packet, whatever the number of packets.
+BINS: Final = 48
+PER_OCTAVE: Final = 4
+SHORTEST: Final = 2e-6
+"""s; the first bin holds everything up to it, each next one 2 ** (1 / `PER_OCTAVE`) times more.
+The last holds all that took longer than 5.8 ms."""
+
+
+def bin_of(seconds: float) -> int:
+    """Index of the bin that a latency falls into."""
+    if not seconds > SHORTEST:
+        return 0
+    if math.isinf(seconds):
+        return BINS - 1
+    return min(BINS - 1, math.ceil(PER_OCTAVE * math.log2(seconds / SHORTEST)))
+
+
+def upper_edge(index: int) -> float:
+    """Longest latency of a bin, s; that of the last is infinite."""
+    return math.inf if index >= BINS - 1 else SHORTEST * 2.0 ** (index / PER_OCTAVE)
+
+
+def quantile(counts: Sequence[int], share: float) -> float | None:
+    """Latency not exceeded by this share of the answers, s; None without any.
+
+    It is the upper edge of a bin: never too short, and at most 19 % too long.
+    """
+    total = sum(counts)
+    if total <= 0:
+        return None
+    needed, seen = share * total, 0
+    for index, count in enumerate(counts):
+        seen += count
+        if seen >= needed and seen > 0:
+            return upper_edge(index)
+    return upper_edge(BINS - 1)
 
 
 class ArchiveState(IntEnum):
@@ -56,7 +99,7 @@ class ControlBlock(ctypes.Structure):
         fd: descriptor of the memory.
 
     Attributes:
-        latencies: (`latency.BINS`,) answers by how long they took, counted by the exchange.
+        latencies: (`BINS`,) answers by how long they took, counted by the exchange.
         supervisor_heartbeat: s.
         stop_count: raised by one for each stop asked for.
         override: fraction of the speed asked for.
@@ -168,3 +211,33 @@ class ControlBlock(ctypes.Structure):
 def create() -> int:
     """Descriptor of memory for a block; every field is 0."""
     return memory.create("hil-control", ctypes.sizeof(ControlBlock))
+
+
+LONGEST_LOOK: Final = 0.5
+"""s between two looks that count at most; in a longer time this process was held up itself."""
+
+
+class Pulse:
+    """How long a heartbeat has stood still while somebody was awake to see it.
+
+    Its age would not do: a machine that was suspended wakes with every heartbeat old.
+
+    Args:
+        beat: the heartbeat, any number; 0 before the first.
+        longest_look: s; `LONGEST_LOOK` for somebody who looks more often.
+    """
+
+    def __init__(self, beat: Callable[[], float], *, longest_look: float = LONGEST_LOOK) -> None:
+        self._beat, self._longest = beat, longest_look
+        self._last, self._seen = beat(), time.monotonic()
+        self._quiet = 0.0
+
+    def quiet(self) -> float:
+        """Seconds since the last beat; 0 before the first. To be called often."""
+        now, beat = time.monotonic(), self._beat()
+        if beat != self._last or beat == 0.0:
+            self._last, self._quiet = beat, 0.0
+        else:
+            self._quiet += min(now - self._seen, self._longest)
+        self._seen = now
+        return self._quiet

@@ -23,7 +23,7 @@ from drivers.exchange import (
     ExchangeProcess,
     Leaving,
 )
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from drivers.states import State
 from hil.terminal_text import plural
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange import RingReader
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.archive.recorder import describe
