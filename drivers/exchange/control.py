@@ -204,7 +204,7 @@ class ControlBlock(ctypes.Structure):
 
     def copied(self) -> Self:
         """Return the fields as they are at this moment."""
-        copy: Self = self.from_buffer_copy(self)
+        copy: Self = type(self).from_buffer_copy(self)
         return copy
 
 
