@@ -2,7 +2,7 @@
 
 A search draws motions by the thousand, and some cannot be planned: their points are outside the
 limits, or their corners crash the solver and its process with it, so that it is to be a worker's
-(`planner.children`). Here each comes back as a motion or as the error that made it infeasible.
+(`planner.worker`). Here each comes back as a motion or as the error that made it infeasible.
 """
 
 from __future__ import annotations
@@ -17,10 +17,15 @@ from planner.blocks import Block
 from planner.commands import FlyPercent
 from planner.corners import Corners, round_corners
 from planner.errors import InvalidViaPoints, PlannerError, PlanningError
-from planner.legs import SEGMENT_ACCELERATION, SEGMENT_JERK, SEGMENT_VELOCITY
 from planner.limits import Allowance, JointLimits
+from planner.moves import (
+    SEGMENT_ACCELERATION,
+    SEGMENT_JERK,
+    SEGMENT_VELOCITY,
+    checked_via_points,
+    plan,
+)
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.plan import checked_via_points, plan
 from planner.segments import StraightMoves
 
 _PIECES = 7  # of a straight move

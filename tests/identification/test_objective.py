@@ -13,7 +13,7 @@ from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, samp
 from identification.excitation.criteria import coupling_index, information, log10_det
 from identification.excitation.objective import Objective
 from planner import FourierSeries, JointLimits, plan
-from planner.remote import load, pack
+from planner.worker import load, pack
 
 LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 MODEL = RobotModel.from_urdf((Path(__file__).parent / "two_link.urdf").read_text(encoding="utf-8"))

@@ -13,18 +13,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import planner.isolation
+import planner.worker
 from planner import ViaPointOutOfLimits, plan
 from planner.batch import plan_chunk
-from planner.children import chunks_of, map_in_children
 from planner.errors import (
     PlannerCrashed,
     PlannerNotStarted,
     PlannerOutOfStep,
     PlanningTimedOut,
 )
-from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
+from planner.worker import (
+    WorkerProcess,
+    chunks_of,
+    close_child,
+    in_child,
+    map_in_children,
+    plan_in_child,
+)
 
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
 CRASH = {
@@ -237,7 +243,7 @@ def test_a_call_that_takes_too_long_is_ended():
 def test_a_child_ends_with_its_parent_even_in_the_middle_of_a_long_call(task):
     script = f"""
 import os, signal, time
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess
 child = WorkerProcess(timeout=3600.0)
 print(child.call(os.getpid), flush=True)
 {task}
@@ -391,9 +397,9 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
 def test_an_answer_to_another_call_is_refused_and_the_next_one_is_right(monkeypatch):
     with WorkerProcess() as child:
         child.call(os.getpid)
-        honest = planner.isolation.numbered
+        honest = planner.worker.numbered
         monkeypatch.setattr(
-            planner.isolation, "numbered", lambda number, message: honest(number + 1, message)
+            planner.worker, "numbered", lambda number, message: honest(number + 1, message)
         )
         with pytest.raises(PlannerOutOfStep):
             child.call(os.getpid)
