@@ -12,8 +12,7 @@ import numpy as np
 from planner import JointLimits
 from planner.arrays import Array
 from planner.commands import FlyPercent, Move
-from planner.motion_plan import MotionPlan
-from planner.moves import plan_moves
+from planner.moves import MotionPlan, plan_moves
 from planner.verify import position_rounding
 
 FLYS = (0.1, 0.25, 0.5, 0.75, 1.0)

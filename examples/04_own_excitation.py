@@ -18,7 +18,7 @@ from hil import Campaign, Cell
 from hil.campaign import design
 from hil.progress import Silent
 from identification.excitation import Excitation, Objective, correlation, midpoints
-from identification.excitation.random_motion import moves_through
+from identification.excitation.excitation import moves_through
 from planner import plan_moves
 
 PICTURE = Path("runs/examples/04_own_excitation.png")

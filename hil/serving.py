@@ -22,7 +22,7 @@ from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, serve
-from sim_fixtures.tally import ServeSummary, Tally
+from sim_fixtures.tally import Tally
 
 _PR_SET_TIMERSLACK: Final = 29
 
@@ -196,7 +196,7 @@ class Served:
         gave_up: whether the controller ended the session because too many openings were lost.
     """
 
-    summary: ServeSummary
+    summary: Tally
     phase: Phase
     reason: str
     intervals: int

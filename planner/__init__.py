@@ -7,8 +7,7 @@ set-point per controller cycle, at an override that may change, and stops it on 
 
 from __future__ import annotations
 
-from planner.batch import PlanningPool, plan_many
-from planner.children import chunks_of, map_in_children, stream_in_children
+from planner.batch import plan_chunk
 from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
@@ -34,18 +33,23 @@ from planner.errors import (
 )
 from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import Interpolator
-from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
-from planner.motion_csv import from_csv, to_csv
-from planner.motion_plan import MotionPlan, TargetPassage
-from planner.moves import plan_moves
+from planner.moves import MotionPlan, TargetPassage, plan, plan_moves
 from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
-from planner.plan import plan
-from planner.plan_file import PlanFile
+from planner.plan_file import PlanFile, to_csv
 from planner.player import TrajectoryPlayer
-from planner.remote import load, pack
-from planner.sampled import SampledTrajectory
 from planner.verify import check_limits, check_rest
+from planner.worker import (
+    WorkerProcess,
+    chunks_of,
+    close_child,
+    in_child,
+    load,
+    map_in_children,
+    pack,
+    plan_in_child,
+    stream_in_children,
+)
 
 __all__ = [
     "plan",
@@ -57,8 +61,7 @@ __all__ = [
     "Overrides",
     "MotionPlan",
     "TargetPassage",
-    "plan_many",
-    "PlanningPool",
+    "plan_chunk",
     "plan_in_child",
     "in_child",
     "close_child",
@@ -76,12 +79,10 @@ __all__ = [
     "Extrema",
     "FourierSeries",
     "harmonic_bounds",
-    "SampledTrajectory",
     "TrajectoryPlayer",
     "Interpolator",
     "PlanFile",
     "to_csv",
-    "from_csv",
     "PlannerError",
     "InvalidLimits",
     "InvalidSetting",

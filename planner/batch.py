@@ -1,170 +1,37 @@
-"""Planning whole populations in worker processes, for searches.
+"""Planning whole populations together, for searches.
 
 A search draws motions by the thousand, and some cannot be planned: their points are outside the
-limits, or their corners crash the solver and its process with it. Here each comes back as a
-motion or as the error that made it infeasible, in the order given, whatever the number of
-workers; a worker that dies is started anew.
+limits, or their corners crash the solver and its process with it, so that it is to be a worker's
+(`planner.worker`). Here each comes back as a motion or as the error that made it infeasible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cbrt
-from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array
-from planner.blocks import Block, LimitRows, Rows, after
-from planner.children import chunks_of, map_in_children
+from planner.blocks import Block
 from planner.commands import FlyPercent
-from planner.corners import FIRST_SHARES, LAST_SHARES, LEAST_SHARE, ranked
-from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
-from planner.isolation import WorkerProcess
-from planner.joins import Join, Solutions, finish_many, solve_many
-from planner.legs import SEGMENT_ACCELERATION, SEGMENT_JERK, SEGMENT_VELOCITY
-from planner.limits import JointLimits
+from planner.corners import Corners, round_corners
+from planner.errors import InvalidViaPoints, PlannerError, PlanningError
+from planner.limits import Allowance, JointLimits
+from planner.moves import (
+    SEGMENT_ACCELERATION,
+    SEGMENT_JERK,
+    SEGMENT_VELOCITY,
+    checked_via_points,
+    plan,
+)
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.plan import checked_via_points, plan
-
-
-class StraightMoves(NamedTuple):
-    """Straight joint-space lines, each run by one scalar profile of seven pieces.
-
-    Attributes:
-        start: Where each begins (s, n) [rad].
-        direction: Change of the joints per unit of path, largest entry 1, (s, n).
-        knots: Times of the profile (s, 8) [s].
-        pieces: Path, its rates at the start of each piece, and its constant jerk, (s, 7, 4).
-        ramp: Time spent accelerating, equal to that spent decelerating (s,) [s].
-    """
-
-    start: Array
-    direction: Array
-    knots: Array
-    pieces: Array
-    ramp: Array
-
-    @classmethod
-    def between(
-        cls, starts: Array, ends: Array, velocity: Array, acceleration: Array, jerk: Array
-    ) -> StraightMoves:
-        """Plan the fastest straight moves (s, n) under limits that are each (s, n)."""
-        change = ends - starts
-        length = np.max(np.abs(change), axis=1)
-        moves = length > 0.0
-        direction = change / np.where(moves, length, 1.0)[:, None]
-        with np.errstate(divide="ignore", over="ignore"):
-            along = [
-                np.where(moves, np.min(bound / np.abs(direction), axis=1), 1.0)
-                for bound in (velocity, acceleration, jerk)
-            ]
-        knots, pieces, ramp = _profiles(np.where(moves, length, 1.0), *along)
-        knots *= moves[:, None]
-        pieces *= moves[:, None, None]
-        return cls(starts, direction, knots, pieces, ramp * moves)
-
-    def take(self, rows: Rows) -> StraightMoves:
-        """Return some of the moves, by index."""
-        return StraightMoves(*(field[rows] for field in self))
-
-    @property
-    def durations(self) -> Array:
-        """Length in time (s,) [s]."""
-        last: Array = self.knots[:, -1]
-        return last
-
-    def states(self, t: Array) -> Array:
-        """Return position, velocity, acceleration (s, n, 3) at one time `t` (s,) [s] in each."""
-        along = self._along(t)
-        states = self.direction[:, :, None] * along[:, None, :3]
-        states[..., 0] += self.start
-        return states
-
-    def cut(self, begin: Array, end: Array) -> tuple[Array, Array]:
-        """Return the parts between two times (s,) [s], with pieces outside them of no length.
-
-        Those hold the state at the cut, so that the table stays continuous.
-
-        Returns:
-            Times from 0 (s, 8) [s] and pieces (s, n, 7, 4).
-        """
-        begin, end = begin[:, None], end[:, None]
-        knots = np.clip(self.knots, begin, end)
-        pieces = self.pieces.copy()
-        moved = knots[:, :-1] - self.knots[:, :-1]
-        p, v, a, j = np.moveaxis(self.pieces, -1, 0)
-        pieces[..., :3] = np.stack(after(p, v, a, j, moved), axis=-1)
-        for outside, at in (
-            (self.knots[:, 1:] <= begin, begin[:, 0]),
-            (self.knots[:, :-1] >= end, end[:, 0]),
-        ):
-            np.copyto(pieces, self._along(at)[:, None, :], where=outside[..., None])
-        table = self.direction[:, :, None, None] * pieces[:, None]
-        table[..., 0] += self.start[:, :, None]
-        return knots - begin, table
-
-    def _along(self, t: Array) -> Array:
-        """Return path, its two rates and its jerk at a time in each move, (s, 4)."""
-        index = np.sum(self.knots[:, 1:-1] <= t[:, None], axis=1)
-        rows = np.arange(len(t))
-        p, v, a, j = self.pieces[rows, index].T
-        return np.stack((*after(p, v, a, j, t - self.knots[rows, index]), j), axis=-1)
-
-
-def _profiles(
-    distance: Array, velocity: Array, acceleration: Array, jerk: Array
-) -> tuple[Array, Array, Array]:
-    """Return knots (s, 8), pieces (s, 7, 4) and ramps (s,), as `scurve.rest_to_rest` does."""
-    rise = np.minimum(acceleration / jerk, np.sqrt(velocity / jerk))
-    flat = np.maximum(velocity / (jerk * rise) - rise, 0.0)
-    cruises = distance > velocity * (2.0 * rise + flat)
-    # Too short to reach full speed; the shortest do not even reach full acceleration.
-    full = acceleration / jerk
-    holds = distance >= 2.0 * acceleration * full * full
-    held = (np.sqrt(full * full + 4.0 * distance / acceleration) - 3.0 * full) / 2.0
-    short = full.copy()
-    # As floats have it: that of arrays may differ in the last digit.
-    least = (distance / (2.0 * jerk))[~holds].tolist()
-    short[~holds] = [cbrt(cube) for cube in least]
-    rise = np.where(cruises, rise, short)
-    flat = np.where(cruises, flat, np.where(holds, np.maximum(held, 0.0), 0.0))
-
-    a1 = jerk * rise
-    v1 = a1 * rise / 2.0
-    p1 = v1 * rise / 3.0
-    v2, p2 = v1 + a1 * flat, p1 + flat * (v1 + a1 * flat / 2.0)
-    v3, p3 = v2 + v1, p2 + rise * (v2 + a1 * rise / 3.0)
-    cruise = np.where(cruises, (distance - p3 - p3) / v3, 0.0)
-    zero = np.zeros_like(distance)
-    pieces = np.array(
-        [
-            (zero, zero, zero, jerk),
-            (p1, v1, a1, zero),
-            (p2, v2, a1, -jerk),
-            (p3, v3, zero, zero),
-            (distance - p3, v3, zero, -jerk),
-            (distance - p2, v2, -a1, zero),
-            (distance - p1, v1, -a1, jerk),
-        ]
-    )
-    lengths = np.stack((zero, rise, flat, rise, cruise, rise, flat, rise), axis=-1)
-    return np.cumsum(lengths, axis=-1), np.moveaxis(pieces, -1, 0), 2.0 * rise + flat
-
+from planner.segments import StraightMoves
 
 _PIECES = 7  # of a straight move
 
 
-class _Corners(NamedTuple):
-    """How corners are rounded: times cut before and after (c,) [s], and the joins."""
-
-    leave: Array
-    enter: Array
-    joins: list[Join | None]
-
-
-def plan_population(points: Array, bounds: LimitRows, fly: float) -> list[PiecewiseCubic | None]:
+def plan_population(points: Array, bounds: Allowance, fly: float) -> list[PiecewiseCubic | None]:
     """Plan motions through via points, as many for each, that were checked.
 
     Args:
@@ -186,7 +53,8 @@ def plan_population(points: Array, bounds: LimitRows, fly: float) -> list[Piecew
     )
     numbered = np.arange(len(each)).reshape(count, n_points - 1)
     before, after = numbered[:, :-1].ravel(), numbered[:, 1:].ravel()
-    corners = _round(moves, before, after, bounds.take(each[before]), fly)
+    shares = np.full(len(before), FlyPercent(100.0 * fly).share)
+    corners = round_corners(moves, before, after, bounds.take(each[before]), shares)
     block = _assembled(moves, corners, points.shape)
     good = block.keeps(bounds) & block.smooth(bounds)
     return [
@@ -194,73 +62,7 @@ def plan_population(points: Array, bounds: LimitRows, fly: float) -> list[Piecew
     ]
 
 
-def _round(
-    moves: StraightMoves, before: Rows, after: Rows, bounds: LimitRows, fly: float
-) -> _Corners:
-    """Choose the join of each corner between two moves; none where the arm stops."""
-    count, fly = len(before), FlyPercent(100.0 * fly).share
-    corners = _Corners(np.zeros(count), np.zeros(count), [None] * count)
-    task = _Task(moves, before, after, bounds, fly)
-    flown = (fly >= LEAST_SHARE) & (moves.ramp[before] > 0.0) & (moves.ramp[after] > 0.0)
-    asked = np.flatnonzero(flown)
-    if len(asked) == 0:  # the solver is not even asked whether it is there
-        return corners
-    shares = np.repeat(fly * np.array(FIRST_SHARES), len(asked))
-    rows = np.tile(asked, len(FIRST_SHARES))
-    candidates = task.solve(rows, shares)
-    leave, enter = task.cuts(rows, shares)
-    saving = leave + enter - candidates.durations
-    saving = saving.reshape(len(FIRST_SHARES), -1)
-    for place in ranked(saving):
-        picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
-        picked = picked[[corners.joins[row] is None for row in asked[picked].tolist()]]
-        chosen = place[picked] * len(asked) + picked
-        task.finish(corners, rows[chosen], shares[chosen], candidates.take(chosen))
-    for share in LAST_SHARES:
-        rows = asked[[corners.joins[row] is None for row in asked.tolist()]]
-        if len(rows) == 0:
-            break
-        shares = np.full(len(rows), fly * share)
-        solutions = task.solve(rows, shares)
-        leave, enter = task.cuts(rows, shares)
-        found = np.flatnonzero(leave + enter >= solutions.durations)
-        task.finish(corners, rows[found], shares[found], solutions.take(found))
-    return corners
-
-
-class _Task(NamedTuple):
-    """Corners (c,) between moves, their limits (c, n), and the fly asked for."""
-
-    moves: StraightMoves
-    before: Rows
-    after: Rows
-    bounds: LimitRows
-    fly: float
-
-    def cuts(self, rows: Rows, shares: Array) -> tuple[Array, Array]:
-        """Return the times cut before and after some corners for a share of each ramp."""
-        ramp = self.moves.ramp
-        return shares * ramp[self.before[rows]], shares * ramp[self.after[rows]]
-
-    def solve(self, rows: Rows, shares: Array) -> Solutions:
-        """Ask the solver to join what is cut."""
-        leave, enter = self.cuts(rows, shares)
-        before, after = self.moves.take(self.before[rows]), self.moves.take(self.after[rows])
-        starts, ends = before.states(before.durations - leave), after.states(enter)
-        full = self.fly * (self.moves.ramp[self.before[rows]] + self.moves.ramp[self.after[rows]])
-        return solve_many(starts, ends, full, self.bounds.take(rows))
-
-    def finish(self, corners: _Corners, rows: Rows, shares: Array, solutions: Solutions) -> None:
-        """Enter the joins that keep their limits and are no slower than to stop."""
-        leave, enter = self.cuts(rows, shares)
-        joins = finish_many(solutions, self.bounds.take(rows))
-        for row, out, into, join in zip(rows.tolist(), leave, enter, joins, strict=True):
-            if join is not None and join.duration <= out + into:
-                corners.leave[row], corners.enter[row] = out, into
-                corners.joins[row] = join
-
-
-def _assembled(moves: StraightMoves, corners: _Corners, shape: tuple[int, ...]) -> Block:
+def _assembled(moves: StraightMoves, corners: Corners, shape: tuple[int, ...]) -> Block:
     """Cut the moves where the corners ask for it and put everything in a row."""
     count, n_points, n_joints = shape
     legs = n_points - 1
@@ -272,7 +74,7 @@ def _assembled(moves: StraightMoves, corners: _Corners, shape: tuple[int, ...]) 
     times = times.reshape(count, legs, 1, _PIECES + 1)
     pieces = pieces.reshape(count, legs, n_joints, _PIECES, 4)
 
-    width = max([1, *(join.knots.shape[1] - 1 for join in corners.joins if join is not None)])
+    width = max([1, *(len(join.knots[0]) - 1 for join in corners.joins if join is not None)])
     # Where the arm stops, and behind the last piece of a join, pieces of no length hold the state
     # in which the next move is entered.
     rounds = np.repeat(pieces[:, 1:, :, :1], width, axis=3)
@@ -280,7 +82,7 @@ def _assembled(moves: StraightMoves, corners: _Corners, shape: tuple[int, ...]) 
     knots = np.zeros((count, legs - 1, n_joints, width + 1))
     for index, join in enumerate(corners.joins):
         if join is not None:
-            where, own = divmod(index, legs - 1), join.knots.shape[1]
+            where, own = divmod(index, legs - 1), len(join.knots[0])
             rounds[where][:, : own - 1] = join.coefficients
             knots[where][:, :own] = join.knots
             knots[where][:, own:] = join.duration
@@ -307,115 +109,23 @@ def _in_a_row(move_knots: Array, moves: Array, join_knots: Array, joins: Array) 
     return Block.of_pieces(times, table)
 
 
-# Motions per call to a worker: enough for whole arrays to pay, few enough to spread.
-_CHUNK = 32
-
 Planned = PiecewiseCubic | PlannerError
-
-
-class PlanningPool:
-    """Worker processes that plan populations; keep one for all generations of a search.
-
-    Args:
-        workers: Number of processes; 0 plans in this one, where a crash of the solver is fatal.
-        timeout: Longest time [s] a worker may take for 32 motions, then for each of them alone.
-
-    Attributes:
-        children: The worker processes.
-    """
-
-    def __init__(self, workers: int = 1, *, timeout: float = 10.0) -> None:
-        if workers < 0:
-            raise InvalidSetting("workers", workers, "a number of processes, 0 or more")
-        self.children = [WorkerProcess(timeout=timeout) for _ in range(workers)]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the workers."""
-        for child in self.children:
-            child.close()
-
-    def plan_many(
-        self,
-        individuals: Sequence[ArrayLike] | Array,
-        limits: JointLimits,
-        *,
-        speed: ArrayLike = 1.0,
-        fly: float = 0.5,
-    ) -> list[Planned]:
-        """Plan each individual as `planner.plan` does; see `plan_many`."""
-        shares = _one_each(speed, len(individuals), limits.n_joints)
-        if not 0.0 <= fly <= 1.0:
-            raise InvalidSetting("fly", fly, "a number from 0 to 1")
-        chunks = chunks_of(len(individuals), _CHUNK)
-        population = _Population(individuals, shares, limits, fly)
-        if self.children:
-            return list(map_in_children(self.children, plan_chunk, chunks, population.part))
-        return [planned for chunk in chunks for planned in plan_chunk(*population.part(chunk))]
-
-
-def plan_many(
-    individuals: Sequence[ArrayLike] | Array,
-    limits: JointLimits,
-    *,
-    speed: ArrayLike = 1.0,
-    fly: float = 0.5,
-    workers: int = 1,
-    timeout: float = 10.0,
-) -> list[Planned]:
-    """Plan a motion through the via points of each individual, as `planner.plan` does.
-
-    Args:
-        individuals: Via points (n_points, n_joints) [rad] of each; their number may differ.
-        limits: Limits that every motion keeps.
-        speed: Share of each joint's velocity limit, in (0, 1]: a number, (n_joints,) for all, or
-            one row for each individual.
-        fly: Share of each deceleration that the next acceleration overlaps, 0 to 1.
-        workers: Number of processes; the result does not depend on it. With 0 all is planned in
-            this process, where a crash of the solver is fatal.
-        timeout: Longest time [s] a worker may take for 32 motions, then for each of them alone.
-
-    Returns:
-        For each individual, in their order, its motion, or the error that `plan` would raise for
-        it, or `PlannerCrashed` or `PlanningTimedOut` if planning it alone ended its process.
-
-    Raises:
-        InvalidSetting: speed or fly outside its range, or a negative number of workers.
-        PlannerNotStarted: a worker died before it was given anything to do.
-    """
-    with PlanningPool(workers, timeout=timeout) as pool:
-        return pool.plan_many(individuals, limits, speed=speed, fly=fly)
-
-
-class _Population:
-    """What is to be planned, and parts of it as a worker wants them."""
-
-    def __init__(
-        self,
-        individuals: Sequence[ArrayLike] | Array,
-        shares: Array,
-        limits: JointLimits,
-        fly: float,
-    ) -> None:
-        self._individuals = individuals
-        self._shares = shares
-        self._limits = limits
-        self._fly = fly
-
-    def part(self, chunk: Sequence[int]) -> tuple[list[ArrayLike], Array, JointLimits, float]:
-        own = [self._individuals[index] for index in chunk]
-        return own, self._shares[list(chunk)], self._limits, self._fly
 
 
 def plan_chunk(
     individuals: Sequence[ArrayLike], speed: Array, limits: JointLimits, fly: float
 ) -> list[Planned]:
-    """Plan some individuals together, in this process; `speed` has one row (n,) for each."""
+    """Plan a motion through the via points of each individual, as `planner.plan` does.
+
+    Args:
+        individuals: Via points (n_points, n_joints) [rad] of each; their number may differ.
+        speed: Share of each joint's velocity limit, in (0, 1], one row (n,) for each.
+        limits: Limits that every motion keeps.
+        fly: Share of each deceleration that the next acceleration overlaps, 0 to 1.
+
+    Returns:
+        For each individual, in their order, its motion or the error that `plan` would raise for it.
+    """
     planned: list[Planned | None] = [None] * len(individuals)
     alike: dict[int, list[tuple[int, Array]]] = {}
     for index, via_points in enumerate(individuals):
@@ -428,7 +138,7 @@ def plan_chunk(
     for group in alike.values():
         rows = [index for index, _ in group]
         shape = (len(rows), limits.n_joints)
-        bounds = LimitRows(
+        bounds = Allowance(
             np.broadcast_to(limits.lower, shape),
             np.broadcast_to(limits.upper, shape),
             limits.velocity * speed[rows],
@@ -447,15 +157,3 @@ def _alone(points: Array, speed: Array, limits: JointLimits, fly: float) -> Plan
         return plan(points, limits, speed=speed, fly=fly)
     except PlanningError as error:
         return error
-
-
-def _one_each(speed: ArrayLike, count: int, n_joints: int) -> Array:
-    """Return shares of speed, one row (n_joints,) for each individual."""
-    shares = np.asarray(speed, dtype=np.float64)
-    if shares.shape not in ((), (n_joints,), (count, n_joints)) or not np.all(
-        (shares > 0.0) & (shares <= 1.0)
-    ):
-        raise InvalidSetting(
-            "speed", speed, f"a share in (0, 1]: one, {n_joints}, or {n_joints} per individual"
-        )
-    return np.broadcast_to(shares, (count, n_joints))

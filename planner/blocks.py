@@ -8,25 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.arrays import Array
+from planner.limits import Allowance
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.verify import jump_rounding, position_rounding
 
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
-
-
-class LimitRows(NamedTuple):
-    """Limits of many motions, each (c, n), SI units."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-    def take(self, rows: Rows | Mask) -> LimitRows:
-        """Return the bounds of some rows, by index or mask."""
-        return LimitRows(*(bound[rows] for bound in self))
 
 
 class Block(NamedTuple):
@@ -46,15 +33,20 @@ class Block(NamedTuple):
     @classmethod
     def from_jerks(cls, start: Array, knots: Array, jerks: Array) -> Self:
         """Integrate constant jerks (c, n, m) between knots (c, n, m + 1) from states (c, n, 3)."""
-        coefficients = np.empty((*jerks.shape, 4))
-        lengths = np.diff(knots, axis=-1)
-        p, v, a = np.moveaxis(start, -1, 0)
-        for piece in range(jerks.shape[-1]):
-            j, x = jerks[..., piece], lengths[..., piece]
-            for column, value in enumerate((p, v, a, j)):
-                coefficients[..., piece, column] = value
-            p, v, a = after(p, v, a, j, x)
-        return cls(knots, coefficients, np.stack((p, v, a), axis=-1))
+        x = knots[..., 1:] - knots[..., :-1]
+        states = np.empty((*knots.shape, 3))
+        states[..., 0, :] = start
+        # In the order of operations in which a table is evaluated: so pieces meet to the last bit.
+        jx = jerks * x
+        states[..., 1:, 2] = jx
+        p, v, a = (states[..., i] for i in range(3))
+        np.cumsum(a, axis=-1, out=a)
+        v[..., 1:] = x * (a[..., :-1] + jx * 0.5)
+        np.cumsum(v, axis=-1, out=v)
+        p[..., 1:] = x * (v[..., :-1] + x * (a[..., :-1] * 0.5 + jx * (1.0 / 6.0)))
+        np.cumsum(p, axis=-1, out=p)
+        pieces = np.concatenate((states[..., :-1, :], jerks[..., None]), axis=-1)
+        return cls(knots, pieces, states[..., -1, :])
 
     @classmethod
     def of_pieces(cls, knots: Array, coefficients: Array) -> Self:
@@ -73,7 +65,7 @@ class Block(NamedTuple):
         """Return some of the motions, by index or mask."""
         return Block(*(field[rows] for field in self))
 
-    def keeps(self, bounds: LimitRows) -> Mask:
+    def keeps(self, bounds: Allowance) -> Mask:
         """Whether each motion keeps its bounds at every instant (c,), from roots, not samples."""
         p, v, a, j = np.moveaxis(self.coefficients, -1, 0)
         length = np.diff(self.knots, axis=-1)
@@ -97,7 +89,7 @@ class Block(NamedTuple):
         respected: Mask = within.all(axis=-1)
         return respected
 
-    def smooth(self, bounds: LimitRows) -> Mask:
+    def smooth(self, bounds: Allowance) -> Mask:
         """Whether each motion is C2 and at rest at both ends, but for rounding, (c,)."""
         p, v, a, j = np.moveaxis(self.coefficients, -1, 0)
         ends = np.stack(after(p, v, a, j, np.diff(self.knots, axis=-1)), axis=-1)

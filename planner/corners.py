@@ -6,24 +6,27 @@ then a smaller join is one of the motions to choose from. The solver is not perf
 isolated states, such as those at a knot of a ramp, it misses the fastest join by far, or takes one
 that breaks a limit. So it is asked at shares next to each other and the corner that saves most is
 used; none is used that would be slower than to stop.
+
+Many corners are joined at once: a join is solved in 10 µs, all else goes over all of them together.
+Each number is made by the same operations whatever else is in the arrays, so a corner does not
+depend on its company, to the last bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
-from typing import Final, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import ruckig
 from numpy.typing import NDArray
 
 from planner.arrays import Array
-from planner.blocks import Block, LimitRows
+from planner.blocks import Block, Mask, Rows
 from planner.errors import UnsupportedSolver
-from planner.limits import Bounds
+from planner.limits import Allowance, Bounds
 from planner.piecewise_cubic import PiecewiseCubic
-from planner.segments import StraightSegment
+from planner.segments import StraightMoves, StraightSegment
 from planner.verify import jump_rounding
 
 _SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
@@ -148,42 +151,42 @@ class Corner(NamedTuple):
 STOP: Final = Corner(0.0, 0.0, None)
 
 
-class Solution(NamedTuple):
-    """What the solver says.
-
-    Attributes:
-        duration: How long the motion takes [s].
-        answer: All else, in the units in which it was asked.
-        time: Unit of time [s].
-        jerk: Unit of jerk of each joint (n,) [rad/s³].
-    """
-
-    duration: float
-    answer: ruckig.Trajectory
-    time: float
-    jerk: Array
-
-    def pieces(self) -> tuple[Array, Array]:
-        """Return how long each constant jerk lasts [s], and the jerks [rad/s³], (n, m) each."""
-        rows = [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in self.answer.profiles[0]]
-        lengths, jerks = np.array(rows).reshape(len(self.jerk), 2, -1).swapaxes(0, 1)
-        return lengths * self.time, jerks * self.jerk[:, None]
-
-
 def fly_by(before: StraightSegment, after: StraightSegment, bounds: Bounds, share: float) -> Corner:
     """Round the corner between two segments as far as `share` asks and the bounds allow.
 
     The cut takes the share of the ramp before and of the ramp after the corner, so that no part
     of a segment goes to both of its corners. It never takes longer than to stop.
     """
-    if share < LEAST_SHARE or before.slowing_down == 0.0 or after.speeding_up == 0.0:
-        return STOP
-    for tried in _candidates(before, after, bounds, share):
-        joined = _finished(tried.solution, tried.start, tried.end, bounds)
-        if joined is not None:
-            how: How = "flown" if tried.share == share else "reduced"
-            return Corner(tried.leave, tried.enter, joined, tried.share, how)
-    return STOP
+    return fly_by_all([(before, after)], [bounds], [share])[0]
+
+
+def fly_by_all(
+    segments: Sequence[tuple[StraightSegment, StraightSegment]],
+    bounds: Sequence[Bounds],
+    shares: Sequence[float],
+) -> list[Corner]:
+    """Round each corner between two segments as `fly_by` does."""
+    corners = [STOP] * len(segments)
+    flown = [
+        index
+        for index, ((before, after), share) in enumerate(zip(segments, shares, strict=True))
+        if share >= LEAST_SHARE and before.slowing_down > 0.0 and after.speeding_up > 0.0
+    ]
+    if not flown:
+        return corners
+    rows = np.arange(2 * len(flown))
+    rounded = round_corners(
+        StraightMoves.of([segment for index in flown for segment in segments[index]]),
+        rows[::2],
+        rows[1::2],
+        Allowance.of_many([bounds[index] for index in flown]),
+        np.array([shares[index] for index in flown]),
+    )
+    for index, leave, enter, taken, join in zip(flown, *rounded, strict=True):
+        if join is not None:
+            how: How = "flown" if taken == shares[index] else "reduced"
+            corners[index] = Corner(float(leave), float(enter), join, float(taken), how)
+    return corners
 
 
 def fly_within(
@@ -228,182 +231,267 @@ def ranked(savings: Array) -> NDArray[np.intp]:
     return np.argsort(-preferred, axis=0, kind="stable")
 
 
-class _Candidate(NamedTuple):
-    """A corner that the solver was asked about, and knows an answer to."""
-
-    share: float
-    leave: float
-    enter: float
-    start: Array
-    end: Array
-    solution: Solution
-
-    @property
-    def saving(self) -> float:
-        """Time gained against a stop [s]."""
-        return self.leave + self.enter - self.solution.duration
+# A join may miss its end by this share of what counts as rounding between two pieces.
+_MISS = 0.1
+# Of a solution: two to brake into the limits (of no length here), seven to move.
+_PIECES = 9
 
 
-def _candidates(
-    before: StraightSegment, after: StraightSegment, bounds: Bounds, share: float
-) -> Iterator[_Candidate]:
-    """Give solved corners in the order in which they are to be tried."""
-    ask = Solver(bounds, share * (before.slowing_down + after.speeding_up))
-    first = _solved(before, after, ask, share, FIRST_SHARES)
-    savings = np.array([-np.inf if each is None else each.saving for each in first])
-    order = (first[i] for i in ranked(savings).tolist())
-    last = (_solved(before, after, ask, share, (part,))[0] for part in LAST_SHARES)
-    yield from (each for each in chain(order, last) if each is not None and each.saving >= 0.0)
+class Solutions(NamedTuple):
+    """What the solver found for many joins, not yet checked.
 
+    Attributes:
+        starts: Position, velocity and acceleration of the joints at each start, (c, n, 3).
+        ends: The same at each end, (c, n, 3); all joints arrive together.
+        times: Unit of time in which each was asked for (c,) [s].
+        durations: Length in time of each join (c,) [s]; infinite where there is none.
+        found: The solver's own results (c,), in its units; None where there is none.
+    """
 
-def _solved(
-    before: StraightSegment,
-    after: StraightSegment,
-    ask: Solver,
-    share: float,
-    parts: Sequence[float],
-) -> list[_Candidate | None]:
-    """Ask the solver for corners that take parts of a share; None where it knows none."""
-    shares = share * np.array(parts)
-    leave, enter = shares * before.slowing_down, shares * after.speeding_up
-    starts, ends = before.states(before.duration - leave), after.states(enter)
-    solutions = ask(starts, ends)
-    return [
-        None
-        if solution is None
-        else _Candidate(
-            float(shares[i]), float(leave[i]), float(enter[i]), starts[i], ends[i], solution
+    starts: Array
+    ends: Array
+    times: Array
+    durations: Array
+    found: NDArray[np.object_]
+
+    def take(self, rows: Rows) -> Solutions:
+        """Return some of the solutions, by index."""
+        return Solutions(
+            self.starts[rows],
+            self.ends[rows],
+            self.times[rows],
+            self.durations[rows],
+            self.found[rows],
         )
-        for i, solution in enumerate(solutions)
-    ]
 
 
-def join(start: Array, end: Array, bounds: Bounds, time: float) -> PiecewiseCubic | None:
-    """Plan the fastest motion between two states (n, 3) that keeps the bounds, if there is one.
+def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Solutions:
+    """Find the fastest motions between two states (c, n, 3) each under limits (c, n).
 
-    Rows are position, velocity and acceleration of a joint; all joints arrive together. `time`
-    [s] is about how long it may take.
-
-    Raises:
-        UnsupportedSolver: the installed ruckig is not of the series measured.
-    """
-    solution = Solver(bounds, time)(start[None], end[None])[0]
-    return None if solution is None else _finished(solution, start, end, bounds)
-
-
-class Solver:
-    """The solver, asked for one corner: for motions between two states within the same bounds.
-
-    It works to absolute tolerances, such as 1e-8 of a position, that suit motions of some radians
-    and seconds. So it is asked in units in which every joint's motion is such a one: `time` [s],
-    which the motion takes at most about, and as much way as full jerk makes in a part of that.
+    Args:
+        starts: Position, velocity and acceleration of the joints at each start.
+        ends: The same at each end; all joints arrive together.
+        times: About how long each may take (c,) [s].
+        bounds: What each may use.
 
     Raises:
-        UnsupportedSolver: the installed ruckig is not of the series measured.
+        UnsupportedSolver: the solver is of a version that nothing is known about.
     """
-
-    def __init__(self, bounds: Bounds, time: float) -> None:
-        require_solver()
-        self._n = len(bounds.velocity)
-        self._time = time
-        self._per_jerk = bounds.jerk / SOLVER_JERK
-        way = self._per_jerk * time**3
-        self._units = np.stack((way, way / time, way / time**2), axis=1)
-        largest = np.stack((bounds.velocity, bounds.acceleration), axis=1)
-        self._nearest = NEAREST_STATE * largest
-        largest /= self._units[:, 1:]
-        self._problem = ruckig.InputParameter(self._n)
-        self._problem.synchronization = ruckig.Synchronization.Time
-        self._problem.max_velocity, self._problem.max_acceleration = (FULL * largest.T).tolist()
-        self._problem.max_jerk = [FULL * SOLVER_JERK] * self._n
-
-    def __call__(self, starts: Array, ends: Array) -> list[Solution | None]:
-        """Return motions between states (m, n, 3); None for any not to be asked for or unknown."""
-        # Written so that NaN is refused too.
-        askable = np.abs(starts[:, :, 1:]) < self._nearest
-        askable &= np.abs(ends[:, :, 1:]) < self._nearest
-        here, there = starts / self._units, ends / self._units
-        there[:, :, 0] = (ends[:, :, 0] - starts[:, :, 0]) / self._units[:, 0]
-        here[:, :, 0] = 0.0
-        here_rows, there_rows = here.swapaxes(1, 2).tolist(), there.swapaxes(1, 2).tolist()
-        return [
-            self._solution(here_rows[i], there_rows[i]) if fair else None
-            for i, fair in enumerate(np.all(askable, axis=(1, 2)))
-        ]
-
-    def _solution(self, here: list[list[float]], there: list[list[float]]) -> Solution | None:
-        ask = self._problem
-        ask.current_position, ask.current_velocity, ask.current_acceleration = here
-        ask.target_position, ask.target_velocity, ask.target_acceleration = there
-        answer = ruckig.Trajectory(self._n)
-        try:
-            ruckig.Ruckig(self._n).calculate(ask, answer)
-        except REFUSALS:
-            return None
-        duration = float(answer.duration) * self._time
-        return Solution(duration, answer, self._time, self._per_jerk)
-
-
-def _finished(
-    solution: Solution, start: Array, end: Array, bounds: Bounds
-) -> PiecewiseCubic | None:
-    """Turn a solution into cubic pieces that end in `end` and keep the bounds, if it does."""
-    lengths, jerks = solution.pieces()
-    knots = np.zeros((len(start), lengths.shape[1] + 1))
-    knots[:, 1:] = np.minimum(np.cumsum(lengths, axis=1), solution.duration)
-    knots[:, -1] = solution.duration
-    table, reached = _integrated(start, knots, jerks)
-    rounding = 0.1 * jump_rounding(bounds, solution.duration)
-    if not (np.abs(end - reached) <= rounding).all():
-        table, reached = _closed(start, end, knots, jerks, reached)
-    if not (np.abs(end - reached) <= rounding).all():
-        return None
-    block = Block(table[0][None], table[1][None], reached[None])
-    rows = LimitRows(
-        *(bound[None] for bound in (bounds.lower, bounds.upper, bounds.velocity)),
-        *(bound[None] for bound in (bounds.acceleration, bounds.jerk)),
+    require_solver()
+    n_joints = starts.shape[1]
+    problem = ruckig.InputParameter(n_joints)
+    problem.synchronization = ruckig.Synchronization.Time
+    problem.max_jerk = [FULL * SOLVER_JERK] * n_joints
+    solver = ruckig.Ruckig(n_joints)
+    durations = np.full(len(starts), np.inf)
+    found = np.full(len(starts), None, dtype=np.object_)
+    rows = np.flatnonzero(_askable(starts, bounds) & _askable(ends, bounds))
+    tasks = zip(
+        rows.tolist(),
+        times[rows].tolist(),
+        *_in_units(starts[rows], ends[rows], times[rows], bounds.take(rows)),
+        strict=True,
     )
-    return PiecewiseCubic(tuple(table[0]), tuple(table[1])) if block.keeps(rows)[0] else None
+    for row, time, here, there, largest in tasks:
+        problem.current_position, problem.current_velocity, problem.current_acceleration = here
+        problem.target_position, problem.target_velocity, problem.target_acceleration = there
+        problem.max_velocity, problem.max_acceleration = largest
+        answer = ruckig.Trajectory(n_joints)
+        try:
+            solver.calculate(problem, answer)
+        except REFUSALS:
+            continue
+        durations[row], found[row] = answer.duration * time, answer
+    return Solutions(starts, ends, times, durations, found)
 
 
-def _integrated(start: Array, knots: Array, jerks: Array) -> tuple[tuple[Array, Array], Array]:
-    """Integrate constant jerks (n, m): the pieces (n, m, 4), and the states they end in (n, 3)."""
-    x = knots[:, 1:] - knots[:, :-1]
-    states = np.empty((len(start), jerks.shape[1] + 1, 3))
-    states[:, 0] = start
-    # In the order of operations in which a table is evaluated: so pieces meet to the last bit.
-    np.multiply(jerks, x, out=states[:, 1:, 2])
-    p, v, a = (states[:, :, i] for i in range(3))
-    np.cumsum(a, axis=1, out=a)
-    jx = jerks * x
-    v[:, 1:] = x * (a[:, :-1] + jx * 0.5)
-    np.cumsum(v, axis=1, out=v)
-    p[:, 1:] = x * (v[:, :-1] + x * (a[:, :-1] * 0.5 + jx * (1.0 / 6.0)))
-    np.cumsum(p, axis=1, out=p)
-    pieces = np.concatenate((states[:, :-1], jerks[:, :, None]), axis=2)
-    return (knots, pieces), states[:, -1]
+def _in_units(
+    starts: Array, ends: Array, times: Array, bounds: Allowance
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Return starts, ends (c, 3, n) and limits (c, 2, n) in the solver's units, as lists.
+
+    Setting lists costs the solver's face a third of setting arrays.
+    """
+    # Powers as floats have them: those of arrays may differ in the last digit.
+    square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
+    way = bounds.jerk / SOLVER_JERK * cube[:, None]
+    units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)
+    here, there = starts / units, ends / units
+    there[..., 0] = (ends[..., 0] - starts[..., 0]) / way
+    here[..., 0] = 0.0
+    largest = np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:]
+    return (
+        here.swapaxes(1, 2).tolist(),
+        there.swapaxes(1, 2).tolist(),
+        (FULL * largest).swapaxes(1, 2).tolist(),
+    )
 
 
-def _closed(
-    start: Array, end: Array, knots: Array, jerks: Array, reached: Array
-) -> tuple[tuple[Array, Array], Array]:
-    """Change the jerks of a motion from `start` as little as it takes to end in `end`.
+def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic | None]:
+    """Turn solutions, none of which is None, into joins; None for one that breaks its bounds."""
+    joined: list[PiecewiseCubic | None] = [None] * len(solutions.durations)
+    if not joined:
+        return joined
+    tables = _tables(solutions, bounds)
+    met = _meets(tables, solutions.ends, bounds)
+    groups = [(np.flatnonzero(met), tables.take(met))]
+    if not np.all(met):
+        missed = np.flatnonzero(~met)
+        starts, ends = solutions.starts[missed], solutions.ends[missed]
+        groups.append((missed, _closed(tables.take(missed), starts, ends)))
+    for rows, block in groups:
+        own = bounds.take(rows)
+        valid = block.keeps(own) & _meets(block, solutions.ends[rows], own)
+        for index in np.flatnonzero(valid).tolist():
+            pieces = tuple(block.knots[index]), tuple(block.coefficients[index])
+            joined[int(rows[index])] = PiecewiseCubic(*pieces)
+    return joined
+
+
+def _askable(states: Array, bounds: Allowance) -> Mask:
+    """Return which states (c, n, 3) the solver may be shown, (c,)."""
+    slow = np.abs(states[..., 1]) < NEAREST_STATE * bounds.velocity
+    gentle = np.abs(states[..., 2]) < NEAREST_STATE * bounds.acceleration
+    askable: Mask = np.all(slow & gentle, axis=-1)
+    return askable
+
+
+def _tables(solutions: Solutions, bounds: Allowance) -> Block:
+    """Turn solutions into cubic pieces."""
+    profiles = np.array(
+        [
+            [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in answer.profiles[0]]
+            for answer in solutions.found
+        ]
+    )
+    lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]
+    jerks = profiles[..., _PIECES:] * (bounds.jerk / SOLVER_JERK)[..., None]
+    last = solutions.durations[:, None, None]
+    knots = np.zeros((*profiles.shape[:2], _PIECES + 1))
+    np.minimum(np.cumsum(lengths, axis=-1), last, out=knots[..., 1:])
+    knots[..., -1:] = last
+    return Block.from_jerks(solutions.starts, knots, jerks)
+
+
+def _closed(block: Block, start: Array, end: Array) -> Block:
+    """Change the jerks of tables from `start` as little as it takes to end in `end`.
 
     The solver is content with 1e-8 rad. Sampled each millisecond, such a jump is a jerk of
     10 rad/s³ and more. Knots at the quarters keep the change small: the fastest way to shift
     a joint a little, all else equal, changes its jerk there.
     """
-    duration = knots[0, -1]
-    quarters = np.broadcast_to(duration * np.array([0.25, 0.5, 0.75]), (len(start), 3))
-    finer = np.sort(np.concatenate((knots, quarters), axis=1), axis=1)
-    piece = np.sum(finer[:, :-1, None] >= knots[:, None, 1:-1], axis=2)
-    jerks = np.take_along_axis(jerks, piece, axis=1)
+    duration = block.durations[:, None, None]
+    quarters = np.broadcast_to(duration * np.array([0.25, 0.5, 0.75]), (*start.shape[:2], 3))
+    finer = np.sort(np.concatenate((block.knots, quarters), axis=-1), axis=-1)
+    piece = np.sum(finer[..., :-1, None] >= block.knots[..., None, 1:-1], axis=-1)
+    jerks = np.take_along_axis(block.coefficients[..., 3], piece, axis=-1)
     # What each jerk does to the end state, by the time that is left at its two knots.
     left = duration - finer
-    effect = -np.diff(np.stack((left**3 / 6.0, left**2 / 2.0, left), axis=1), axis=2)
-    scale = np.array([1.0, duration, duration**2])  # makes the three rows comparable
-    closing = np.linalg.pinv(effect * scale[:, None])
+    effect = -np.diff(np.stack((left**3 / 6.0, left**2 / 2.0, left), axis=-2), axis=-1)
+    # Makes the three rows comparable.
+    scale = np.concatenate((np.ones_like(duration), duration, duration**2), axis=-1)
+    closing = np.linalg.pinv(effect * scale[..., None])
     for _ in range(2):  # the second time for what rounding left of the first
-        jerks = jerks + np.einsum("jik,jk->ji", closing, (end - reached) * scale)
-        table, reached = _integrated(start, finer, jerks)
-    return table, reached
+        gap = (end - block.end) * scale
+        jerks = jerks + np.einsum("cjik,cjk->cji", closing, gap)
+        block = Block.from_jerks(start, finer, jerks)
+    return block
+
+
+def _meets(block: Block, end: Array, bounds: Allowance) -> Mask:
+    """Whether tables end in their state `end` (c, n, 3) but for rounding, (c,)."""
+    rounding = _MISS * jump_rounding(bounds, block.durations)
+    met: Mask = np.all(np.abs(end - block.end) <= rounding, axis=(1, 2))
+    return met
+
+
+class Corners(NamedTuple):
+    """How c corners are rounded.
+
+    Attributes:
+        leave: Time cut from the end of the move before (c,) [s].
+        enter: Time cut from the beginning of the move after (c,) [s].
+        share: Share of the ramps that each takes (c,).
+        joins: What replaces them; None where the arm stops.
+    """
+
+    leave: Array
+    enter: Array
+    share: Array
+    joins: list[PiecewiseCubic | None]
+
+
+def round_corners(
+    moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
+) -> Corners:
+    """Choose the join of each corner between two of the moves, which is part of the way.
+
+    Args:
+        moves: The straight moves.
+        before: Which of them lead to the corners (c,).
+        after: Which lead on (c,).
+        bounds: What each join may use (c, n).
+        fly: Share of the ramps that each is asked to take (c,).
+    """
+    count = len(before)
+    leave, enter, taken = np.zeros((3, count))
+    corners = Corners(leave, enter, taken, [None] * count)
+    task = _Task(moves, before, after, bounds, fly)
+    flown = (moves.slowing_down[before] > 0.0) & (moves.speeding_up[after] > 0.0)
+    asked = np.flatnonzero(flown & (fly >= LEAST_SHARE))
+    if len(asked) == 0:  # the solver is not even asked whether it is there
+        return corners
+    shares = np.multiply.outer(FIRST_SHARES, fly[asked]).ravel()
+    rows = np.tile(asked, len(FIRST_SHARES))
+    candidates = task.solve(rows, shares)
+    leave, enter = task.cuts(rows, shares)
+    saving = leave + enter - candidates.durations
+    saving = saving.reshape(len(FIRST_SHARES), -1)
+    for place in ranked(saving):
+        picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
+        picked = picked[[corners.joins[row] is None for row in asked[picked].tolist()]]
+        if len(picked) > 0:
+            chosen = place[picked] * len(asked) + picked
+            task.finish(corners, rows[chosen], shares[chosen], candidates.take(chosen))
+    for share in LAST_SHARES:
+        rows = asked[[corners.joins[row] is None for row in asked.tolist()]]
+        if len(rows) == 0:
+            break
+        shares = fly[rows] * share
+        solutions = task.solve(rows, shares)
+        leave, enter = task.cuts(rows, shares)
+        found = np.flatnonzero(leave + enter >= solutions.durations)
+        task.finish(corners, rows[found], shares[found], solutions.take(found))
+    return corners
+
+
+class _Task(NamedTuple):
+    """Corners (c,) between moves, their limits (c, n), and the fly asked of each (c,)."""
+
+    moves: StraightMoves
+    before: Rows
+    after: Rows
+    bounds: Allowance
+    fly: Array
+
+    def cuts(self, rows: Rows, shares: Array) -> tuple[Array, Array]:
+        """Return the times cut before and after some corners for a share of each ramp."""
+        slowing, speeding = self.moves.slowing_down, self.moves.speeding_up
+        return shares * slowing[self.before[rows]], shares * speeding[self.after[rows]]
+
+    def solve(self, rows: Rows, shares: Array) -> Solutions:
+        """Ask the solver to join what is cut."""
+        leave, enter = self.cuts(rows, shares)
+        before, after = self.moves.take(self.before[rows]), self.moves.take(self.after[rows])
+        starts, ends = before.states(before.durations - leave), after.states(enter)
+        full = self.fly[rows] * (before.slowing_down + after.speeding_up)
+        return solve_many(starts, ends, full, self.bounds.take(rows))
+
+    def finish(self, corners: Corners, rows: Rows, shares: Array, solutions: Solutions) -> None:
+        """Enter the joins that keep their limits and are no slower than to stop."""
+        leave, enter = self.cuts(rows, shares)
+        joins = finish_many(solutions, self.bounds.take(rows))
+        for k, (row, join) in enumerate(zip(rows.tolist(), joins, strict=True)):
+            if join is not None and join.duration <= leave[k] + enter[k]:
+                corners.leave[row], corners.enter[row] = leave[k], enter[k]
+                corners.share[row], corners.joins[row] = shares[k], join

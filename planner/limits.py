@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
@@ -42,13 +43,22 @@ class Bounds(Protocol):
 
 
 class Allowance(NamedTuple):
-    """`Bounds` made of others that were checked before, each (n,), SI units."""
+    """`Bounds` made of others that were checked before, of one motion (n,) or of many (c, n)."""
 
     lower: Array
     upper: Array
     velocity: Array
     acceleration: Array
     jerk: Array
+
+    @classmethod
+    def of_many(cls, bounds: Sequence[Bounds]) -> Allowance:
+        """Return bounds (n,) each as rows."""
+        return cls(*(np.array([getattr(one, name) for one in bounds]) for name in cls._fields))
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Allowance:
+        """Return some of the rows, by index or mask."""
+        return Allowance(*(bound[rows] for bound in self))
 
 
 # No arm comes near; far beyond, the corners' solver has been seen to take its process with it.

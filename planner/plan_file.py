@@ -1,25 +1,28 @@
 """A plan as data: the moves that were asked for, and the motion that came of them.
 
 `PlanFile.to_dict` is what an archive carries (JSON, SI units); `to_toml` is the same for people,
-with angles in degrees, and restores the same bits.
+with angles in degrees, and restores the same bits. `to_csv` is the motion alone, for others.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from math import ceil
+from typing import Any, Final
 
 import numpy as np
 
 from planner.arrays import Array
 from planner.checked_data import DAMAGED, number, numbers, one_or_more, rows, table, text
 from planner.commands import STOP, Fly, FlyDistance, FlyPercent, Move, Overrides
-from planner.errors import InvalidPlanFile, PlannerError
+from planner.errors import InvalidPlanFile, InvalidSetting, PlannerError
 from planner.limits import JointLimits
 from planner.moves import MotionPlan, plan_moves
-from planner.piecewise_cubic import PiecewiseCubic
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory
 from planner.toml_text import Angles, Rows, from_text, to_text
 from planner.verify import check_limits, check_smooth
 
@@ -328,3 +331,44 @@ def _pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
     return np.stack(
         (p + x * (v + x * (a / 2.0 + x * j / 6.0)), v + x * (a + x * j / 2.0), a + x * j, j), axis=1
     )
+
+
+_QUANTITIES: Final = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]")
+# A last period this much shorter than the others is rounding, not motion.
+_LAST_PERIOD: Final = 1e-9
+# More rows a second than any controller has cycles.
+_HIGHEST_RATE: Final = 1e5
+
+
+def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> str:
+    """Return a motion as comma-separated values, `rate` rows a second [Hz] and one for its end.
+
+    The first row names the columns: ``time [s]``, then for each joint ``NAME.position [rad]``,
+    ``NAME.velocity [rad/s]`` and ``NAME.acceleration [rad/s^2]``. Every bit of a number is written.
+
+    Raises:
+        InvalidSetting: a rate not above 0 or above 100 kHz, not one name per joint, each another,
+            or a motion of no duration, which no rows can tell.
+    """
+    if not 0.0 < rate <= _HIGHEST_RATE:
+        raise InvalidSetting("rate", rate, f"above 0 Hz, at most {_HIGHEST_RATE:g} Hz")
+    if trajectory.duration <= 0.0:
+        raise InvalidSetting("duration", trajectory.duration, "a motion of more than 0 s")
+    if len({*joint_names}) != trajectory.n_joints or len(joint_names) != trajectory.n_joints:
+        raise InvalidSetting(
+            "joint_names", list(joint_names), f"{trajectory.n_joints} different names"
+        )
+    steps = max(1, ceil(trajectory.duration * rate - _LAST_PERIOD))
+    time = np.minimum(np.arange(steps + 1) / rate, trajectory.duration)
+    time[-1] = trajectory.duration
+    columns = np.stack(trajectory.sample(time), axis=2).reshape(len(time), -1)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(
+        [
+            "time [s]",
+            *(f"{name}.{quantity}" for name in joint_names for quantity in _QUANTITIES),
+        ]
+    )
+    writer.writerows(np.column_stack((time, columns)).tolist())
+    return text.getvalue()

@@ -30,7 +30,7 @@ from drivers.packets import (
 )
 from drivers.transports.faults import FaultyLink
 from sim_fixtures.far_end import FarEnd
-from sim_fixtures.tally import ServeSummary, Tally
+from sim_fixtures.tally import Tally
 
 Delayed = tuple[float, int, bytes]
 
@@ -188,7 +188,7 @@ def serve(
     clock: Clock | None = None,
     patience: float = PATIENCE,
     stretch: float = 0.0,
-) -> ServeSummary:
+) -> Tally:
     """Run a controller on a real link until its session has ended.
 
     The first packet is repeated once a second until a PC answers it, so that the order of starting
@@ -212,7 +212,7 @@ def serve(
     server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
     if server.knock(request):
         server.run(request, patience)
-    return server.tally.summary()
+    return server.tally
 
 
 class _Server:

@@ -36,9 +36,9 @@ class Histogram:
         return 0.0
 
 
-@dataclass(frozen=True)
-class ServeSummary:
-    """What a served session came to.
+@dataclass(eq=False)
+class Tally:
+    """What a served session came to so far.
 
     Attributes:
         cycles: packets the controller sent, the repeated first one counted once.
@@ -49,38 +49,14 @@ class ServeSummary:
         surplus: further answers to a cycle that had been answered.
         rejected: answers of wrong length, number or content.
         stretched: cycles made longer than a period to wait for their answer.
-        stretch_max: by how much the longest of them was, s.
         own_late: cycles that began late by a tenth of the period or more though the answer before
             had come in time: the server's fault, not the PC's.
         slips: how many of these were late by a whole period or more; the cycle goes on from there.
         ended: whether the controller has ended its session (504); otherwise it was given up.
-        answer_p50, answer_p99, answer_max: from the packet to its answer, as seen here, s.
-        cost_p50, cost_p99, cost_max: computing a cycle of controller and arm, s.
+        stretch_max: by how much the longest stretched cycle was longer, s.
+        answer: times from the packet to its answer, as seen here.
+        cost: times of computing a cycle of controller and arm.
     """
-
-    cycles: int
-    knocks: int
-    replies: int
-    missed: int
-    late: int
-    surplus: int
-    rejected: int
-    stretched: int
-    own_late: int
-    slips: int
-    ended: bool
-    stretch_max: float
-    answer_p50: float
-    answer_p99: float
-    answer_max: float
-    cost_p50: float
-    cost_p99: float
-    cost_max: float
-
-
-@dataclass(eq=False)
-class Tally:
-    """Running counts; see `ServeSummary` for what they mean."""
 
     cycles: int = 0
     knocks: int = 0
@@ -128,26 +104,3 @@ class Tally:
             self.surplus += 1
         else:
             self.rejected += 1
-
-    def summary(self) -> ServeSummary:
-        """The counts so far."""
-        return ServeSummary(
-            cycles=self.cycles,
-            knocks=self.knocks,
-            replies=self.replies,
-            missed=self.missed,
-            late=self.late,
-            surplus=self.surplus,
-            rejected=self.rejected,
-            stretched=self.stretched,
-            own_late=self.own_late,
-            slips=self.slips,
-            ended=self.ended,
-            stretch_max=self.stretch_max,
-            answer_p50=self.answer.quantile(0.5),
-            answer_p99=self.answer.quantile(0.99),
-            answer_max=self.answer.largest,
-            cost_p50=self.cost.quantile(0.5),
-            cost_p99=self.cost.quantile(0.99),
-            cost_max=self.cost.largest,
-        )

@@ -18,7 +18,7 @@ from drivers.exchange.notices import (
     OverrideRefused,
     ResumeRefused,
 )
-from drivers.exchange.process import ExchangeError, ExchangeProcess, ExchangeStatus, WithdrawnError
+from drivers.exchange.process import ExchangeError, ExchangeProcess, WithdrawnError
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import (
@@ -44,7 +44,6 @@ __all__ = [
     "ExchangeProcess",
     "ExchangeSettings",
     "ExchangeStarted",
-    "ExchangeStatus",
     "HoldRefused",
     "Leaving",
     "OverrideRefused",

@@ -26,7 +26,7 @@ from drivers.guard import Guard
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
-from drivers.transports.tapped import tapped
+from drivers.transports.tapped import TappedTransport
 
 LINK_FAILED: Final = 1
 NOT_STARTED: Final = 2
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
         max_late = settings.late_allowed
         transport = settings.transport.open()
         for fd in packets_fd:
-            transport = tapped(transport, SharedPacketRing(fd), lambda: session.cycle)
+            transport = TappedTransport(transport, SharedPacketRing(fd), lambda: session.cycle)
         control = ControlBlock(control_fd)
         serving = Serving(
             session,

@@ -2,23 +2,65 @@
 
 Fields of eight bytes, each with one writer, read without locks: a store of eight aligned bytes
 is seen whole or not at all. Times are those of CLOCK_MONOTONIC, the same in every process.
+
+With it what is read from it: percentiles of latencies, and whether another process lives (`Pulse`).
 """
 
 from __future__ import annotations
 
+import ctypes
+import math
+import time
+from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import Final, overload
+from typing import Any, ClassVar, Final, Self, TypeAlias
 
 from drivers.exchange import memory
-from drivers.exchange.latency import BINS
 
 STALE: Final = 0.5
 """s after which a heartbeat counts as that of a dead process."""
 PATIENCE: Final = 5.0
 """The same where no motion was requested: a busy computer may keep a supervisor waiting, and the
 death of one is shown by its end of the pipe at once."""
-_WORDS: Final = 128
-_LATENCIES: Final = 64
+
+
+# How long answers take is counted in bins, so that other processes can tell percentiles: that costs
+# a logarithm and a store per packet, whatever the number of packets.
+BINS: Final = 48
+PER_OCTAVE: Final = 4
+SHORTEST: Final = 2e-6
+"""s; the first bin holds everything up to it, each next one 2 ** (1 / `PER_OCTAVE`) times more.
+The last holds all that took longer than 5.8 ms."""
+
+
+def bin_of(seconds: float) -> int:
+    """Index of the bin that a latency falls into."""
+    if not seconds > SHORTEST:
+        return 0
+    if math.isinf(seconds):
+        return BINS - 1
+    return min(BINS - 1, math.ceil(PER_OCTAVE * math.log2(seconds / SHORTEST)))
+
+
+def upper_edge(index: int) -> float:
+    """Longest latency of a bin, s; that of the last is infinite."""
+    return math.inf if index >= BINS - 1 else SHORTEST * 2.0 ** (index / PER_OCTAVE)
+
+
+def quantile(counts: Sequence[int], share: float) -> float | None:
+    """Latency not exceeded by this share of the answers, s; None without any.
+
+    It is the upper edge of a bin: never too short, and at most 19 % too long.
+    """
+    total = sum(counts)
+    if total <= 0:
+        return None
+    needed, seen = share * total, 0
+    for index, count in enumerate(counts):
+        seen += count
+        if seen >= needed and seen > 0:
+            return upper_edge(index)
+    return upper_edge(BINS - 1)
 
 
 class ArchiveState(IntEnum):
@@ -39,50 +81,25 @@ class Ended(IntEnum):
     LOST = 4
 
 
-class _Whole:
-    """An integer field."""
-
-    def __init__(self, index: int) -> None:
-        self._index = index
-
-    @overload
-    def __get__(self, block: None, owner: type[ControlBlock]) -> _Whole: ...
-    @overload
-    def __get__(self, block: ControlBlock, owner: type[ControlBlock]) -> int: ...
-    def __get__(self, block: ControlBlock | None, owner: type[ControlBlock]) -> _Whole | int:
-        return self if block is None else int(block.wholes[self._index])
-
-    def __set__(self, block: ControlBlock, value: int) -> None:
-        block.wholes[self._index] = value
+Gap: TypeAlias = ctypes.Array[ctypes.c_int64]
+"""A cache line between the fields of two writers."""
+Counts: TypeAlias = ctypes.Array[ctypes.c_int64]
+_KINDS: Final[dict[str, Any]] = {
+    "float": ctypes.c_double,
+    "int": ctypes.c_int64,
+    "Gap": ctypes.c_int64 * 8,
+    "Counts": ctypes.c_int64 * BINS,
+}
 
 
-class _Real:
-    """A floating-point field."""
-
-    def __init__(self, index: int) -> None:
-        self._index = index
-
-    @overload
-    def __get__(self, block: None, owner: type[ControlBlock]) -> _Real: ...
-    @overload
-    def __get__(self, block: ControlBlock, owner: type[ControlBlock]) -> float: ...
-    def __get__(self, block: ControlBlock | None, owner: type[ControlBlock]) -> _Real | float:
-        return self if block is None else float(block.reals[self._index])
-
-    def __set__(self, block: ControlBlock, value: float) -> None:
-        block.reals[self._index] = value
-
-
-def create() -> int:
-    """Descriptor of memory for a block; every field is 0."""
-    return memory.create("hil-control", 8 * _WORDS)
-
-
-class ControlBlock:
+class ControlBlock(ctypes.Structure):
     """The fields, for whoever reads or writes them. Those of different writers lie apart.
 
+    Args:
+        fd: descriptor of the memory.
+
     Attributes:
-        latencies: (`latency.BINS`,) answers by how long they took, counted by the exchange.
+        latencies: (`BINS`,) answers by how long they took, counted by the exchange.
         supervisor_heartbeat: s.
         stop_count: raised by one for each stop asked for.
         override: fraction of the speed asked for.
@@ -123,51 +140,104 @@ class ControlBlock:
         rate: how fast its motion time runs, 1 as planned; NaN likewise.
         archive_heartbeat: s.
         archive_state: an `ArchiveState`.
+
+    Raises:
+        ValueError: the memory is not a control block.
     """
 
-    supervisor_heartbeat = _Real(0)
-    stop_count = _Whole(1)
-    override = _Real(2)
-    finish = _Whole(3)
-    program_id = _Whole(4)
-    override_count = _Whole(5)
-    held = _Whole(6)
-    hold_count = _Whole(7)
-    program_offered = _Whole(8)
+    supervisor_heartbeat: float
+    stop_count: int
+    override: float
+    finish: int
+    program_id: int
+    override_count: int
+    held: int
+    hold_count: int
+    program_offered: int
+    _exchange: Gap
+    exchange_heartbeat: float
+    state: int
+    cycle: int
+    interval: int
+    program_accepted: int
+    program_refused: int
+    pickup_us: float
+    ended_count: int
+    ended_outcome: int
+    ended_interval: int
+    overflow: int
+    answered: int
+    missed: int
+    duplicates: int
+    stale: int
+    malformed: int
+    foreign: int
+    late: int
+    answered_late: int
+    unanswered: int
+    refused: int
+    worst_turnaround_us: float
+    finished: int
+    motion_time: float
+    rate: float
+    latencies: Counts
+    _archive: Gap
+    archive_heartbeat: float
+    archive_state: int
 
-    exchange_heartbeat = _Real(16)
-    state = _Whole(17)
-    cycle = _Whole(18)
-    interval = _Whole(19)
-    program_accepted = _Whole(20)
-    program_refused = _Whole(21)
-    pickup_us = _Real(22)
-    ended_count = _Whole(23)
-    overflow = _Whole(24)
-    answered = _Whole(25)
-    missed = _Whole(26)
-    duplicates = _Whole(27)
-    stale = _Whole(28)
-    malformed = _Whole(29)
-    foreign = _Whole(30)
-    late = _Whole(31)
-    refused = _Whole(32)
-    worst_turnaround_us = _Real(33)
-    finished = _Whole(34)
-    answered_late = _Whole(35)
-    unanswered = _Whole(36)
-    ended_outcome = _Whole(37)
-    ended_interval = _Whole(38)
-    motion_time = _Real(39)
-    rate = _Real(40)
+    _fields_: ClassVar = [(name, _KINDS[kind]) for name, kind in __annotations__.items()]
 
-    archive_heartbeat = _Real(48)
-    archive_state = _Whole(49)
+    def __new__(cls, fd: int) -> Self:
+        """Return the block that lies in shared memory."""
+        mapped = memory.attach(fd)
+        if len(mapped) != ctypes.sizeof(cls):
+            raise ValueError("this memory is not a control block")
+        return cls.from_buffer(mapped)
 
     def __init__(self, fd: int) -> None:
-        whole = memoryview(memory.attach(fd)).cast("B")
-        if len(whole) != 8 * _WORDS:
-            raise ValueError("this memory is not a control block")
-        self.wholes = whole.cast("q")
-        self.reals = whole.cast("d")
-        self.latencies = self.wholes[_LATENCIES : _LATENCIES + BINS]
+        """Leave the fields as they are."""
+
+    @property
+    def outcome(self) -> str:
+        """How the last motion ended, a `drivers.events.Outcome`, or "none"."""
+        return Ended(self.ended_outcome).name.lower()
+
+    def copied(self) -> Self:
+        """Return the fields as they are at this moment."""
+        copy: Self = type(self).from_buffer_copy(self)
+        return copy
+
+
+def create() -> int:
+    """Descriptor of memory for a block; every field is 0."""
+    return memory.create("hil-control", ctypes.sizeof(ControlBlock))
+
+
+LONGEST_LOOK: Final = 0.5
+"""s between two looks that count at most; in a longer time this process was held up itself."""
+
+
+class Pulse:
+    """How long a heartbeat has stood still while somebody was awake to see it.
+
+    Its age would not do: a machine that was suspended wakes with every heartbeat old.
+
+    Args:
+        beat: the heartbeat, any number; 0 before the first.
+        longest_look: s; `LONGEST_LOOK` for somebody who looks more often.
+    """
+
+    def __init__(self, beat: Callable[[], float], *, longest_look: float = LONGEST_LOOK) -> None:
+        self._beat, self._longest = beat, longest_look
+        self._last, self._seen = beat(), time.monotonic()
+        self._quiet = 0.0
+
+    def quiet(self) -> float:
+        """Seconds since the last beat; 0 before the first. To be called often."""
+        now, beat = time.monotonic(), self._beat()
+        if beat != self._last or beat == 0.0:
+            self._last, self._quiet = beat, 0.0
+        else:
+            self._quiet += min(now - self._seen, self._longest)
+        self._seen = now
+        return self._quiet

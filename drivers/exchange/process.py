@@ -10,12 +10,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log, memory
+from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventReader
 from drivers.exchange.inbox import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.notices import ExchangeEvent
@@ -23,7 +23,6 @@ from drivers.exchange.realtime import RealTimeReport
 from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.motion_source import MotionSource
-from drivers.states import State
 
 
 class ExchangeError(DriverError):
@@ -39,41 +38,6 @@ START_TIMEOUT: Final = 60.0
 ANSWER_TIMEOUT: Final = 5.0
 """s until a program has been read, and again until it has been accepted or refused."""
 _BEAT: Final = 0.1
-
-
-@dataclass(frozen=True)
-class ExchangeStatus:
-    """The exchange's fields of the control block, at one moment; see `ControlBlock`.
-
-    `ended_outcome` is a `drivers.events.Outcome`, or "none".
-    """
-
-    state: State
-    cycle: int
-    interval: int
-    heartbeat_age: float
-    program_accepted: int
-    program_refused: int
-    pickup_us: float
-    ended_count: int
-    ended_outcome: str
-    ended_interval: int
-    overflow: int
-    answered: int
-    missed: int
-    duplicates: int
-    stale: int
-    malformed: int
-    foreign: int
-    late: int
-    answered_late: int
-    unanswered: int
-    refused: int
-    worst_turnaround_us: float
-    motion_time: float
-    rate: float
-    latencies: tuple[int, ...]
-    finished: bool
 
 
 def _always() -> bool:
@@ -107,7 +71,7 @@ class ExchangeProcess:
         self.event_fd = event_log.create()
         self.control_fd = control.create()
         self._log_fd = memory.create("hil-exchange-log", 0)
-        self._control = control.ControlBlock(self.control_fd)
+        self._control = ControlBlock(self.control_fd)
         self._events = EventReader(self.event_fd)
         self._offers = 0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -240,17 +204,9 @@ class ExchangeProcess:
         """What happened since the last call, in order."""
         return self._events.drain()
 
-    def status(self) -> ExchangeStatus:
-        """Where it stands."""
-        block = self._control
-        return ExchangeStatus(
-            state=State(block.state),
-            ended_outcome=control.Ended(block.ended_outcome).name.lower(),
-            heartbeat_age=time.monotonic() - block.exchange_heartbeat,
-            finished=bool(block.finished),
-            latencies=tuple(block.latencies),
-            **{name: getattr(block, name) for name in _COPIED},
-        )
+    def status(self) -> ControlBlock:
+        """Where it stands: what the control block says at this moment."""
+        return self._control.copied()
 
     @property
     def alive(self) -> bool:
@@ -323,11 +279,6 @@ class ExchangeProcess:
             return pickle.loads(message)
 
 
-_COPIED: Final = tuple(
-    name
-    for name in ExchangeStatus.__dataclass_fields__
-    if name not in ("state", "ended_outcome", "heartbeat_age", "finished", "latencies")
-)
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -19,7 +19,7 @@ from drivers.packets import (
 )
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
-from drivers.transports.base import Stamped, Transport
+from drivers.transports.base import Transport
 
 FALLEN_SILENT: Final = 1.0
 """s without a packet that gets an answer, after which another sender may begin the session."""
@@ -128,7 +128,6 @@ class Intake:
     def __init__(self, transport: Transport, session: Session) -> None:
         self._transport = transport
         self._session = session
-        self._stamped = transport if isinstance(transport, Stamped) else None
         self._heard = self._arrived = math.inf
         self._due = -math.inf
         self._number = 0
@@ -158,7 +157,8 @@ class Intake:
         return (self._arrival(packet, stamp, now, transport.ages),)
 
     def _stamp(self) -> float | None:
-        return None if self._stamped is None else self._stamped.arrived
+        arrived: float | None = getattr(self._transport, "arrived", None)
+        return arrived
 
     def _arrival(
         self, packet: bytes, stamp: float | None, now: float, ages: Ages | None

@@ -13,11 +13,17 @@ import numpy as np
 
 from drivers.errors import DriverError, RequestError
 from drivers.events import AnswersLost, Event, GapSeen, LinkLost, MotionEnded, PacketRejected
-from drivers.exchange.control import PATIENCE, STALE, ArchiveState, ControlBlock, Ended
+from drivers.exchange.control import (
+    PATIENCE,
+    STALE,
+    ArchiveState,
+    ControlBlock,
+    Ended,
+    Pulse,
+    bin_of,
+)
 from drivers.exchange.event_log import EventWriter
 from drivers.exchange.inbox import WITHDRAWN, Inbox
-from drivers.exchange.latency import bin_of
-from drivers.exchange.liveness import Pulse
 from drivers.exchange.notices import (
     NO_ARCHIVE,
     NO_SUPERVISOR,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,10 @@ class Transport(Protocol):
 
     Packets may be lost or come twice; one that arrives is one that was sent (or was corrupted
     beyond what the link can see).
+
+    One that knows how long a packet lay in a queue has `arrived` besides: when the packet received
+    last arrived, s on the clock of `now`, or None if unknown; never in the future, nor before the
+    packet that came before it. One whose options the system can refuse has `notes`, in words.
     """
 
     @property
@@ -80,19 +84,6 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Give the link up. Closing twice changes nothing."""
-        ...
-
-
-@runtime_checkable
-class Stamped(Protocol):
-    """A transport that knows how long a packet lay in a queue before it was received."""
-
-    @property
-    def arrived(self) -> float | None:
-        """When the packet received last arrived, s on the clock of `now`; None if unknown.
-
-        Never in the future, nor before the packet that came before it.
-        """
         ...
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.packet_records import PacketSink
-from drivers.transports.base import Stamped, Transport
+from drivers.transports.base import Transport
 
 MOST_WAITING: Final = 256
 """Packets that wait for their cycle; a flood is handed on in parts, with the cycle known then."""
@@ -54,6 +54,12 @@ class TappedTransport:
         return self._transport.ages
 
     @property
+    def arrived(self) -> float | None:
+        """When the packet received last arrived, of a link that knows."""
+        arrived: float | None = getattr(self._transport, "arrived", None)
+        return arrived
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Options that the system refused, in words, of a link that has such."""
         return tuple(getattr(self._transport, "notes", ()))
@@ -64,7 +70,9 @@ class TappedTransport:
             self.settle()
         packet = self._transport.receive(timeout)
         if packet is not None:
-            self._passed.append(_Passed(self._arrival(), False, packet))
+            arrived = self.arrived
+            time = self._transport.now if arrived is None else arrived
+            self._passed.append(_Passed(time, False, packet))
         return packet
 
     def send(self, packet: bytes) -> None:
@@ -91,32 +99,3 @@ class TappedTransport:
         for time, sent, packet in self._passed:
             self._sink.put(cycle, time, sent, packet)
         self._passed.clear()
-
-    def _arrival(self) -> float:
-        """When the packet received last arrived."""
-        return self._transport.now
-
-
-class _StampedTap(TappedTransport):
-    """The same for a link that knows when a packet arrived."""
-
-    _transport: _StampedTransport
-
-    @property
-    def arrived(self) -> float | None:
-        """See `Stamped.arrived`."""
-        return self._transport.arrived
-
-    def _arrival(self) -> float:
-        arrived = self._transport.arrived
-        return self._transport.now if arrived is None else arrived
-
-
-class _StampedTransport(Transport, Stamped, Protocol):
-    """A link that knows when a packet arrived."""
-
-
-def tapped(transport: Transport, sink: PacketSink, cycle: Callable[[], int]) -> TappedTransport:
-    """The same link, tapped; see `TappedTransport`."""
-    kind = _StampedTap if isinstance(transport, Stamped) else TappedTransport
-    return kind(transport, sink, cycle)

@@ -34,7 +34,7 @@ from drivers.exchange import (
     PacketReader,
     RingReader,
 )
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from drivers.packet_records import PACKET_DTYPE
 from hil.archive.live import LivePublisher, Serve
 from hil.archive.recorder import Recorder

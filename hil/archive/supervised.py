@@ -18,7 +18,7 @@ from typing import IO, Any, Protocol
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange import ControlBlock
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from hil.archive.live import Serve
 from hil.archive.recorder import ArchiveSpec
 

@@ -20,9 +20,8 @@ from functools import reduce
 from typing import Any, Final, Generic, NamedTuple, Self, TypeVar
 
 from hil.errors import HilError
-from planner.children import stream_in_children
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess, stream_in_children
 
 from .types import Broken, CacheError
 
@@ -279,7 +278,7 @@ def run_tasks(tasks: Sequence[ArchiveTask[T, S]], timeout: float) -> list[Part[T
     found = []
     for task in tasks:
         # From here: what a new process takes to import is no fault of the archive.
-        # `planner.remote` switches the alarm off when this returns.
+        # `planner.worker` switches the alarm off when this returns.
         signal.setitimer(signal.ITIMER_REAL, timeout)
         found.append(run_task(task))
     return found

@@ -21,10 +21,9 @@ from drivers.exchange import (
     ExchangeEvent,
     ExchangeFailed,
     ExchangeProcess,
-    ExchangeStatus,
     Leaving,
 )
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from drivers.states import State
 from hil.terminal_text import plural
 
@@ -114,14 +113,14 @@ class ExchangeView:
         return self.ended is not None or self.status.ended_count != self._ended_before
 
     @property
-    def status(self) -> ExchangeStatus:
+    def status(self) -> ControlBlock:
         """The exchange's fields of the control block."""
         return self.exchange.status()
 
     @property
     def state(self) -> State:
         """Of the session."""
-        return self.status.state
+        return State(self.status.state)
 
     @property
     def trouble(self) -> str | None:

@@ -25,7 +25,7 @@ from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
 from drivers.transports import SimulatedTransport, Transport
-from drivers.transports.tapped import TappedTransport, tapped
+from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell
 from hil.errors import ControllerFault, OperatorStopError
@@ -113,7 +113,7 @@ class Link:
         if not cell.controller.packets:
             return cls(transport, session, ring, guard, finish, cell=cell)
         packets = PacketRing(20 * DRAIN_CYCLES)
-        tap = tapped(transport, packets, lambda: session.cycle)
+        tap = TappedTransport(transport, packets, lambda: session.cycle)
         return cls(tap, session, ring, guard, finish, packets=packets, cell=cell)
 
     @property

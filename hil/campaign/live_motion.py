@@ -147,7 +147,9 @@ class LiveMotion:
         if display.due:
             display.take(self._reader.drain())
             status = self._view.status
-            display.show(self._watch, status.state, self._counts(), status.motion_time, status.rate)
+            display.show(
+                self._watch, self._view.state, self._counts(), status.motion_time, status.rate
+            )
 
     def _display(self, source: MotionSource) -> ProgressDisplay:
         connection, cell = self._link.connection, self._link.cell
@@ -163,7 +165,7 @@ class LiveMotion:
             status.missed,
             status.late,
             status.unanswered,
-            status.latencies,
+            tuple(status.latencies),
             1e-6 * status.worst_turnaround_us,
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.exchange import RingReader
-from drivers.exchange.liveness import Pulse
+from drivers.exchange.control import Pulse
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.archive.recorder import describe
@@ -120,7 +120,7 @@ class LiveRecording:
         status, period = self._view.status, self._link.cell.period
         over = (
             restarted,
-            status.state is State.ENDED,
+            status.state == State.ENDED,
             failure,
             self._view.lost,
             self._stop.requested,
@@ -132,7 +132,7 @@ class LiveRecording:
             return "stopped", "the controller began a new session"
         if duration is not None and (status.cycle + 1) * period >= duration:
             return "completed", "as long as was asked for"
-        if status.state is State.ENDED:
+        if status.state == State.ENDED:
             return "completed", "the controller ended the session"
         if failure is not None:
             return "lost", failure
@@ -175,7 +175,7 @@ class LiveRecording:
             Progress(
                 status.cycle,
                 status.missed,
-                status.state,
+                State(status.state),
                 self._position,
                 late=status.late,
                 untaken=status.unanswered,

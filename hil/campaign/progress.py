@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import TURN, DriveTrain
 from drivers.exchange import ExchangeEvent
-from drivers.exchange.latency import quantile
+from drivers.exchange.control import quantile
 from drivers.guard import Guard
 from drivers.packets import InitPacket
 from drivers.states import State

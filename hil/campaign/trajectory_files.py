@@ -18,8 +18,7 @@ from hil.cell import Cell
 from hil.files import write_together
 from hil.motion_checks import MotionChecks
 from identification.excitation import Excitation
-from planner import Trajectory
-from planner.motion_csv import to_csv
+from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan
 from .quick_design import plan_around

@@ -25,7 +25,7 @@ from sim_fixtures.errors import SettingError
 from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import PATIENCE
-from sim_fixtures.tally import ServeSummary, Tally
+from sim_fixtures.tally import Histogram, Tally
 
 REFRESH: Final = 0.25
 WIDTH: Final = 110
@@ -407,18 +407,10 @@ def _figures(served: Served) -> dict[str, object]:
         for field in fields(summary)
         if isinstance(getattr(summary, field.name), int)
     }
-    times = {
-        f"{name}_us": round(1e6 * getattr(summary, name), 1)
-        for name in (
-            "stretch_max",
-            "answer_p50",
-            "answer_p99",
-            "answer_max",
-            "cost_p50",
-            "cost_p99",
-            "cost_max",
-        )
-    }
+    times = {"stretch_max_us": round(1e6 * summary.stretch_max, 1)}
+    for name, each in (("answer", summary.answer), ("cost", summary.cost)):
+        for part, seconds in zip(("p50", "p99", "max"), _parts(each), strict=True):
+            times[f"{name}_{part}_us"] = round(1e6 * seconds, 1)
     return {
         **counts,
         "foreign": served.foreign,
@@ -442,16 +434,24 @@ def _sentences(served: Served) -> list[str]:
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
         f"{served.foreign} from elsewhere" + _stretched(summary),
-        f"answers came after {_us(summary.answer_p50)} (median), {_us(summary.answer_p99)} "
-        f"(99 %), {_us(summary.answer_max)} (longest)",
-        f"controller and arm took {_us(summary.cost_p50)} (median), {_us(summary.cost_p99)} "
-        f"(99 %), {_us(summary.cost_max)} (longest) to compute a cycle; "
+        f"answers came after {_spread(summary.answer)}",
+        f"controller and arm took {_spread(summary.cost)} to compute a cycle; "
         f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
         "whole cycle",
     ]
 
 
-def _stretched(summary: ServeSummary) -> str:
+def _parts(times: Histogram) -> tuple[float, float, float]:
+    """Median, 99 % and longest [s]."""
+    return times.quantile(0.5), times.quantile(0.99), times.largest
+
+
+def _spread(times: Histogram) -> str:
+    median, most, longest = map(_us, _parts(times))
+    return f"{median} (median), {most} (99 %), {longest} (longest)"
+
+
+def _stretched(summary: Tally) -> str:
     if not summary.stretched:
         return ""
     cycles = "1 cycle was" if summary.stretched == 1 else f"{summary.stretched} cycles were"

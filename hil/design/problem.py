@@ -135,19 +135,8 @@ def _refuse_beginning(cell: Cell, where: str, reason: str, remedy: str) -> NoRet
 
 def search_settings(settings: DesignSettings) -> SearchSettings:
     """Return the part of the settings that the search itself reads."""
-    search = settings.search
-    return SearchSettings(
-        method=settings.method,
-        population=search.population,
-        generations=search.generations,
-        crossover=search.crossover,
-        mutation=search.mutation,
-        weights=search.weights,
-        seed=settings.seed,
-        polish=search.polish,
-        crossover_eta=search.crossover_eta,
-        mutation_eta=search.mutation_eta,
-    )
+    table = settings.search.model_dump()
+    return SearchSettings(method=settings.method, seed=settings.seed, **table)
 
 
 def _genome(

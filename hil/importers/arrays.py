@@ -28,7 +28,7 @@ from hil.importers.column_map import Column
 from hil.importers.mcap_messages import Topic
 from hil.reading import opened, text_of
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess
 
 STAMP = "stamp"
 """Name of the time of a topic's messages [ns]: that of their header, or else the file's."""

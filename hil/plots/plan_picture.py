@@ -19,8 +19,8 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import style
 from hil.plots.joints import corner_times, draw_joints
-from planner.isolation import in_child
 from planner.moves import FlyPercent, MotionPlan, TargetPassage, plan_moves
+from planner.worker import in_child
 
 Array = NDArray[np.float64]
 

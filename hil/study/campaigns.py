@@ -28,9 +28,8 @@ from identification.excitation import (
     sampled,
 )
 from planner import FourierSeries, PlanFile, PlannerError
-from planner.children import map_in_children
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess, map_in_children
 
 from .searches import (
     AP,

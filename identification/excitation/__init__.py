@@ -35,10 +35,9 @@ from identification.excitation.errors import (
     PostureError,
     WorkspaceError,
 )
-from identification.excitation.excitation import Excitation
+from identification.excitation.excitation import DrawnMotion, Excitation
 from identification.excitation.genome import Genome
 from identification.excitation.objective import Measures, Objective
-from identification.excitation.random_motion import DrawnMotion
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.ledger import Progress
@@ -55,7 +54,7 @@ from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
 from identification.excitation.searches.scores import Scores
 from identification.excitation.searches.settings import Method, SearchSettings
 from identification.excitation.sines import SineGenome
-from identification.excitation.validation_motions import Drawing, random_validation_motions
+from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.via_points import ViaPointGenome
 
 __all__ = [
@@ -91,7 +90,6 @@ __all__ = [
     "Genome",
     "SineGenome",
     "ViaPointGenome",
-    "Drawing",
     "DrawnMotion",
     "Excitation",
     "random_validation_motions",

@@ -9,9 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.excitation.collision.checker import CollisionChecker, PathContact
-from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations, rest_violations
 from identification.excitation.violation import KINDS, Kind, Violation, excess_by_kind
 from identification.model.motion import Motion
@@ -72,9 +70,6 @@ class CurrentModel:
         uncertainty: share by which the real torques may be larger than the nominal ones.
         torque_limit: (n,) largest |torque| of each joint [N·m], where one is set besides.
         usable: share of the current limits that a motion may use.
-
-    Raises:
-        ShapeError: an array does not belong to the model's number of joints or parameters.
     """
 
     model: RobotModel
@@ -85,19 +80,6 @@ class CurrentModel:
     uncertainty: float = 0.0
     torque_limit: Array | None = None
     usable: float = 1.0
-
-    def __post_init__(self) -> None:
-        n = self.model.n_joints
-        for name, shape in (
-            ("values", (self.model.n_parameters,)),
-            ("motor_from_joint", (n, n)),
-            ("torque_constant", (n,)),
-            ("current_limit", (n,)),
-            ("torque_limit", (n,)),
-        ):
-            array = getattr(self, name)
-            if array is not None and np.shape(array) != shape:
-                raise ShapeError(name, np.shape(array), str(shape))
 
     def torque(self, motion: Motion) -> Array:
         """Return the joint torques (m, n) [N·m] that a motion needs at most, payload included."""
@@ -180,9 +162,6 @@ class Constraints:
         currents: nominal torques and currents with their uncertainty; None to look at neither.
         at_rest: whether a motion must begin and end at rest. A bare series of sines does not: it
             can be designed and looked at, and cannot be run.
-
-    Raises:
-        DesignError: no duration is allowed.
     """
 
     limits: JointLimits
@@ -191,12 +170,6 @@ class Constraints:
     checker: CollisionChecker | None = None
     currents: CurrentModel | None = None
     at_rest: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.max_duration > 0.0:
-            raise DesignError("max_duration", self.max_duration, "above 0 s")
-        if not self.min_duration <= self.max_duration:
-            raise DesignError("min_duration", self.min_duration, "at most max_duration")
 
     def violations(
         self, trajectory: PiecewiseCubic | FourierSeries, motion: Motion

@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.excitation.constraints import SAMPLE_PERIOD, midpoints
 from identification.excitation.criteria import Criteria, log10_det_and_coupling
-from identification.excitation.errors import DesignError
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel
@@ -57,10 +55,6 @@ class Objective:
         earlier_samples: N, the time samples in it, at the same rate.
         repetitions: how often the new motion is going to be run. It matters beside `earlier`
             only: repeating everything changes neither criterion (section 3.2).
-
-    Raises:
-        ShapeError: an array does not have the shape it should have.
-        DesignError: values that mean nothing.
     """
 
     model: RobotModel
@@ -69,28 +63,6 @@ class Objective:
     earlier: Array | None = None
     earlier_samples: int = 0
     repetitions: int = 1
-
-    def __post_init__(self) -> None:
-        n, p = self.model.n_joints, self.model.n_parameters
-        if self.parameters is not None:
-            self._set("parameters", np.asarray(self.parameters, dtype=np.intp))
-            _check_indices(np.asarray(self.parameters), p)
-        for name, shape in (("joint_weights", (n,)), ("earlier", (p, p))):
-            if (given := getattr(self, name)) is not None:
-                array = np.asarray(given, dtype=np.float64)
-                if array.shape != shape:
-                    raise ShapeError(name, array.shape, str(shape))
-                if not np.all(np.isfinite(array)):
-                    raise DesignError(name, "not finite", "finite numbers")
-                self._set(name, array)
-        if self.joint_weights is not None and not np.all(self.joint_weights > 0.0):
-            raise DesignError("joint_weights", self.joint_weights.tolist(), "above 0")
-        if self.repetitions < 1:
-            raise DesignError("repetitions", self.repetitions, "1 or more")
-        if self.earlier_samples < 0 or (self.earlier is None) != (self.earlier_samples == 0):
-            raise DesignError(
-                "earlier_samples", self.earlier_samples, "the samples in `earlier`, 0 without it"
-            )
 
     @property
     def n_parameters(self) -> int:
@@ -153,25 +125,8 @@ class Objective:
         """Where each joint's columns stand in the Gram matrix."""
         return [np.ix_(used, used) for used in self.model.plan.columns]
 
-    def _set(self, name: str, array: NDArray[np.generic]) -> None:
-        object.__setattr__(self, name, array)
-
 
 def _step(motion: Motion) -> float:
     """Return the time between samples that are uniform in time [s]."""
     steps = max(1, motion.n_samples - 1)
     return float(motion.time[-1] - motion.time[0]) / steps or SAMPLE_PERIOD
-
-
-def _check_indices(indices: NDArray[np.intp], p: int) -> None:
-    """Refuse what is no set of parameters.
-
-    Raises:
-        ShapeError: not a row of indices.
-        DesignError: none, one twice, or one that does not exist.
-    """
-    if indices.ndim != 1:
-        raise ShapeError("parameters", indices.shape, "(e,)")
-    unique = np.unique(indices)
-    if len(unique) == 0 or len(unique) < len(indices) or unique[0] < 0 or unique[-1] >= p:
-        raise DesignError("parameters", indices.tolist(), f"different indices from 0 to {p - 1}")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from identification.errors import ShapeError
-from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
-from identification.excitation.excitation import Excitation
-from identification.excitation.genome import between, checked_genes, share_between
+from identification.excitation.genome import between
 from planner import (
     FourierSeries,
     InvalidSetting,
@@ -49,7 +46,7 @@ class SineGenome:
             sqrt(qdd_max / q_max), which keeps the acceleration limit where there is no ramp.
 
     Raises:
-        DesignError: a setting outside its range.
+        DesignError: an offset outside the limits, or a slowest frequency above the fastest.
     """
 
     limits: JointLimits
@@ -61,24 +58,13 @@ class SineGenome:
     fastest: Array | None = None
 
     def __post_init__(self) -> None:
-        n = self.limits.n_joints
         for name in ("offset", "slowest", "fastest"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only(getattr(self, name)))
-        for name, fine, valid in (
-            ("length", 0.0 < self.length < np.inf, "above 0 s"),
-            ("ramp", 0.0 <= 2.0 * self.ramp <= self.length, "from 0 to half the length"),
-        ):
-            if not fine:
-                raise DesignError(name, getattr(self, name), valid)
         try:
             harmonic_bounds(self.limits, self.centre, self.harmonics)
         except InvalidSetting as error:
             raise DesignError(error.name, error.value, error.valid) from error
-        for name in ("slowest", "fastest"):
-            given = getattr(self, name)
-            if given is not None and given.shape != (n,):
-                raise DesignError(name, given, f"{n} frequencies")
         slowest, fastest = self.frequency_range
         if not np.all((slowest > 0.0) & (slowest <= fastest) & (fastest < np.inf)):
             raise DesignError(
@@ -110,28 +96,10 @@ class SineGenome:
 
     def decode(self, genes: ArrayLike) -> tuple[Array, Array]:
         """Return amplitudes [rad] and frequencies [rad/s], (m, n, W) each."""
-        rows = checked_genes(genes, self.n_genes)
+        rows = np.atleast_2d(genes)
         shares = rows.reshape(len(rows), 2, self.limits.n_joints, self.harmonics)
         (low, high), (slowest, fastest) = self._amplitudes(), self._frequencies()
         return between(low, high, shares[:, 0]), between(slowest, fastest, shares[:, 1])
-
-    def encode(self, amplitude: ArrayLike, frequency: ArrayLike) -> Array:
-        """Return genes (n_genes,) of amplitudes and frequencies (n, W).
-
-        The inverse of `decode` but for rounding; what lies outside the genome's range is moved
-        to its nearest end.
-        """
-        shape = (self.limits.n_joints, self.harmonics)
-        given = {"amplitude": np.asarray(amplitude), "frequency": np.asarray(frequency)}
-        for name, values in given.items():
-            if values.shape != shape:
-                raise ShapeError(name, values.shape, str(shape))
-        return np.concatenate(
-            (
-                share_between(*self._amplitudes(), given["amplitude"]).ravel(),
-                share_between(*self._frequencies(), given["frequency"]).ravel(),
-            )
-        )
 
     def motions(self, genes: Array) -> list[PiecewiseCubic | FourierSeries | PlannerError]:
         """Return the series of each row of genes (m, n_genes)."""
@@ -144,26 +112,13 @@ class SineGenome:
         """Draw a first population (count, n_genes), uniform."""
         return random.random((count, self.n_genes))
 
-    def excitation(
+    def recorded(
         self,
         genes: Array,  # noqa: ARG002  the series tells them
         trajectory: PiecewiseCubic | FourierSeries,
-        criteria: Criteria,
-        *,
-        method: str,
-        seed: int,
-        tried: int,
-        rejected: Mapping[str, int],
-    ) -> Excitation:
-        """Return the record of a search that chose these genes (n_genes,) and their motion."""
-        return Excitation(
-            trajectory=trajectory,
-            criteria=criteria,
-            method=method,
-            seed=seed,
-            tried=tried,
-            rejected=dict(rejected),
-        )
+    ) -> dict[str, Any]:
+        """Return the motion of genes (n_genes,), as an argument of an `Excitation`."""
+        return {"trajectory": trajectory}
 
     def _amplitudes(self) -> tuple[Array, Array]:
         """Return the bounds of amplitudes, (n, 1) each [rad]."""

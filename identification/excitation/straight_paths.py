@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from identification.excitation.collision.checker import CollisionChecker
-from planner import JointLimits
 
 Array = NDArray[np.float64]
 
@@ -27,9 +26,3 @@ def free_segments(checker: CollisionChecker, segments: Sequence[Array]) -> NDArr
     """Return which ways (m_i, n) keep the clearance at every posture, (len(ways),)."""
     starts = np.cumsum([0, *(len(way) for way in segments[:-1])])
     return np.logical_and.reduceat(checker.clear(np.concatenate(segments)), starts)
-
-
-def is_inside(posture: ArrayLike, limits: JointLimits) -> bool:
-    """Whether something is a posture (n,) [rad] within joint limits."""
-    q = np.asarray(posture, dtype=np.float64)
-    return q.shape == limits.lower.shape and bool(np.all((q >= limits.lower) & (q <= limits.upper)))

@@ -7,7 +7,8 @@ interpolator runs it, and keeps all constraints.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,9 +21,9 @@ from identification.excitation.constraints import (
     check_motion,
     clearance,
 )
-from identification.excitation.errors import DesignError, NoFeasibleMotionError
-from identification.excitation.random_motion import DrawnMotion
-from identification.excitation.straight_paths import is_inside, straight_way
+from identification.excitation.errors import NoFeasibleMotionError
+from identification.excitation.excitation import DrawnMotion
+from identification.excitation.straight_paths import straight_way
 from planner import (
     JointLimits,
     PlannerCrashed,
@@ -41,34 +42,11 @@ _TRIES_PER_MOTION: Final = 100
 _VALIDATION: Final = 2
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """Which motions are drawn.
-
-    Attributes:
-        speed: range that each joint's share of its velocity limit is drawn from.
-        range_share: share of each joint's range, about its middle, that via points lie in.
-        min_duration, max_duration: of a motion [s].
-
-    Raises:
-        DesignError: a setting outside its range.
-    """
-
-    speed: tuple[float, float] = (0.5, 1.0)
-    range_share: float = 0.98
-    min_duration: float = 0.0
-    max_duration: float = 60.0
-
-    def __post_init__(self) -> None:
-        slowest, fastest = self.speed
-        for name, fine, valid in (
-            ("speed", 0.0 < slowest <= fastest <= 1.0, "a range within (0, 1]"),
-            ("range_share", 0.0 < self.range_share <= 1.0, "within (0, 1]"),
-            ("min_duration", self.min_duration <= self.max_duration, "at most max_duration"),
-            ("max_duration", self.max_duration > 0.0, "above 0 s"),
-        ):
-            if not fine:
-                raise DesignError(name, getattr(self, name), valid)
+# Range that each joint's share of its velocity limit is drawn from, share of each joint's range,
+# about its middle, that via points lie in, and the longest motion [s].
+_SPEED: Final = (0.5, 1.0)
+_RANGE_SHARE: Final = 0.98
+_LONGEST: Final = 60.0
 
 
 def random_validation_motions(
@@ -79,7 +57,6 @@ def random_validation_motions(
     count: int,
     n_via: int = 6,
     fly: float = 0.5,
-    drawing: Drawing = Drawing(),
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
 ) -> tuple[DrawnMotion, ...]:
@@ -90,20 +67,18 @@ def random_validation_motions(
 
     Args:
         limits: joint limits of the plan.
-        home: posture (n,) [rad] where each motion begins and ends.
+        home: posture (n,) [rad] within the limits where each motion begins and ends.
         seed: the same seed gives the same motions, to the last bit.
         count: how many; the first ones do not depend on it.
         n_via: via points between the two ends.
         fly: how far corners are rounded, 0 to 1.
-        drawing: what else they are drawn by.
         checker: clearance that every motion must keep.
         currents: torque and current limits that every motion must keep.
 
     Raises:
         NoFeasibleMotionError: a hundred tries in a row did not give one feasible motion.
-        DesignError: a setting outside its range, or home outside the limits.
     """
-    draw = _Draw(limits, home, n_via, fly, drawing, checker, currents)
+    draw = _Draw(limits, home, n_via, fly, checker, currents)
     motions = []
     for k in range(count):
         for attempt in range(_TRIES_PER_MOTION):
@@ -125,27 +100,21 @@ class _Draw:
         home: Array,
         n_via: int,
         fly: float,
-        drawing: Drawing,
         checker: CollisionChecker | None,
         currents: CurrentModel | None,
     ) -> None:
-        self._limits, self._drawing = limits, drawing
-        self._home = np.asarray(home, dtype=np.float64)
+        self._limits, self._home = limits, home
         self._n_via, self._fly = n_via, fly
         self._checker, self._currents = checker, currents
         self.rejected: Counter[str] = Counter()
         self._nearest: dict[str, Violation] = {}
-        if n_via < 1:
-            raise DesignError("n_via", n_via, "at least 1")
-        if not is_inside(self._home, limits):
-            raise DesignError("home", self._home.tolist(), "a posture inside the joint limits")
         if (contact := self._contact(self._home[None])) is not None:
             self._reject([replace(contact, subject=f"{contact.subject} at home")])
             raise self.failure()
 
     def __call__(self, random: np.random.Generator) -> DrawnMotion | None:
         """Return a feasible motion, or None and count why there is none."""
-        speed = random.uniform(*self._drawing.speed, self._limits.n_joints)
+        speed = random.uniform(*_SPEED, self._limits.n_joints)
         via_points = self._via_points(random)
         if via_points is None:
             return None
@@ -155,14 +124,16 @@ class _Draw:
         except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
             self._reject([Violation("planning", f"the motion ({error})", 1.0, 0.0, None)])
             return None
-        violations = self._wrong_duration(trajectory.duration)
-        if not violations:
+        found: Sequence[Violation] = [
+            Violation("duration", "the motion", trajectory.duration, _LONGEST, None)
+        ]
+        if trajectory.duration <= _LONGEST:
             check = check_motion(
                 trajectory, self._limits, checker=self._checker, currents=self._currents
             )
-            violations = list(check.violations)
-        if violations:
-            self._reject(violations)
+            found = check.violations
+        if found:
+            self._reject(found)
             return None
         return DrawnMotion(via_points, speed, self._fly, trajectory)
 
@@ -189,7 +160,7 @@ class _Draw:
     ) -> Array | Violation:
         """Draw until the way is free; return what was in the way when patience ends."""
         middle = (self._limits.upper + self._limits.lower) / 2.0
-        half = (self._limits.upper - self._limits.lower) / 2.0 * self._drawing.range_share
+        half = (self._limits.upper - self._limits.lower) / 2.0 * _RANGE_SHARE
         draws = 0
         while True:
             point = random.uniform(middle - half, middle + half)
@@ -205,14 +176,7 @@ class _Draw:
     def _contact(self, q: Array) -> Violation | None:
         return None if self._checker is None else clearance(self._checker, q)
 
-    def _wrong_duration(self, duration: float) -> list[Violation]:
-        shortest, longest = self._drawing.min_duration, self._drawing.max_duration
-        bound = min(max(duration, shortest), longest)
-        if bound == duration:
-            return []
-        return [Violation("duration", "the motion", duration, bound, None)]
-
-    def _reject(self, violations: list[Violation]) -> None:
+    def _reject(self, violations: Sequence[Violation]) -> None:
         """Count a motion once per kind of constraint it breaks; keep the mildest case of each."""
         for kind in dict.fromkeys(violation.kind for violation in violations):
             self.rejected[kind] += 1

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from identification.errors import ShapeError
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.criteria import Criteria
-from identification.excitation.errors import DesignError
-from identification.excitation.excitation import Excitation
-from identification.excitation.genome import between, checked_genes, share_between
-from identification.excitation.straight_paths import free_segments, is_inside, straight_way
-from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError, plan_in_child
+from identification.excitation.genome import between
+from identification.excitation.straight_paths import free_segments, straight_way
+from planner import (
+    FourierSeries,
+    JointLimits,
+    PiecewiseCubic,
+    PlannerError,
+    plan_chunk,
+    plan_in_child,
+)
 from planner.arrays import read_only
-from planner.batch import plan_chunk
 
 Array = NDArray[np.float64]
 
@@ -37,15 +38,12 @@ class ViaPointGenome:
         limits: joint limits of the plan; via points reach from one end of a range to the other.
         n_via: K, without home.
         fly: how far corners are rounded, 0 to 1.
-        slowest: share of a joint's velocity limit that gene 0 means; gene 1 means all of it.
+        slowest: share of a joint's velocity limit, above 0, that gene 0 means; gene 1 means 1.
         range_share: share of each joint's range, about its middle, that via points lie in.
-        home: posture (n,) [rad] where the motion begins and ends; None: it leads from the first
-            via point to the last.
+        home: posture (n,) [rad] within the limits where the motion begins and ends; None: it leads
+            from the first via point to the last.
         checker: clearance that the straight ways between the points of a first population keep;
             None: its points are uniform in the range, as the paper's.
-
-    Raises:
-        DesignError: a setting outside its range, or home outside the limits.
     """
 
     limits: JointLimits
@@ -59,20 +57,6 @@ class ViaPointGenome:
     def __post_init__(self) -> None:
         if self.home is not None:
             object.__setattr__(self, "home", read_only(self.home))
-        least = 1 if self.home is not None else 2
-        for name, fine, valid in (
-            ("n_via", self.n_via >= least, f"at least {least}"),
-            ("fly", 0.0 <= self.fly <= 1.0, "a number from 0 to 1"),
-            ("slowest", 0.0 < self.slowest <= 1.0, "a share in (0, 1]"),
-            ("range_share", 0.0 < self.range_share <= 1.0, "a share in (0, 1]"),
-            (
-                "home",
-                self.home is None or is_inside(self.home, self.limits),
-                "a posture inside the limits",
-            ),
-        ):
-            if not fine:
-                raise DesignError(name, getattr(self, name), valid)
 
     @property
     def n_genes(self) -> int:
@@ -81,28 +65,13 @@ class ViaPointGenome:
 
     def decode(self, genes: ArrayLike) -> tuple[Array, Array]:
         """Return via points (m, n_points, n) [rad], home included, and shares of speed (m, n)."""
-        rows = checked_genes(genes, self.n_genes)
+        rows = np.atleast_2d(genes)
         coordinates, rates = np.split(rows, [self.n_via * self.limits.n_joints], axis=1)
         points = self._points(coordinates.reshape(len(rows), self.n_via, -1))
         if self.home is not None:
             home = np.broadcast_to(self.home, (len(rows), 1, self.limits.n_joints))
             points = np.concatenate((home, points, home), axis=1)
         return points, between(self.slowest, 1.0, rates)
-
-    def encode(self, via_points: ArrayLike, speed: ArrayLike) -> Array:
-        """Return genes (n_genes,) of a motion through via points (n_points, n), home included.
-
-        The inverse of `decode` but for rounding; what lies outside the genome's range is moved
-        to its nearest end.
-        """
-        points = np.asarray(via_points, dtype=np.float64)
-        n_points = self.n_via + (0 if self.home is None else 2)
-        if points.shape != (n_points, self.limits.n_joints):
-            raise ShapeError("via_points", points.shape, f"({n_points}, {self.limits.n_joints})")
-        own = points if self.home is None else points[1:-1]
-        lower, upper = self._range()
-        rates = share_between(self.slowest, 1.0, speed)
-        return np.concatenate((share_between(lower, upper, own).ravel(), rates))
 
     def motions(self, genes: Array) -> list[PiecewiseCubic | FourierSeries | PlannerError]:
         """Plan each row of genes (m, n_genes), all together and in this process.
@@ -126,34 +95,19 @@ class ViaPointGenome:
             before = self._redraw(random, self.checker, coordinates[:, k], before, after)
         return genes
 
-    def excitation(
+    def recorded(
         self,
         genes: Array,
-        trajectory: PiecewiseCubic | FourierSeries,  # noqa: ARG002  planned once more
-        criteria: Criteria,
-        *,
-        method: str,
-        seed: int,
-        tried: int,
-        rejected: Mapping[str, int],
-    ) -> Excitation:
-        """Return the record of a search that chose these genes (n_genes,).
+        trajectory: PiecewiseCubic | FourierSeries,
+    ) -> dict[str, Any]:
+        """Return the motion of genes (n_genes,), and its via points, for the record.
 
-        Its trajectory is planned once more, move by move: the same motion to the last bit at
-        every instant, but in the pieces that its moves plan to.
+        The motion is planned once more, move by move: the same to the last bit at every instant,
+        but in the pieces that its moves plan to.
         """
         points, speed = (each[0] for each in self.decode(genes))
-        return Excitation(
-            trajectory=plan_in_child(points, self.limits, speed=speed, fly=self.fly),
-            criteria=criteria,
-            method=method,
-            seed=seed,
-            tried=tried,
-            rejected=dict(rejected),
-            via_points=points,
-            speed=speed,
-            fly=self.fly,
-        )
+        trajectory = plan_in_child(points, self.limits, speed=speed, fly=self.fly)
+        return {"trajectory": trajectory, "via_points": points, "speed": speed, "fly": self.fly}
 
     def _redraw(
         self,

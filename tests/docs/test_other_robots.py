@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from hil.cell import Cell
 from hil.cli import app
 from hil.results import Results
-from planner.motion_csv import from_csv
 from tests.docs.typed import ROOT
+from tests.motion_table import MotionTable
 
 BLOCKS = re.findall(
     r"```(sh|toml)\n(.*?)```", (ROOT / "docs" / "other-robots.md").read_text("utf-8"), re.DOTALL
@@ -24,7 +24,7 @@ BLOCKS = re.findall(
 def log(motion: str, path: str) -> None:
     """What an arm of the URDF, with friction, logs of a designed motion: twice, with noise."""
     cell = Cell.load("cell.toml")
-    trajectory = from_csv(Path("runs/motion", motion).read_text()).trajectory
+    trajectory = MotionTable.of(Path("runs/motion", motion).read_text())
     once = np.arange(0.0, trajectory.duration + 0.5, 2e-3)
     time = np.arange(2 * len(once)) * 2e-3
     q, qd, qdd = (np.tile(one, (2, 1)) for one in trajectory.sample(once))

@@ -11,7 +11,7 @@ from drivers import CyclicPacket, InitPacket
 from drivers.packet_records import PacketRing
 from drivers.packets import INIT_LENGTH
 from drivers.transports import SimulatedTransport
-from drivers.transports.tapped import tapped
+from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveWriter, open_archive
 from hil.archive.schema import PACKETS
 from tests.drivers import oracle
@@ -38,7 +38,7 @@ class Replayed:
 def archived(path: Path, pairs: list[tuple[bytes, bytes | None]]) -> list[tuple[bool, bytes]]:
     """The packets of a conversation after a while in an archive: whether sent, and bytes."""
     ring, cycle = PacketRing(2 * len(pairs)), 0
-    link = tapped(SimulatedTransport(Replayed([p for p, _ in pairs])), ring, lambda: cycle)
+    link = TappedTransport(SimulatedTransport(Replayed([p for p, _ in pairs])), ring, lambda: cycle)
     for _, answer in pairs:
         link.receive(1.0)
         if answer is not None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.exchange.latency import BINS, SHORTEST, bin_of, quantile, upper_edge
+from drivers.exchange.control import BINS, SHORTEST, bin_of, quantile, upper_edge
 
 WIDTH = 2.0**0.25
 """From one bin to the next, a fifth at most."""

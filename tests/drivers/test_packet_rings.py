@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.exchange import PacketReader, RingReader, SharedCycleRing, SharedPacketRing
 from drivers.packet_records import PacketRing
-from drivers.transports.base import Stamped
-from drivers.transports.tapped import MOST_WAITING, tapped
+from drivers.transports.tapped import MOST_WAITING, TappedTransport
 
 
 class Wire:
@@ -63,7 +62,7 @@ def drained(ring: PacketRing) -> list[tuple[int, float, int, bytes]]:
 
 def test_packets_reach_the_ring_once_their_cycle_is_known() -> None:
     ring, cycle = PacketRing(10), 6
-    link = tapped(Wire(b"one", b"two"), ring, lambda: cycle)
+    link = TappedTransport(Wire(b"one", b"two"), ring, lambda: cycle)
     assert link.receive(0.1) == b"one"
     cycle = 7  # what the session makes of it
     link.send(b"answer")
@@ -77,7 +76,7 @@ def test_packets_reach_the_ring_once_their_cycle_is_known() -> None:
 
 def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
     ring, cycle = PacketRing(10), 6
-    link = tapped(Wire(b"old", b"older", b"newest"), ring, lambda: cycle)
+    link = TappedTransport(Wire(b"old", b"older", b"newest"), ring, lambda: cycle)
     link.receive(0.1)
     link.receive(0.0)
     link.receive(0.0)
@@ -90,7 +89,7 @@ def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
 
 def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
     ring = PacketRing(10_000)
-    link = tapped(Wire(*[b"flood"] * 5000), ring, lambda: 3)
+    link = TappedTransport(Wire(*[b"flood"] * 5000), ring, lambda: 3)
     for _ in range(5000):
         link.receive(0.0)
     handed_on = drained(ring)
@@ -101,8 +100,7 @@ def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
 
 def test_a_tap_changes_nothing_for_the_session() -> None:
     wire = Wire(b"packet")
-    link = tapped(wire, PacketRing(10), lambda: 0)
-    assert not isinstance(link, Stamped)
+    link = TappedTransport(wire, PacketRing(10), lambda: 0)
     assert link.receive(0.1) == b"packet"
     assert link.receive(0.1) is None
     link.send(b"answer")
@@ -113,8 +111,7 @@ def test_a_tap_changes_nothing_for_the_session() -> None:
 
 def test_of_a_link_that_knows_when_packets_arrived_that_time_is_kept() -> None:
     ring = PacketRing(10)
-    link = tapped(StampedWire(b"packet"), ring, lambda: 0)
-    assert isinstance(link, Stamped)
+    link = TappedTransport(StampedWire(b"packet"), ring, lambda: 0)
     assert link.arrived == 0.125
     link.receive(0.1)
     link.settle()

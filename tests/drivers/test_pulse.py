@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from drivers.exchange.liveness import LONGEST_LOOK, Pulse
+from drivers.exchange.control import LONGEST_LOOK, Pulse
 
 
 class Machine:

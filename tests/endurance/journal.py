@@ -45,7 +45,7 @@ class Sample:
         processes: by name.
         shared: files in /dev/shm, of whoever.
         counters: of the exchange, since it began.
-        latencies: answers by duration, in the bins of `drivers.exchange.latency`, likewise.
+        latencies: answers by duration, in the bins of `drivers.exchange.control`, likewise.
         stalls: of the machine since the piece began, see `tests.endurance.stalls`; 0 where nobody
             could look.
         stood: s that they lasted.

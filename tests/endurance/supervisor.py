@@ -141,7 +141,7 @@ class Supervisor:
             say(
                 "status",
                 counters={name: getattr(status, name) for name in COUNTERS},
-                latencies=status.latencies,
+                latencies=list(status.latencies),
                 stalls=stalls,
                 stood=stood,
             )

@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers.exchange.latency import BINS, bin_of, upper_edge
+from drivers.exchange.control import BINS, bin_of, upper_edge
 from tests.endurance.__main__ import main
 from tests.endurance.journal import Piece, Ran, Sample, Use, read_journal
 from tests.endurance.piece import _use

@@ -16,7 +16,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.exchange.latency import BINS, PER_OCTAVE, SHORTEST
+from drivers.exchange.control import BINS, PER_OCTAVE, SHORTEST
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.events import MotionEnded
-from drivers.exchange.latency import BINS, bin_of, quantile, upper_edge
+from drivers.exchange.control import BINS, bin_of, quantile, upper_edge
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop

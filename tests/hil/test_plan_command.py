@@ -17,10 +17,10 @@ from hil.errors import InputError
 from hil.plots import draw_plan
 from hil.plots.joints import corner_times
 from hil.plots.plan_picture import flown_corners, sharpest_corner
-from planner.motion_csv import from_csv
 from planner.moves import FlyPercent, Move, plan_moves
 from planner.plan_file import PlanFile
 from sim_fixtures.ns16 import CELL_PATH
+from tests.motion_table import MotionTable
 
 VIA = """\
 # as on the teach pendant
@@ -125,8 +125,8 @@ def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
 def test_the_table_holds_the_motion(run, via, tmp_path, cell):
     path = tmp_path / "motion.csv"
     run("--via", via, "--csv", path)
-    table, names = from_csv(path.read_text())
-    assert names == cell.joint_names
+    table = MotionTable.of(path.read_text())
+    assert table.joint_names == cell.joint_names
     np.testing.assert_allclose(np.diff(table.time)[:-1], cell.period)
     frame = AngleFrame.of(cell)
     np.testing.assert_allclose(

@@ -23,9 +23,9 @@ from hil.motion_checks import collision_checker, current_model
 from identification.excitation.constraints import clearance
 from identification.model.motion import Motion
 from planner import JointLimits, Move, plan_moves
-from planner.motion_csv import from_csv
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.new_cells import TWO_JOINTS
+from tests.motion_table import MotionTable
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def a_plan(limits: JointLimits) -> SimpleNamespace:
 
 
 def motion_of(files: dict[str, str]) -> Any:
-    return from_csv(files["excitation.csv"]).trajectory
+    return MotionTable.of(files["excitation.csv"])
 
 
 class TestFiles:

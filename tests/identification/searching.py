@@ -58,8 +58,8 @@ class MoodyGenome:
     def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
         return self.plain.sample(random, count)
 
-    def excitation(self, *args: Any, **kwargs: Any) -> Any:
-        return self.plain.excitation(*args, **kwargs)
+    def recorded(self, *args: Any) -> dict[str, Any]:
+        return self.plain.recorded(*args)
 
     @staticmethod
     def within(genes: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import FrictionLaw, RobotModel, ShapeError
+from identification import FrictionLaw, RobotModel
 from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.collision.workspace import Workspace
 from identification.excitation.constraints import (
@@ -21,7 +21,6 @@ from identification.excitation.constraints import (
     excess_by_kind,
     sampled,
 )
-from identification.excitation.errors import DesignError
 from identification.excitation.joint_limits import limit_violations
 from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
 
@@ -196,27 +195,6 @@ def test_a_prediction_that_is_no_number_is_beyond_every_limit(model, values, swi
     assert [violation.excess for violation in violations] == [np.inf, np.inf]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"values": np.zeros(3)},
-        {"motor_from_joint": np.eye(3)},
-        {"torque_constant": np.ones(3)},
-        {"current_limit": np.ones(1)},
-        {"torque_limit": np.ones(6)},
-    ],
-)
-def test_arrays_of_another_arm_are_refused_by_name(model, values, wrong):
-    given = {
-        "values": values,
-        "motor_from_joint": MOTOR_FROM_JOINT,
-        "torque_constant": TORQUE_CONSTANT,
-        "current_limit": np.ones(2),
-    }
-    with pytest.raises(ShapeError, match=next(iter(wrong))):
-        CurrentModel(model, **{**given, **wrong})
-
-
 def series(seed, *, ramp, scale=1.0):
     random = np.random.default_rng(seed)
     return FourierSeries(
@@ -320,12 +298,6 @@ def test_every_kind_is_told_at_once_and_counts_by_its_worst(make_currents, swing
 
 def test_the_worst_excess_of_nothing_is_nothing():
     np.testing.assert_array_equal(excess_by_kind(()), np.zeros(len(KINDS)))
-
-
-@pytest.mark.parametrize("bounds", [(0.0, 0.0), (3.0, 2.0), (np.nan, 1.0), (0.0, np.nan)])
-def test_durations_that_no_motion_can_have_are_refused(bounds):
-    with pytest.raises(DesignError, match="duration"):
-        Constraints(LIMITS, *bounds)
 
 
 def test_a_deeper_contact_is_a_larger_excess():

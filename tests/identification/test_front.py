@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from identification import ShapeError
 from identification.excitation.constraints import KINDS
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.scale import Scale
@@ -118,11 +117,6 @@ def test_a_front_of_nothing_feasible_is_empty_and_has_no_knee():
     assert len(front) == 0
     with pytest.raises(ValueError, match="empty"):
         front.knee()
-
-
-def test_genes_must_belong_to_the_scores():
-    with pytest.raises(ShapeError):
-        Front.of(np.zeros((3, 2)), scores_of([1.0], [2.0]))
 
 
 def test_one_motion_is_its_own_knee():

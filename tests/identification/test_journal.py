@@ -28,7 +28,7 @@ from identification.excitation import (
 )
 from identification.excitation.searches.journal import digest
 from identification.excitation.searches.scores import ROW, unplanned
-from planner.remote import load, pack
+from planner.worker import load, pack
 from tests.identification.searching import LIMITS, URDF, problem
 
 SETTINGS = SearchSettings(population=4, generations=3)

@@ -9,9 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import ShapeError
 from identification.excitation.constraints import KINDS
-from identification.excitation.errors import DesignError
 from identification.excitation.searches.polish import dominating, generation_size, polish
 from identification.excitation.searches.scale import Scale
 from identification.excitation.searches.scores import Scores, unplanned
@@ -64,7 +62,7 @@ def polished(population, genes, fitness, **others):
     scores = population.score(np.array(genes, dtype=np.float64, ndmin=2)[:1].copy())
     if hasattr(population, "asked"):
         population.asked.clear()
-    return polish(population, genes, scores, fitness, **others)
+    return polish(population.score, genes, scores, fitness, **others)
 
 
 def larger(scores):
@@ -119,7 +117,7 @@ def test_a_start_whose_scores_are_known_stays_whatever_becomes_of_scoring_it():
             return Scores.of_rows(np.tile(unplanned(), (len(genes), 1)))
 
     known = Bowl().score(start()[None].copy())
-    result = polish(Unlucky(), start(), known, larger, evaluations=100, seed=1)
+    result = polish(Unlucky().score, start(), known, larger, evaluations=100, seed=1)
     assert result.genes.tobytes() == start().tobytes()
     assert result.scores.rows.tobytes() == known.rows.tobytes()
 
@@ -288,33 +286,6 @@ def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index,
         assert merit > 0.0
 
 
-def test_a_reference_must_be_one_motion_that_can_be_judged():
-    two = Bowl().score(np.full((2, N), 0.5))
-    with pytest.raises(ShapeError):
-        dominating(two)
-    nothing = Scores(
-        np.array([-np.inf]), np.array([np.inf]), np.array([5.0]), np.zeros((1, len(KINDS)))
-    )
-    with pytest.raises(DesignError):
-        dominating(nothing)
-
-
-@pytest.mark.parametrize(
-    ("genes", "evaluations", "error"),
-    [
-        (np.full(N, 1.1), 10, DesignError),
-        (np.full(N, np.nan), 10, DesignError),
-        (np.full(N, 0.5), 0, DesignError),
-        (np.full((2, N), 0.5), 10, ShapeError),
-        ([0.5], 10, ShapeError),
-    ],
-)
-def test_nonsense_is_refused(genes, evaluations, error):
-    known = Bowl().score(np.full((1, N), 0.5))
-    with pytest.raises(error):
-        polish(Bowl(), genes, known, larger, evaluations=evaluations, seed=1)
-
-
 ON_ITS_OWN = """
 import numpy as np
 from identification.excitation.searches.polish import polish
@@ -327,7 +298,8 @@ class Bowl:
 
 start = np.full(90, 0.5)
 known = Bowl().score(start[None])
-result = polish(Bowl(), start, known, lambda scores: scores.log10_det, evaluations=1200, seed=1)
+fitness = lambda scores: scores.log10_det
+result = polish(Bowl().score, start, known, fitness, evaluations=1200, seed=1)
 print(result.genes.tobytes().hex())
 """
 

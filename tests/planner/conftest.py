@@ -3,7 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planner import JointLimits
+from planner import JointLimits, PiecewiseCubic
+from planner.corners import finish_many, solve_many
+from planner.limits import Allowance
 
 DEG = np.pi / 180.0
 
@@ -31,3 +33,15 @@ def random_points(six_axis_limits: JointLimits):
         return six_axis_limits.lower + shares * span
 
     return points
+
+
+@pytest.fixture(scope="session")
+def join():
+    """Join two states (n, 3) within limits in about a time [s], as a corner does."""
+
+    def joined(start, end, limits: JointLimits, time: float) -> PiecewiseCubic | None:
+        bounds = Allowance.of_many([limits])
+        found = solve_many(start[None], end[None], np.array([time]), bounds)
+        return finish_many(found, bounds)[0] if found.found[0] is not None else None
+
+    return joined

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import JointLimits, PiecewiseCubic, PlanningError, check_limits
-from planner.batch import StraightMoves
-from planner.blocks import Block, LimitRows
+from planner.blocks import Block
+from planner.limits import Allowance
+from planner.segments import StraightMoves
 from planner.verify import check_smooth
 
 COUNT, JOINTS, PIECES = 3, 2, 5
@@ -53,9 +54,7 @@ def test_limits_are_kept_exactly_where_the_check_of_one_motion_says_so(block, fa
             for rate, factor in zip(reach[2:], factors[2:], strict=True)
         ]
         each.append(JointLimits(lower, upper, *rates))
-    rows = LimitRows(
-        *(np.array([getattr(limits, name) for limits in each]) for name in LimitRows._fields)
-    )
+    rows = Allowance.of_many(each)
     expected = [holds(check_limits, table(block, row), each[row]) for row in range(COUNT)]
     assert block.keeps(rows).tolist() == expected
 
@@ -76,7 +75,7 @@ def test_motions_are_smooth_exactly_where_the_check_of_one_motion_says_so(
     pieces[1, 0, piece, quantity] += jump
     motion = Block.of_pieces(np.repeat(knots[:, None], JOINTS, axis=1), pieces)
     limits = JointLimits(-ones[0], ones[0], ones[0], ones[0], ones[0])
-    rows = LimitRows(*(np.tile(getattr(limits, name), (COUNT, 1)) for name in LimitRows._fields))
+    rows = Allowance.of_many([limits] * COUNT)
     expected = [holds(check_smooth, table(motion, row), limits) for row in range(COUNT)]
     assert motion.smooth(rows).tolist() == expected
     assert expected[0]

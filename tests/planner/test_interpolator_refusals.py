@@ -6,12 +6,12 @@ import signal
 import numpy as np
 import pytest
 
-from planner import isolation
+from planner import worker
 from planner.errors import InvalidSetting, PlannerNotStarted
 from planner.interpolator import Interpolator
-from planner.isolation import in_child
-from planner.legs import corner
+from planner.moves import corner
 from planner.rrs import EventKind, FlybyCriterion, SpeedCorrection, Status
+from planner.worker import in_child
 from tests.planner.interpolating import (
     PERIOD,
     events,
@@ -210,7 +210,7 @@ def test_a_planner_that_died_leaves_the_motion_to_the_target_before_and_nobody_w
 
     dead = in_child(os.getpid)
     os.kill(dead, signal.SIGKILL)
-    assert isolation._warm[0].connection.poll(5.0)
+    assert worker._warm[0].connection.poll(5.0)
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL == -68
     assert "signal 9" in interpolator.refusal
     steps = steps_to_rest(interpolator)

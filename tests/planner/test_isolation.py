@@ -7,23 +7,30 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import planner.isolation
-from planner import InvalidSetting, ViaPointOutOfLimits, plan
-from planner.batch import PlanningPool, plan_many
-from planner.corners import join
+import planner.worker
+from planner import ViaPointOutOfLimits, plan
+from planner.batch import plan_chunk
 from planner.errors import (
     PlannerCrashed,
     PlannerNotStarted,
     PlannerOutOfStep,
     PlanningTimedOut,
 )
-from planner.isolation import WorkerProcess, close_child, in_child, plan_in_child
 from planner.limits import JointLimits
+from planner.worker import (
+    WorkerProcess,
+    chunks_of,
+    close_child,
+    in_child,
+    map_in_children,
+    plan_in_child,
+)
 
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
 CRASH = {
@@ -112,7 +119,7 @@ def test_the_solver_crashes_on_legal_input():
     assert done.returncode == -signal.SIGSEGV
 
 
-def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked():
+def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked(join):
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
@@ -156,6 +163,23 @@ plan([one, -one, one / 2], JointLimits(-one, one, one, one, one), speed={CREEP})
     assert done.returncode == -signal.SIGABRT, done.stderr
 
 
+@contextmanager
+def workers(count):
+    """Worker processes, ended at last."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(WorkerProcess()) for _ in range(count)]
+
+
+def together(children, points, limits, speed=None):
+    """Motions through points that workers planned in chunks, as searches have them planned."""
+    shares = np.ones((len(points), limits.n_joints)) if speed is None else speed
+
+    def arguments(chunk):
+        return [points[index] for index in chunk], shares[list(chunk)], limits, 0.5
+
+    return map_in_children(children, plan_chunk, chunks_of(len(points), 32), arguments)
+
+
 def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limits, random_points):
     points = random_points(5)
     with WorkerProcess() as child:
@@ -196,8 +220,8 @@ def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
 ):
     (tmp_path / "ruckig.py").write_text("raise SystemExit(3)", encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(PlannerNotStarted, match="status 3"):
-        plan_many([random_points(0)] * 3, six_axis_limits, workers=2)
+    with workers(2) as children, pytest.raises(PlannerNotStarted, match="status 3"):
+        together(children, [random_points(0)] * 3, six_axis_limits)
     with WorkerProcess() as child:
         with pytest.raises(PlannerNotStarted, match="status 3"):
             child.call(abs, -1)
@@ -219,7 +243,7 @@ def test_a_call_that_takes_too_long_is_ended():
 def test_a_child_ends_with_its_parent_even_in_the_middle_of_a_long_call(task):
     script = f"""
 import os, signal, time
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess
 child = WorkerProcess(timeout=3600.0)
 print(child.call(os.getpid), flush=True)
 {task}
@@ -235,14 +259,15 @@ def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits,
     speed = np.ones((80, 6))
     deadly = [0, 41, 79]
     speed[deadly, 0] = CREEP
-    with PlanningPool(2) as pool:
-        planned = pool.plan_many(points, six_axis_limits, speed=speed)
+    with workers(2) as children:
+        planned = together(children, points, six_axis_limits, speed)
         assert [
             i for i, motion in enumerate(planned) if isinstance(motion, PlannerCrashed)
         ] == deadly
         for index in sorted({*range(80)} - {*deadly}):
-            assert same(planned[index], plan_many(points[[index]], six_axis_limits, workers=0)[0])
-        again = pool.plan_many(points[:40], six_axis_limits)  # the pool is whole
+            (alone,) = plan_chunk(points[[index]], speed[[index]], six_axis_limits, 0.5)
+            assert same(planned[index], alone)
+        again = together(children, points[:40], six_axis_limits)  # both are whole
         assert not any(isinstance(motion, Exception) for motion in again)
 
 
@@ -252,9 +277,10 @@ def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits,
     points[7] = points[7] + 100.0
     speed = np.full((70, 6), 0.7)
     speed[33, 0] = CREEP
-    runs = [
-        plan_many(points, six_axis_limits, speed=speed, workers=workers) for workers in (1, 2, 3)
-    ]
+    runs = []
+    for count in (1, 2, 3):
+        with workers(count) as children:
+            runs.append(together(children, points, six_axis_limits, speed))
     for index, (one, *others) in enumerate(zip(*runs, strict=True)):
         for other in others:
             assert type(one) is type(other)
@@ -266,14 +292,10 @@ def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits,
 def test_ctrl_c_ends_a_search_and_its_workers():
     script = """
 import numpy as np
-from planner import JointLimits
-from planner.batch import PlanningPool
-one = np.ones(6)
-limits = JointLimits(-one, one, one, one, one)
-points = np.random.default_rng(0).uniform(-1.0, 1.0, (200_000, 6, 6))
-with PlanningPool(2) as pool:
-    print(*(child.call(__import__("os").getpid) for child in pool.children), flush=True)
-    pool.plan_many(points, limits)
+from planner import WorkerProcess, map_in_children
+with WorkerProcess() as one, WorkerProcess() as other:
+    print(*(child.call(__import__("os").getpid) for child in (one, other)), flush=True)
+    map_in_children([one, other], np.negative, [[k] for k in range(10**7)], lambda k: (k,))
 """
     with subprocess.Popen(
         [sys.executable, "-c", script],
@@ -291,17 +313,6 @@ with PlanningPool(2) as pool:
     assert said.rstrip().endswith("KeyboardInterrupt")
     assert len(pids) == 2
     assert all(gone(pid, 5.0) for pid in pids)
-
-
-@pytest.mark.parametrize(
-    ("setting", "name"),
-    [({"speed": 0.0}, "speed"), ({"speed": [0.5] * 5}, "speed"), ({"fly": 1.5}, "fly")],
-)
-def test_settings_of_a_batch_are_checked_at_once(six_axis_limits, random_points, setting, name):
-    with pytest.raises(InvalidSetting, match=name):
-        plan_many([random_points(0)], six_axis_limits, **setting, workers=0)
-    with pytest.raises(InvalidSetting, match="workers"):
-        plan_many([random_points(0)], six_axis_limits, workers=-1)
 
 
 def in_fork(check) -> bool:
@@ -351,26 +362,20 @@ def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
         assert child.receive() == child.pid
 
 
-def test_a_pool_used_on_both_sides_of_a_fork_gives_each_its_own_motions(
+def test_a_worker_used_on_both_sides_of_a_fork_gives_each_its_own_motions(
     six_axis_limits, random_points
 ):
     points = np.array([random_points(seed) for seed in range(64)])
-    with PlanningPool(1) as pool:
-        before = pool.plan_many(points, six_axis_limits)
+    with workers(1) as children:
+        before = together(children, points, six_axis_limits)
 
         def backwards() -> bool:
-            motions = pool.plan_many(points[::-1], six_axis_limits)
-            pool.close()
+            motions = together(children, points[::-1], six_axis_limits)
+            children[0].close()
             return all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
 
-        pid = os.fork()
-        if pid == 0:
-            try:
-                os._exit(0 if backwards() else 1)
-            finally:
-                os._exit(2)
-        after = pool.plan_many(points, six_axis_limits)
-        assert os.waitpid(pid, 0)[1] == 0
+        assert in_fork(backwards)
+        after = together(children, points, six_axis_limits)
         assert all(same(a, b) for a, b in zip(after, before, strict=True))
 
 
@@ -392,9 +397,9 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
 def test_an_answer_to_another_call_is_refused_and_the_next_one_is_right(monkeypatch):
     with WorkerProcess() as child:
         child.call(os.getpid)
-        honest = planner.isolation.numbered
+        honest = planner.worker.numbered
         monkeypatch.setattr(
-            planner.isolation, "numbered", lambda number, message: honest(number + 1, message)
+            planner.worker, "numbered", lambda number, message: honest(number + 1, message)
         )
         with pytest.raises(PlannerOutOfStep):
             child.call(os.getpid)

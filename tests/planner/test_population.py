@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from planner import JointLimits, PiecewiseCubic, ViaPointOutOfLimits, plan
-from planner.batch import plan_chunk, plan_many
+from planner.batch import plan_chunk
 from planner.errors import NonFiniteViaPoint, TooFewViaPoints, WrongShape
 from planner.verify import check_limits, check_smooth
 
@@ -83,9 +83,8 @@ def test_company_changes_no_bit(problem, data):
 @pytest.mark.slow
 def test_of_a_thousand_ordinary_motions_none_differs(six_axis_limits, random_points):
     points = np.array([random_points(seed) for seed in range(1000)])
-    for via_points, motion in zip(
-        points, plan_many(points, six_axis_limits, workers=0), strict=True
-    ):
+    planned = plan_chunk(points, np.ones((1000, 6)), six_axis_limits, 0.5)
+    for via_points, motion in zip(points, planned, strict=True):
         alone = plan(via_points, six_axis_limits)
         assert motion.duration == alone.duration
         times = np.linspace(0.0, alone.duration, 50)
@@ -98,7 +97,7 @@ def test_what_cannot_be_planned_is_told_in_its_place(six_axis_limits, random_poi
     outside[3, 2] = 50.0
     unknown[0, 0] = np.nan
     individuals = [good, outside, good[:1], unknown, good[:, :5], good[:3], good]
-    planned = plan_many(individuals, six_axis_limits, workers=0)
+    planned = plan_chunk(individuals, np.ones((7, 6)), six_axis_limits, 0.5)
     assert [type(each) for each in planned] == [
         PiecewiseCubic,
         ViaPointOutOfLimits,
@@ -113,4 +112,4 @@ def test_what_cannot_be_planned_is_told_in_its_place(six_axis_limits, random_poi
 
 
 def test_nobody_to_plan_for(six_axis_limits):
-    assert plan_many([], six_axis_limits, workers=0) == []
+    assert plan_chunk([], np.ones((0, 6)), six_axis_limits, 0.5) == []

@@ -140,7 +140,7 @@ def test_an_answer_counts_from_when_the_kernel_had_it():
     cabinet, link = Cabinet(clock, 50), VirtualLink(clock, lambda _, p: [(0.6 * T, echo(p))])
     link.waited = 0.5 * T
     summary = serve(cabinet, link, clock=clock)
-    assert summary.answer_max == pytest.approx(0.1 * T, rel=0.1)
+    assert summary.answer.largest == pytest.approx(0.1 * T, rel=0.1)
 
 
 def test_a_datagram_that_lay_in_the_queue_says_for_how_long():

@@ -16,7 +16,7 @@ from time import monotonic
 from typing import Any, Final
 
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
-from planner.isolation import WorkerProcess
+from planner.worker import WorkerProcess
 from tests.journal import Journal, entries
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, Verdict

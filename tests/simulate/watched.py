@@ -217,7 +217,7 @@ class StampedWatchedTransport(WatchedTransport):
 
     @property
     def arrived(self) -> float:
-        """See `drivers.transports.base.Stamped`."""
+        """See `drivers.transports.base.Transport`."""
         return min(self.now, self._arrival + self._clock.offset(self._inner.cycle))
 
 

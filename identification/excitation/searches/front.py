@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.excitation.searches.scale import Scale
 
 if TYPE_CHECKING:
@@ -52,18 +51,12 @@ class Front:
         return cls(np.empty((0, n_genes)), nothing, nothing, nothing)
 
     @classmethod
-    def of(cls, genes: ArrayLike, scores: Scores) -> Self:
+    def of(cls, genes: Array, scores: Scores) -> Self:
         """Return the front of motions with `genes` (m, n_genes).
 
         Left out are those that break a constraint or leave a parameter without excitation.
-
-        Raises:
-            ShapeError: not as many genes as scores.
         """
-        rows = np.asarray(genes, dtype=np.float64)
-        if rows.ndim != 2 or len(rows) != len(scores.log10_det):
-            raise ShapeError("genes", rows.shape, f"({len(scores.log10_det)}, n_genes)")
-        everything = cls(rows, scores.log10_det, scores.coupling_index, scores.duration)
+        everything = cls(genes, scores.log10_det, scores.coupling_index, scores.duration)
         return everything._selected(np.flatnonzero(scores.usable))._unbeaten()
 
     def __len__(self) -> int:

@@ -13,14 +13,12 @@ eigenvectors differ in their last bits with the threads that linear algebra is g
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from identification.errors import ShapeError
-from identification.excitation.errors import DesignError
 from identification.excitation.searches.population import CHUNK
 
 if TYPE_CHECKING:
@@ -40,14 +38,6 @@ _STREAM: Final = 3
 _SECOND: Final = 1e-3
 
 
-class Scorer(Protocol):
-    """Judges motions by their genes."""
-
-    def score(self, genes: Array) -> Scores:
-        """Return the scores of `genes` (m, n_genes)."""
-        ...
-
-
 class PolishResult(NamedTuple):
     """What a polish ended with.
 
@@ -61,8 +51,8 @@ class PolishResult(NamedTuple):
 
 
 def polish(
-    population: Scorer,
-    genes: ArrayLike,
+    score: Callable[[Array], Scores],
+    genes: Array,
     scores: Scores,
     fitness: Fitness,
     *,
@@ -76,31 +66,23 @@ def polish(
     same seed gives the same motion to the last bit, whatever else draws random numbers meanwhile.
 
     Args:
-        population: scores whole generations at once.
-        genes: (n_genes,) of the start, within [0, 1].
+        score: gives the scores of a whole generation of genes (m, n_genes) at once.
+        genes: (n_genes,) of the start, two or more, within [0, 1].
         scores: of the start, m = 1. It is not scored again: were that to fail for a reason that is
             not its own, anything would be better than the start.
         fitness: (m,) of scores, the larger the better; -inf is the worst there is.
         evaluations: how many motions may be scored.
         seed: of the random numbers.
         stop: asked before each generation; true ends the polish with the best so far.
-
-    Raises:
-        ShapeError: the start is no vector of at least two genes, or its scores are not of one.
-        DesignError: genes outside [0, 1], or no evaluation allowed.
     """
-    start = _checked(genes)
-    if evaluations < 1:
-        raise DesignError("evaluations", evaluations, "at least 1")
-    if len(scores.duration) != 1:
-        raise ShapeError("scores", np.shape(scores.duration), "(1,)")
+    start = genes.copy()
     best = _Best(start, scores, fitness)
     size = generation_size(len(start))
     strategy = _strategy(start, size, seed)
     evaluated = 0
     while evaluated + size <= evaluations and not stop():
         asked = np.array(strategy.ask())
-        found = population.score(asked.copy())
+        found = score(asked.copy())
         merits = _merits(found, fitness)
         strategy.tell(list(asked), _ranks(merits).tolist())
         best.take(asked, found, merits)
@@ -118,19 +100,11 @@ def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
     measures or stays.
 
     Args:
-        reference: scores of one motion, m = 1.
+        reference: scores of one motion, m = 1, that excites every parameter.
         scale: units of the gains; without it one decade of the determinant is worth one step of
             1 in the coupling index.
-
-    Raises:
-        ShapeError: the reference is not one motion.
-        DesignError: it leaves a parameter without excitation: everything is better than that.
     """
-    if len(reference.log10_det) != 1:
-        raise ShapeError("reference", np.shape(reference.log10_det), "(1,)")
     log10_det, coupling_index = reference.log10_det[0], reference.coupling_index[0]
-    if not (np.isfinite(log10_det) and np.isfinite(coupling_index)):
-        raise DesignError("reference", (log10_det, coupling_index), "a motion with finite measures")
     decade, step = (
         (1.0, 1.0) if scale is None else (scale.log10_det_spread, scale.coupling_index_spread)
     )
@@ -194,15 +168,6 @@ class _Best:
             self._excess, self._fitness = excess, fitness
             self.genes = genes[index].copy()
             self.scores = scores.take(index)
-
-
-def _checked(genes: ArrayLike) -> Array:
-    start = np.array(genes, dtype=np.float64)
-    if start.ndim != 1 or start.size < 2:
-        raise ShapeError("genes", start.shape, "(n_genes,), at least 2 of them")
-    if not np.all((start >= 0.0) & (start <= 1.0)):
-        raise DesignError("genes", start.tolist(), "numbers within [0, 1]")
-    return start
 
 
 def _strategy(start: Array, size: int, seed: int) -> Any:

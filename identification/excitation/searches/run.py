@@ -370,7 +370,7 @@ class _Search:
         self._phase = "polish"
         start = _scores_on(front, winner)
         result = polish(
-            self._ledger,
+            self._ledger.score,
             front.genes[winner],
             start,
             goal.polished_by(start),
@@ -383,14 +383,13 @@ class _Search:
     def _excitation(
         self, genes: Array, trajectory: PiecewiseCubic | FourierSeries, criteria: Criteria
     ) -> Excitation:
-        return self._genome.excitation(
-            genes,
-            trajectory,
-            criteria,
+        return Excitation(
+            criteria=criteria,
             method=self._settings.method,
             seed=self._settings.seed,
             tried=self._ledger.evaluated,
-            rejected=self._ledger.infeasible,
+            rejected=dict(self._ledger.infeasible),
+            **self._genome.recorded(genes, trajectory),
         )
 
     def _entered(self) -> None:

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
-
-import numpy as np
-
-from identification.excitation.errors import DesignError
+from typing import Literal
 
 Method = Literal["a", "b", "balanced", "front"]
 
@@ -30,9 +26,6 @@ class SearchSettings:
         polish: evaluations of a local search from the winner; 0 for none.
         crossover_eta: how close children stay to their parents (SBX), the larger the closer.
         mutation_eta: how close a changed gene stays to what it was, the larger the closer.
-
-    Raises:
-        DesignError: a setting outside its range.
     """
 
     method: Method = "front"
@@ -45,25 +38,3 @@ class SearchSettings:
     polish: int = 0
     crossover_eta: float = 15.0
     mutation_eta: float = 20.0
-
-    def __post_init__(self) -> None:
-        weights = np.array(self.weights, dtype=np.float64)
-        for name, fine, valid in (
-            ("method", self.method in get_args(Method), f"one of {', '.join(get_args(Method))}"),
-            ("population", self.population >= 2, "at least 2"),
-            ("generations", self.generations >= 1, "at least 1"),
-            ("crossover", 0.0 <= self.crossover <= 1.0, "a probability"),
-            ("mutation", 0.0 <= self.mutation <= 1.0, "a probability"),
-            (
-                "weights",
-                weights.shape == (2,) and np.all((weights >= 0.0) & (weights < np.inf)),
-                "two numbers of 0 or more",
-            ),
-            ("weights", np.any(weights > 0.0), "two numbers, not both 0"),
-            ("seed", self.seed >= 0, "0 or more"),
-            ("polish", self.polish >= 0, "0 or more evaluations"),
-            ("crossover_eta", 1.0 <= self.crossover_eta < np.inf, "1 or more"),
-            ("mutation_eta", 1.0 <= self.mutation_eta < np.inf, "1 or more"),
-        ):
-            if not fine:
-                raise DesignError(name, getattr(self, name), valid)
