@@ -30,7 +30,8 @@ from hil.archive.header import (
     HeaderError,
     is_known,
 )
-from hil.archive.survey import Survey, Visit, survey
+from hil.archive.repair import is_indexed
+from hil.archive.survey import Survey, survey
 from hil.errors import NotAnArchiveError
 
 Fault = tuple[str, str]
@@ -276,17 +277,14 @@ def check_archive(path: str | PathLike[str]) -> Check:
         ArchiveError: it cannot be read.
     """
     path = Path(path)
-    checkers: list[_Checker] = []
-
-    def begin() -> Visit:
-        checkers.append(_Checker())
-        return checkers[-1].visit
-
-    found = survey(path, begin)
-    checkers[-1].finish(found)
+    checker = _Checker()
+    found = survey(path, checker.visit)
+    checker.finish(found)
     faults: dict[str, list[str]] = {}
     for fault in found.faults:
         faults.setdefault(fault.aspect, []).append(fault.text)
+    if not faults and found.header is not None and not is_indexed(found):
+        faults["index"] = ["the message indexes or the index at the end do not fit what is there"]
     if found.metadata is None:
         if not any(repr(METADATA) in text for text in faults.get("metadata", ())):
             raise _another_kind(found)
@@ -297,7 +295,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.outcome is not None:
         faults.setdefault("outcome", []).extend(_outcome_faults(found.outcome))
     if not described and found.pieces:
-        for aspect, text in checkers[-1].faults:
+        for aspect, text in checker.faults:
             faults.setdefault(aspect, []).append(text)
     return Check(
         path=path,

@@ -28,7 +28,7 @@ from hil.archive.header import (
     ArchiveOutcome,
     is_known,
 )
-from hil.archive.scan import NUMBERS, Contested, Order, Scan
+from hil.archive.scan import NUMBERS, Order, Scan
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
@@ -249,7 +249,7 @@ class _Content(Scan):
 
     def take_chunk(self, record: Record) -> None:
         """Take a chunk, or leave it to be decoded with others."""
-        _, data = self.opened(record)
+        data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
             self._decode(self.parser.messages(data, record.offset), record.offset)
@@ -300,8 +300,8 @@ class _Content(Scan):
         self.events += events
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:
-        """Messages may be missing where chunks were left out."""
-        if self._order.gapless:
+        """Messages may be missing where chunks were left out, or were lost before a repair."""
+        if self._order.gapless and not self._order.repaired:
             super().missing(gaps, offset)
 
     def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
@@ -347,7 +347,6 @@ class _Content(Scan):
             stated = getattr(self.outcome, key)
             if stated != count:
                 raise Damage(size, f"is missing: {stated} {key} were written")
-        self._order.check_end(size)
 
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
@@ -586,8 +585,6 @@ def _from_the_beginning(
     stream.seek(0)
     content = _Content(selection, order)
     damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
-    if order.until is None and isinstance(damage, Contested):  # what was read may be strange
-        return _from_the_beginning(stream, size, selection, replace(order, until=damage))
     return content, damage
 
 
