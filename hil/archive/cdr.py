@@ -4,8 +4,7 @@ ROS 2 messages in CDR begin with four bytes of encapsulation; every primitive is
 own size, counted from after those four bytes. Where names and array lengths never change, all
 messages of a channel have the same bytes at the same places, so a message is one element of a
 structured array: encoding fills its columns, decoding is a view. A JointState holds names and
-sequences, but they stay the same over a recording, so it has a constant layout all the same. Log
-messages differ in length and are encoded one by one.
+sequences, but they stay the same over a recording, so it has a constant layout all the same.
 """
 
 from __future__ import annotations
@@ -208,71 +207,3 @@ def joint_state_layout(
     builder.sequence("velocity", "float64", velocity)
     builder.sequence("effort", "float64", effort)
     return builder.build()
-
-
-class _Cursor:
-    """Reads one CDR message, field after field."""
-
-    def __init__(self, message: bytes) -> None:
-        if message[:4] != ENCAPSULATION:
-            raise LayoutError("the message is not little-endian CDR")
-        self._data = message
-        self._at = 4
-
-    def number(self, code: str, size: int) -> int:
-        self._at += -(self._at - 4) % size
-        value: int
-        try:
-            (value,) = struct.unpack_from("<" + code, self._data, self._at)
-        except struct.error as error:
-            raise LayoutError("the message ends before its last field") from error
-        self._at += size
-        return value
-
-    def string(self) -> str:
-        length = self.number("I", 4)
-        if not 0 < length <= len(self._data) - self._at:
-            raise LayoutError(f"a string of {length} bytes does not fit into the message")
-        data = self._data[self._at : self._at + length - 1]
-        self._at += length
-        try:
-            return data.decode()
-        except UnicodeDecodeError as error:
-            raise LayoutError("a string is not UTF-8") from error
-
-
-@dataclass(frozen=True)
-class LogMessage:
-    """A decoded rcl_interfaces/Log: time in nanoseconds, severity, kind and text."""
-
-    stamp: int
-    level: int
-    name: str
-    text: str
-
-
-def encode_log(message: LogMessage) -> bytes:
-    """The CDR bytes of a log message; file, function and line stay empty."""
-    data = bytearray(ENCAPSULATION)
-    data += struct.pack("<iIB", *divmod(message.stamp, 10**9), message.level)
-    for text in (message.name, message.text, "", ""):
-        data += bytes(-(len(data) - 4) % 4)
-        encoded = text.encode() + b"\0"
-        data += struct.pack("<I", len(encoded)) + encoded
-    data += bytes(-(len(data) - 4) % 4) + struct.pack("<I", 0)
-    return bytes(data)
-
-
-def decode_log(message: bytes) -> LogMessage:
-    """Read a log message.
-
-    Raises:
-        LayoutError: the bytes are not such a message.
-    """
-    cursor = _Cursor(message)
-    seconds = cursor.number("i", 4)
-    nanoseconds = cursor.number("I", 4)
-    level = cursor.number("B", 1)
-    return LogMessage(
-        seconds * 10**9 + nanoseconds, level, name=cursor.string(), text=cursor.string()
-    )

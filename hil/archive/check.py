@@ -15,9 +15,10 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Record
+from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     CHUNKS,
     FORMAT_VERSION,
@@ -208,7 +209,7 @@ def _fields(text: str) -> list[str]:
 def _events(messages: Messages, place: str) -> Iterator[Fault]:
     try:
         for message in messages.all():
-            decode_log(message)
+            ArchivedEvent.decode(message)
     except LayoutError as error:
         yield "sizes", f"{place} has an event that cannot be read: {error}"
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import Bytes, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
@@ -320,11 +320,11 @@ class _Content(Scan):
         if messages is None or not self._selection.events:
             return []
         try:
-            logs = [decode_log(message) for message in messages.all()]
+            events = [ArchivedEvent.decode(message) for message in messages.all()]
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
         start, stop = self._selection.times
-        return [ArchivedEvent.from_log(log) for log in logs if start <= log.stamp < stop]
+        return [event for event in events if start <= event.stamp < stop]
 
     def _check_end(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""

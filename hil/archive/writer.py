@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.cdr import LogMessage, Rows, encode_log
+from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CHUNKS,
@@ -129,12 +129,11 @@ class ArchiveFile:
         for topic in topics:
             self.counts[topic] += len(batch.stamp)
 
-    def add_event(self, message: LogMessage) -> None:
+    def add_event(self, event: ArchivedEvent) -> None:
         """Add an event to the chunk in progress."""
         number = self.counts[EVENTS] % _MOST_NUMBERS
         with self._guarded():
-            data = encode_log(message)
-            self._writer.add_message(self._numbers[EVENTS], message.stamp, number, data)
+            self._writer.add_message(self._numbers[EVENTS], event.stamp, number, event.encode())
         self.counts[EVENTS] += 1
 
     def flush(self) -> None:
@@ -395,8 +394,7 @@ class ArchiveWriter:
         """
         if cycle is None:
             cycle = self._newest
-        event = ArchivedEvent(cycle * self._period, name, text, level, data or {})
-        self._file.add_event(event.to_log())
+        self._file.add_event(ArchivedEvent(cycle * self._period, name, text, level, data or {}))
 
     def flush(self) -> None:
         """Write out what is pending, chunk or not; for links that have fallen silent."""
