@@ -212,6 +212,8 @@ def records(
         if len(head) < RECORD.size:
             raise Damage(offset, "is cut off")
         opcode, length = RECORD.unpack(head)
+        if not opcode:  # a hole of a file is zeros, and would be as many records as it has bytes
+            raise Damage(offset, "is none")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
         if length > LARGEST_RECORD and opcode not in skip:
@@ -297,15 +299,32 @@ def chunk_data(
 ) -> bytes:
     """Decompress the records of a chunk, which may be parsed already; verify their checksum."""
     head = head or chunk(record)
-    size = head.uncompressed_size
-    if size > min(LARGEST_CHUNK, MOST_INFLATION * len(head.data)):
-        raise Damage(record.offset, f"(chunk) claims {size} bytes of content")
-    data = _decompressed(head, record.offset, decompressor)
-    if len(data) != size:
-        raise Damage(record.offset, "(chunk) has another length than it claims")
+    data = decompressed(head, record.offset, decompressor)
     if crc32(data) != head.uncompressed_crc:
         missing = head.uncompressed_crc == _NO_CRC
         raise Damage(record.offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
+    return data
+
+
+def decompressed(
+    chunk: Chunk,
+    offset: int,
+    decompressor: zstandard.ZstdDecompressor,
+    *,
+    largest: int = LARGEST_CHUNK,
+) -> bytes:
+    """The records of a chunk that stands at `offset`; their checksum is not looked at.
+
+    Raises:
+        Damage: they are more than `largest` bytes or inflated beyond measure, not as many as
+            stated, or cannot be decompressed.
+    """
+    size = chunk.uncompressed_size
+    if size > min(largest, MOST_INFLATION * len(chunk.data)):
+        raise Damage(offset, f"(chunk) claims {size} bytes of content")
+    data = _decompressed(chunk, offset, decompressor)
+    if len(data) != size:
+        raise Damage(offset, "(chunk) has another length than it claims")
     return data
 
 
