@@ -588,20 +588,10 @@ def write_samples(
         durable=durable,
     )
     for start in range(0, len(samples.stamp), _SAMPLES_PER_CHUNK):
-        file.add(_encode(encoder, samples, slice(start, start + _SAMPLES_PER_CHUNK)))
+        part = slice(start, start + _SAMPLES_PER_CHUNK)
+        values = (samples.position, samples.velocity, samples.torque, samples.motor_current)
+        quantities = [None if one is None else one[part] for one in values]
+        file.add(encoder.encode(samples.stamp[part], *quantities))
         file.flush()
     file.finish({"outcome": "completed", "samples": str(len(samples.stamp)), "events": "0"})
     return path
-
-
-def _encode(encoder: SampleEncoder, samples: Samples, part: slice) -> Batch:
-    def cut(values: Array | None) -> Array | None:
-        return None if values is None else values[part]
-
-    return encoder.encode(
-        samples.stamp[part],
-        samples.position[part],
-        cut(samples.velocity),
-        cut(samples.torque),
-        cut(samples.motor_current),
-    )
