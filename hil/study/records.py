@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.files import make_folder, write_or_tell
-from hil.io.digest import json_digest
+from hil.io import json_digest
 from hil.reading import text_of
 from hil.results.frozen import Frozen
 from identification import RobotModel

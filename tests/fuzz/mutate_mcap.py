@@ -69,7 +69,7 @@ def taken_apart(data: bytes) -> list[Record] | None:
 
 def _split(data: bytes) -> list[tuple[int, bytes]]:
     """Opcodes and bodies, up to where the bytes are no record any more."""
-    found = []
+    found: list[tuple[int, bytes]] = []
     with contextlib.suppress(Damage):
         found.extend((record.opcode, record.body) for record in container.split(data, 0))
     return found
