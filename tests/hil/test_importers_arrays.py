@@ -379,7 +379,7 @@ class TestTextMatrices:
     def test_an_empty_line_between_numbers_is_named(self, tmp_path, robot):
         lines = [" ".join(map(repr, row)) for row in Q.tolist()]
         (tmp_path / "q.txt").write_text("\n".join([*lines[:9], "", *lines[9:]]))
-        with pytest.raises(SourceError, match=r"line 10 is empty; .*\[format\] skip_empty = true"):
+        with pytest.raises(SourceError, match=r"line 10 is empty; .*skip_empty = true.*skip_rows"):
             read(tmp_path / "q.txt", robot)
 
     @pytest.mark.parametrize("header", [[], ["q1 q2 q3"], ["q1 q2 q3", ""]])

@@ -164,7 +164,7 @@ class TestBadInput:
         [
             (
                 {"position": {"columns": "pos{}"}},
-                "no column 'pos1' for hip.*its columns are t, q1, q2",
+                "no column 'pos1' for hip, joint 1 of 3.*--lock-others.*its columns are t, q1, q2",
             ),
             ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
             ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
@@ -344,9 +344,10 @@ class TestMoreColumnsThanJoints:
             assert np.array_equal(read(file, robot, **entries)["position"], self.WIDE[:, expected])
             file.with_suffix(".mcap").unlink()
 
-    def test_arrays_count_from_zero_where_they_do(self, tmp_path, robot):
+    def test_logs_count_from_zero_where_they_do(self, tmp_path, robot):
         np.savez(tmp_path / "a.npz", **{f"q{k}": self.WIDE[:, k] for k in range(3)})
-        assert np.array_equal(read(tmp_path / "a.npz", robot)["position"], self.WIDE[:, :3])
+        for source in (tmp_path / "a.npz", log(tmp_path / "b.csv", self.WIDE[:, :3], "q0,q1,q2")):
+            assert np.array_equal(read(source, robot)["position"], self.WIDE[:, :3])
 
 
 class TestMapFile:
@@ -379,6 +380,12 @@ class TestMapFile:
             ("sample_rate = 5\nposition = 3\n", "position: must be a table"),
             ("sample_rate = 5\n[position]\nfiles = 3\n", "position.files: must be a name with"),
             ("sample_rate = \n", "cannot be read"),
+            ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nscale = 0.0\n", "position.scale"),
+            (
+                "sample_rate = 5\n[position]\ncolumns = 'q{}'\n"
+                "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n",
+                "another joint",
+            ),
         ],
     )
     def test_a_bad_one_is_refused_by_field(self, tmp_path, text, sentence):
