@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
-from hil.archive.cdr import Rows, encode_log, joint_state_layout
+from hil.archive.cdr import Rows, joint_state_layout
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
     COMMANDED,
@@ -122,9 +121,8 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
         writer.add_message(register(writer, channel), first, 0, message)
     events = register(writer, EVENT_CHANNEL)
     for number, event in enumerate(archive.events):
-        log = event.to_log()
-        shifted = replace(log, stamp=log.stamp + shift)
-        writer.add_message(events, shifted.stamp, number, encode_log(shifted))
+        at = event.stamp + shift
+        writer.add_message(events, at, number, event.encode(at))
     messages = []
     for topic, (times, values) in states.items():
         number = register(writer, Channel(topic, measured.schema, measured.definition))

@@ -11,7 +11,7 @@ from secrets import token_hex
 from tempfile import TemporaryDirectory
 
 from hil.errors import InputError, OutputError
-from hil.io.lock import locked
+from hil.io import locked
 
 
 def make_folder(path: Path) -> None:

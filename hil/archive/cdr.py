@@ -4,15 +4,14 @@ ROS 2 messages in CDR begin with four bytes of encapsulation; every primitive is
 own size, counted from after those four bytes. Where names and array lengths never change, all
 messages of a channel have the same bytes at the same places, so a message is one element of a
 structured array: encoding fills its columns, decoding is a view. A JointState holds names and
-sequences, but they stay the same over a recording, so it has a constant layout all the same. Log
-messages differ in length and are encoded one by one.
+sequences, but they stay the same over a recording, so it has a constant layout all the same.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -39,8 +38,13 @@ _PRIMITIVES = {
     "float32": "<f4",
     "float64": "<f8",
 }
+_FIELD = re.compile(r"(?P<type>[\w/]+)(?P<bound><=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<name>\w+)$")
+_CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
+_SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
+_LARGEST = 4096  # elements; what is larger is an image or a cloud of points
+_MOST_PLACES = 10_000  # in one message where a type is laid out
+_DEEPEST = 32  # types within types
 _LONGEST_COUNT = 9  # digits
-_FIELD = re.compile(r"(?P<type>[\w/]+)(\[(?P<count>\d+)\])?\s+(?P<name>\w+)")
 
 
 LARGEST_MESSAGE: Final = 1 << 20
@@ -143,11 +147,11 @@ class LayoutBuilder:
         if count:
             self.variable(name, primitive, count)
 
-    def header(self, frame: str = "") -> None:
-        """Place a std_msgs/Header with constant frame."""
+    def header(self) -> None:
+        """Place a std_msgs/Header without frame."""
         self.variable("sec", "int32")
         self.variable("nanosec", "uint32")
-        self.string(frame)
+        self.string("")
 
     def build(self) -> MessageLayout:
         """The layout of the fields placed so far.
@@ -170,37 +174,162 @@ class LayoutBuilder:
 
 @lru_cache(maxsize=64)
 def fixed_layout(definition: str) -> MessageLayout:
-    """Lay out a ros2msg definition of numbers and fixed arrays, with or without a header.
+    """Lay out messages of numbers and fixed arrays, with or without a header, by their definition.
+
+    The stamp of the header has the fields ``sec`` and ``nanosec``.
 
     Raises:
-        LayoutError: a field of other type, whose size depends on the message, or too many.
+        LayoutError: the size of a field depends on the message, or one is of no known type.
     """
-    builder = LayoutBuilder()
-    for line in definition.partition("=" * 80)[0].splitlines():
-        text = line.partition("#")[0].strip()
-        if not text:
+    walk = _Walk(_types("", definition), None)
+    walk.fields("", "")
+    layout = walk.builder.build()
+    names = layout.dtype.names or ()
+    layout.dtype.names = tuple(name.removeprefix("header/stamp/") for name in names)
+    return layout
+
+
+@dataclass(frozen=True)
+class _Field:
+    """One line of a definition: `count` None for a single value, -1 for a sequence."""
+
+    kind: str
+    name: str
+    count: int | None
+
+
+def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
+    """The layout of messages like this one, fields named by their paths.
+
+    Args:
+        kind: name of the type.
+        definition: its ros2msg text with all dependencies.
+        message: in plain little-endian CDR.
+
+    Raises:
+        LayoutError: the definition cannot be understood, or the message does not keep it.
+    """
+    if message[:4] != ENCAPSULATION:
+        raise LayoutError("its messages are not little-endian CDR")
+    walk = _Walk(_types(kind, definition), message)
+    walk.fields(_short(kind), "")
+    return walk.builder.build()
+
+
+class _Walk:
+    """Goes through one message along its definition, and lays out what it meets.
+
+    Without a message, strings are empty, and there must be no sequence.
+    """
+
+    def __init__(self, types: Mapping[str, tuple[_Field, ...]], message: bytes | None) -> None:
+        self.builder = LayoutBuilder()
+        self._types = types
+        self._message = message
+        self._places = 0
+
+    def fields(self, kind: str, path: str, depth: int = 0) -> None:
+        """Lay out the fields of a type; types may hold themselves, or nothing."""
+        if kind not in self._types:
+            raise LayoutError(f"its definition lacks {kind}")
+        self._places += 1
+        if depth > _DEEPEST or self._places > _MOST_PLACES:
+            raise LayoutError(f"its definition nests {kind} too deep or too often")
+        for one in self._types[kind]:
+            self._field(one, path + one.name, depth)
+
+    def _field(self, field: _Field, path: str, depth: int) -> None:
+        count = self._count() if field.count == -1 else field.count
+        if field.kind in _PRIMITIVES:
+            if count is not None and count > _LARGEST:
+                raise LayoutError(f"{path} has {count} elements")
+            if count != 0:
+                self._check_left(np.dtype(_PRIMITIVES[field.kind]).itemsize * (count or 1))
+                self.builder.variable(path, field.kind, count)
+            return
+        for index in range(1 if count is None else count):
+            place = path if count is None else f"{path}/{index}"
+            if field.kind in ("string", "wstring"):
+                self._string(field.kind, place)
+            else:
+                self.fields(_short(field.kind), f"{place}/", depth + 1)
+
+    def _count(self) -> int:
+        if self._message is None:
+            raise LayoutError("a sequence is not of constant size")
+        count = self._number(self._message)
+        self.builder.count(count)
+        return count
+
+    def _string(self, kind: str, path: str) -> None:
+        if kind == "wstring":
+            raise LayoutError(f"{path} is a wstring")
+        if self._message is None:
+            self.builder.string("")
+            return
+        length = self._number(self._message)
+        start = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4 + 4
+        text = self._message[start : start + length]
+        if len(text) < length or not text.endswith(b"\0"):
+            raise LayoutError(f"{path} does not fit into the message")
+        try:
+            self.builder.string(text[:-1].decode())
+        except UnicodeDecodeError as error:
+            raise LayoutError(f"{path} is not UTF-8") from error
+
+    def _number(self, message: bytes) -> int:
+        """The length that stands at the next place for one."""
+        at = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4
+        self._check_left(4)
+        return int.from_bytes(message[at : at + 4], "little")
+
+    def _check_left(self, size: int) -> None:
+        if self._message is not None and self.builder.size + size > len(self._message):
+            raise LayoutError("its messages end before their last field")
+
+
+def _short(kind: str) -> str:
+    """``package/Type`` without ``msg``."""
+    return kind.replace("/msg/", "/")
+
+
+@lru_cache(maxsize=64)
+def _types(kind: str, definition: str) -> dict[str, tuple[_Field, ...]]:
+    """Fields by type, of a definition with its dependencies."""
+    own, *others = _SEPARATOR.split(definition)
+    package = _short(kind).partition("/")[0]
+    types = {_short(kind): tuple(_fields(own, package))}
+    for part in others:
+        head, _, text = part.partition("\n")
+        name = _short(head.removeprefix("MSG:").strip())
+        types[name] = tuple(_fields(text, name.partition("/")[0]))
+    return types
+
+
+def _fields(text: str, package: str) -> Iterator[_Field]:
+    for line in text.splitlines():
+        stated = line.partition("#")[0].strip()
+        if not stated or _CONSTANT.match(stated):
             continue
-        match = _FIELD.fullmatch(text)
+        # A default value may follow the name.
+        match = _FIELD.match(" ".join(stated.split()[:2]))
         if match is None:
-            raise LayoutError(f"{text!r} is not a field of constant size")
-        if match["type"] == "std_msgs/Header":
-            builder.header()
-        elif match["type"] in _PRIMITIVES:
-            count = match["count"]
-            if count is not None and len(count) > _LONGEST_COUNT:
-                raise LayoutError(f"{match['name']} has too many elements")
-            builder.variable(match["name"], match["type"], None if count is None else int(count))
-        else:
-            raise LayoutError(f"{match['type']!r} is not a type of constant size")
-    return builder.build()
+            raise LayoutError(f"its definition has the line {stated!r}")
+        kind, count = match["type"], match["count"]
+        if kind in ("time", "duration"):
+            raise LayoutError("its definition is that of ROS 1")
+        if kind not in _PRIMITIVES and kind not in ("string", "wstring") and "/" not in kind:
+            kind = f"{package}/{kind}"
+        fixed = int(count[:_LONGEST_COUNT]) if count is not None and count.isdecimal() else -1
+        yield _Field(kind, match["name"], None if count is None else fixed)
 
 
 def joint_state_layout(
-    names: Sequence[str], *, position: int, velocity: int, effort: int, frame: str = ""
+    names: Sequence[str], *, position: int, velocity: int, effort: int
 ) -> MessageLayout:
     """Lay out a sensor_msgs/JointState with these names and lengths of its arrays."""
     builder = LayoutBuilder()
-    builder.header(frame)
+    builder.header()
     builder.count(len(names))
     for name in names:
         builder.string(name)
@@ -208,71 +337,3 @@ def joint_state_layout(
     builder.sequence("velocity", "float64", velocity)
     builder.sequence("effort", "float64", effort)
     return builder.build()
-
-
-class _Cursor:
-    """Reads one CDR message, field after field."""
-
-    def __init__(self, message: bytes) -> None:
-        if message[:4] != ENCAPSULATION:
-            raise LayoutError("the message is not little-endian CDR")
-        self._data = message
-        self._at = 4
-
-    def number(self, code: str, size: int) -> int:
-        self._at += -(self._at - 4) % size
-        value: int
-        try:
-            (value,) = struct.unpack_from("<" + code, self._data, self._at)
-        except struct.error as error:
-            raise LayoutError("the message ends before its last field") from error
-        self._at += size
-        return value
-
-    def string(self) -> str:
-        length = self.number("I", 4)
-        if not 0 < length <= len(self._data) - self._at:
-            raise LayoutError(f"a string of {length} bytes does not fit into the message")
-        data = self._data[self._at : self._at + length - 1]
-        self._at += length
-        try:
-            return data.decode()
-        except UnicodeDecodeError as error:
-            raise LayoutError("a string is not UTF-8") from error
-
-
-@dataclass(frozen=True)
-class LogMessage:
-    """A decoded rcl_interfaces/Log: time in nanoseconds, severity, kind and text."""
-
-    stamp: int
-    level: int
-    name: str
-    text: str
-
-
-def encode_log(message: LogMessage) -> bytes:
-    """The CDR bytes of a log message; file, function and line stay empty."""
-    data = bytearray(ENCAPSULATION)
-    data += struct.pack("<iIB", *divmod(message.stamp, 10**9), message.level)
-    for text in (message.name, message.text, "", ""):
-        data += bytes(-(len(data) - 4) % 4)
-        encoded = text.encode() + b"\0"
-        data += struct.pack("<I", len(encoded)) + encoded
-    data += bytes(-(len(data) - 4) % 4) + struct.pack("<I", 0)
-    return bytes(data)
-
-
-def decode_log(message: bytes) -> LogMessage:
-    """Read a log message.
-
-    Raises:
-        LayoutError: the bytes are not such a message.
-    """
-    cursor = _Cursor(message)
-    seconds = cursor.number("i", 4)
-    nanoseconds = cursor.number("I", 4)
-    level = cursor.number("B", 1)
-    return LogMessage(
-        seconds * 10**9 + nanoseconds, level, name=cursor.string(), text=cursor.string()
-    )

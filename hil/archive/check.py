@@ -15,9 +15,10 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Record
+from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     CHUNKS,
     FORMAT_VERSION,
@@ -30,7 +31,8 @@ from hil.archive.header import (
     HeaderError,
     is_known,
 )
-from hil.archive.survey import Survey, Visit, survey
+from hil.archive.repair import is_indexed
+from hil.archive.survey import Survey, survey
 from hil.errors import NotAnArchiveError
 
 Fault = tuple[str, str]
@@ -207,7 +209,7 @@ def _fields(text: str) -> list[str]:
 def _events(messages: Messages, place: str) -> Iterator[Fault]:
     try:
         for message in messages.all():
-            decode_log(message)
+            ArchivedEvent.decode(message)
     except LayoutError as error:
         yield "sizes", f"{place} has an event that cannot be read: {error}"
 
@@ -276,17 +278,14 @@ def check_archive(path: str | PathLike[str]) -> Check:
         ArchiveError: it cannot be read.
     """
     path = Path(path)
-    checkers: list[_Checker] = []
-
-    def begin() -> Visit:
-        checkers.append(_Checker())
-        return checkers[-1].visit
-
-    found = survey(path, begin)
-    checkers[-1].finish(found)
+    checker = _Checker()
+    found = survey(path, checker.visit)
+    checker.finish(found)
     faults: dict[str, list[str]] = {}
     for fault in found.faults:
         faults.setdefault(fault.aspect, []).append(fault.text)
+    if not faults and found.header is not None and not is_indexed(found):
+        faults["index"] = ["the message indexes or the index at the end do not fit what is there"]
     if found.metadata is None:
         if not any(repr(METADATA) in text for text in faults.get("metadata", ())):
             raise _another_kind(found)
@@ -297,7 +296,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
     if found.outcome is not None:
         faults.setdefault("outcome", []).extend(_outcome_faults(found.outcome))
     if not described and found.pieces:
-        for aspect, text in checkers[-1].faults:
+        for aspect, text in checker.faults:
             faults.setdefault(aspect, []).append(text)
     return Check(
         path=path,

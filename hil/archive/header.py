@@ -31,7 +31,6 @@ from pydantic import (
     field_validator,
 )
 
-from hil.errors import ArchiveError
 from hil.reading import whole_number
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
@@ -85,19 +84,6 @@ class ArchiveName:
     kind: str
     index: int
     attempt: int = 1
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ArchiveError(
-                None, f"{self.kind!r} is no kind of archive", remedy=f"use {', '.join(KINDS)}"
-            )
-        if self.index < 0 or self.attempt < 1:
-            raise ArchiveError(
-                None,
-                f"index {self.index}, attempt {self.attempt}",
-                field=self.kind,
-                remedy="an index is zero or more, an attempt one or more",
-            )
 
     @property
     def filename(self) -> str:
@@ -286,19 +272,11 @@ def _problem(error: Any, entries: Mapping[str, str]) -> str:
     if error["type"] == "value_error" and len(error["loc"]) == 1:
         return str(error["ctx"]["error"])
     shown = entries[name] if len(entries[name]) <= 40 else f"{entries[name][:40]}..."
-    n = _length(entries.get("joint_names", ""))
     return {
         "joint_names": "is no JSON list of different names",
-        "motor_from_joint": f"is no JSON matrix of {n} by {n} numbers",
+        "motor_from_joint": "is no JSON matrix of numbers",
         "period": f"is {shown!r}, not a time in seconds",
     }.get(name, "is no JSON list of names")
-
-
-def _length(text: str) -> int:
-    try:
-        return len(json.loads(text))
-    except (ValueError, RecursionError, TypeError):
-        return 0
 
 
 class ArchiveOutcome(BaseModel):

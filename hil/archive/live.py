@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange import ExchangeEvent
-from hil.archive.cdr import encode_log
 from hil.archive.events import ArchivedEvent
 from hil.archive.recorder import describe, level_of
 from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder
@@ -189,7 +188,7 @@ class LivePublisher:
         for event in portion.events:
             seconds = self._period * (getattr(event, "cycle", None) or 0)
             said = ArchivedEvent(seconds, type(event).__name__, describe(event), level_of(event))
-            self._events.log(encode_log(said.to_log()), log_time=time.time_ns())
+            self._events.log(said.encode(), log_time=time.time_ns())
 
 
 class ViewerClock:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows, decode_log
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import Bytes, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
@@ -28,7 +28,7 @@ from hil.archive.header import (
     ArchiveOutcome,
     is_known,
 )
-from hil.archive.scan import NUMBERS, Contested, Order, Scan
+from hil.archive.scan import NUMBERS, Order, Scan
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
@@ -249,7 +249,7 @@ class _Content(Scan):
 
     def take_chunk(self, record: Record) -> None:
         """Take a chunk, or leave it to be decoded with others."""
-        _, data = self.opened(record)
+        data = self.opened(record)
         if not self.parser.repeats(data):
             self._take_waiting()
             self._decode(self.parser.messages(data, record.offset), record.offset)
@@ -300,8 +300,8 @@ class _Content(Scan):
         self.events += events
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:
-        """Messages may be missing where chunks were left out."""
-        if self._order.gapless:
+        """Messages may be missing where chunks were left out, or were lost before a repair."""
+        if self._order.gapless and not self._order.repaired:
             super().missing(gaps, offset)
 
     def _begun(self, topic: str, messages: Messages, offset: int) -> _Columns:
@@ -320,11 +320,11 @@ class _Content(Scan):
         if messages is None or not self._selection.events:
             return []
         try:
-            logs = [decode_log(message) for message in messages.all()]
+            events = [ArchivedEvent.decode(message) for message in messages.all()]
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
         start, stop = self._selection.times
-        return [ArchivedEvent.from_log(log) for log in logs if start <= log.stamp < stop]
+        return [event for event in events if start <= event.stamp < stop]
 
     def _check_end(self, size: int) -> None:
         """Compare what was read with what the writer says it wrote."""
@@ -347,7 +347,6 @@ class _Content(Scan):
             stated = getattr(self.outcome, key)
             if stated != count:
                 raise Damage(size, f"is missing: {stated} {key} were written")
-        self._order.check_end(size)
 
 
 _UNREAD = frozenset((container.MESSAGE_INDEX,))
@@ -586,8 +585,6 @@ def _from_the_beginning(
     stream.seek(0)
     content = _Content(selection, order)
     damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
-    if order.until is None and isinstance(damage, Contested):  # what was read may be strange
-        return _from_the_beginning(stream, size, selection, replace(order, until=damage))
     return content, damage
 
 

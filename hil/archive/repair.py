@@ -9,28 +9,36 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import IO, BinaryIO
+from typing import IO, BinaryIO, Protocol
 
-import numpy as np
 import zstandard
 from mcap.records import Chunk
 
 from hil.archive import container, header, schema
-from hil.archive.chunk import HEAD, ChunkParser, Messages
+from hil.archive.chunk import ChunkParser
 from hil.archive.container import Record
 from hil.archive.header import ArchiveOutcome
-from hil.archive.mcap_writer import Entries, McapWriter, chunk_of, entries_of, span
+from hil.archive.mcap_writer import Entries, McapWriter, entries_of, span
 from hil.archive.reader import open_archive
-from hil.archive.survey import Piece, Survey, survey
+from hil.archive.survey import Survey, survey
 from hil.archive.writer import sync_folder
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+from hil.reading import opened
+
+
+class Output(Protocol):
+    """What bytes are written to."""
+
+    def write(self, data: bytes, /) -> object:
+        """Take the next bytes."""
+
 
 _NAMED = 40  # characters that the temporary file takes over of the name
 
@@ -85,9 +93,6 @@ def _beside(target: Path) -> Iterator[IO[bytes]]:
         finally:
             with contextlib.suppress(FileNotFoundError):
                 Path(output.name).unlink()
-
-
-_SEQUENCE_AT = HEAD.fields["sequence"][1] if HEAD.fields else 0  # in a message record
 
 
 @dataclass(frozen=True)
@@ -149,10 +154,10 @@ def repair(
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
-    whole = not found.faults
+    whole = not found.faults and is_indexed(found)
     written = None
     if not whole or (output is not None and not in_place):
-        _write(found, target)
+        write_anew(path, target, partial(copy_of, found))
         written = target
     return Repair(
         path, written, whole, tuple(found.losses), found.samples, samples_lost=_samples_lost(found)
@@ -166,20 +171,31 @@ def _samples_lost(found: Survey) -> int | None:
     return None if stated is None else max(0, stated - found.samples)
 
 
-def _write(found: Survey, target: Path) -> None:
-    """Write the repaired archive; one that is whole is copied to the byte."""
+class _Comparison:
+    """A file to write to that remembers whether all was as in another one."""
 
-    def fill(stream: BinaryIO, output: IO[bytes]) -> None:
-        if found.faults:
-            copy_of(found, stream, output)
-        else:
-            shutil.copyfileobj(stream, output)
+    def __init__(self, other: BinaryIO) -> None:
+        self.same = True
+        self._other = other
 
-    write_anew(found.path, target, fill)
+    def write(self, data: bytes) -> None:
+        self.same = self.same and self._other.read(len(data)) == data
+
+
+def is_indexed(found: Survey) -> bool:
+    """Whether message indexes, summary and all else that follows from a sound content fit it.
+
+    Args:
+        found: of a file whose content has no fault.
+    """
+    with opened(found.path) as stream, opened(found.path) as other:
+        comparison = _Comparison(other)
+        copy_of(found, stream, comparison)
+        return comparison.same and not other.read(1)
 
 
 def copy_of(
-    found: Survey, stream: BinaryIO, output: IO[bytes], *, outcome: Mapping[str, str] | None = None
+    found: Survey, stream: BinaryIO, output: Output, *, outcome: Mapping[str, str] | None = None
 ) -> None:
     """Write what stands of an archive as a new one.
 
@@ -203,7 +219,7 @@ def copy_of(
             parser.known.take(definition)
             writer.copy(definition)
         recovered = []
-        chunk, entries = _chunk(record, piece, parser)
+        chunk, entries = _chunk(record, parser)
         for known in parser.known.definitions:
             writer.note(known)
         writer.add_chunk(chunk, entries)
@@ -212,26 +228,13 @@ def copy_of(
     writer.finish()
 
 
-def _chunk(record: Record, piece: Piece, parser: ChunkParser) -> tuple[Chunk, Entries]:
-    """A chunk as it stands, or with its messages counting on from those that stand before it."""
+def _chunk(record: Record, parser: ChunkParser) -> tuple[Chunk, Entries]:
+    """A chunk as it stands, with the times of its messages, and their entries."""
     head = container.chunk(record)
     data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor(), head=head)
-    found = parser.messages(data, record.offset)
-    entries = entries_of(found)
-    if piece.shift is not None:
-        return chunk_of(_renumbered(data, found, piece.shift), entries), entries
+    entries = entries_of(parser.messages(data, record.offset))
     first, last = span(entries)
     return replace(head, message_start_time=first, message_end_time=last), entries
-
-
-def _renumbered(data: bytes, found: Mapping[int, Messages], shift: Mapping[int, int]) -> bytes:
-    """The records of a chunk, with the numbers of its messages lower by so much, by channel."""
-    changed = np.frombuffer(bytearray(data), np.uint8)
-    for channel, messages in found.items():
-        numbers = messages.of_heads("sequence") - np.uint32(shift[channel])
-        places = messages.places[:, None] + _SEQUENCE_AT + np.arange(numbers.itemsize)
-        changed[places] = numbers.astype("<u4")[:, None].view(np.uint8)
-    return changed.tobytes()
 
 
 def _description(found: Survey) -> dict[str, str]:
@@ -286,11 +289,8 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
     """
     path = Path(path)
     found = survey(path)
-    if found.faults or found.metadata is None or found.outcome is None:
+    if found.faults or found.metadata is None or found.outcome is None or not is_indexed(found):
         raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
     amended = {"outcome": outcome, "reason": reason}
 
-    def fill(stream: BinaryIO, output: IO[bytes]) -> None:
-        copy_of(found, stream, output, outcome=amended)
-
-    write_anew(path, path, fill)
+    write_anew(path, path, partial(copy_of, found, outcome=amended))

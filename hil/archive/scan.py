@@ -7,7 +7,6 @@ The checksum of a chunk says that it is whole, not that it is of this recording:
 put a chunk of another archive in its place. The outcome lists the checksums of all chunks in order,
 so that each is known by its own. Archives of earlier versions have no such list, torn ones no
 outcome: there the cycles must do, which grow from the first to the last that the outcome names.
-Where two chunks claim the same cycles, nobody knows which is strange, and neither is believed.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import BinaryIO, Self
 
 import numpy as np
 import zstandard
-from mcap.records import Chunk, Header
+from mcap.records import Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
@@ -42,18 +41,6 @@ _SEQUENCES = 1 << 32  # message numbers are counted modulo this
 _BUT_METADATA = frozenset(range(256)) - {container.METADATA}
 
 
-class Contested(Damage):
-    """Cycles that cannot be where they are, though each chunk may be sound by itself.
-
-    Attributes:
-        since: stamp [ns]; no chunk that reaches it is believed, nor any behind.
-    """
-
-    def __init__(self, offset: int, reason: str, since: int) -> None:
-        super().__init__(offset, reason)
-        self.since = since
-
-
 @dataclass(eq=False)
 class Order:
     """The chunks that a file must have, as its end says, and how far they have come.
@@ -64,8 +51,7 @@ class Order:
         samples: how many were written, 0 where nothing says so.
         strange: whether that end is of another recording than the beginning.
         gapless: whether every chunk comes; otherwise some are left out.
-        until: what an earlier go ended with.
-        closed: whether no further chunk can be believed.
+        repaired: whether messages were lost before the file was written as it is.
     """
 
     chunks: NDArray[np.uint32] | None = None
@@ -73,8 +59,7 @@ class Order:
     samples: int = 0
     strange: bool = False
     gapless: bool = True
-    until: Contested | None = None
-    closed: bool = field(default=False, init=False)
+    repaired: bool = False
     _at: int = field(default=0, init=False)
     _newest: int = field(default=-1, init=False)
 
@@ -96,7 +81,7 @@ class Order:
         # Another program that copies a file may cut its chunks anew, and then names itself.
         if outcome.chunks is not None and _is_ours(stream, size):
             chunks = np.array(outcome.chunks, np.uint32)
-        return cls(chunks, _ends(header, outcome), outcome.samples or 0)
+        return cls(chunks, _ends(header, outcome), outcome.samples or 0, repaired=outcome.repaired)
 
     def check_chunk(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum, its own, is the next.
@@ -130,12 +115,8 @@ class Order:
             begins: whether they are the first that were written.
 
         Raises:
-            Contested: a chunk before claims the same time.
-            Damage: this chunk is wrong by itself.
+            Damage: they are not.
         """
-        if self.until is not None and stamps.max() >= self.until.since:
-            self.closed = True
-            raise Damage(offset, self.until.reason)
         if (np.diff(stamps) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not grow")
         first, last = self.ends or (int(stamps[0]), int(stamps[-1]))
@@ -143,24 +124,11 @@ class Order:
             reason = "(chunk) has cycles of another recording: the outcome names others"
             raise Damage(offset, reason)
         if stamps[0] <= self._newest:
-            reason = "(chunk) has cycles that do not follow those before, or others claim them too"
-            raise Contested(offset, reason, int(stamps[0]))
+            raise Damage(offset, "(chunk) has cycles that do not follow those before")
 
     def take(self, newest: int) -> None:
         """Note that cycles up to the stamp `newest` [ns] were taken."""
         self._newest = newest
-
-    def check_end(self, size: int) -> None:
-        """Check that the last cycle taken is the last that was written, where none is missing.
-
-        Raises:
-            Contested: it is another.
-        """
-        ends = self.ends
-        if ends is None or self._newest in (-1, ends[1]) or self.until is not None:
-            return
-        reason = "(chunk) does not end with the last cycle that the outcome names"
-        raise Contested(size, reason, self._newest)
 
 
 class Scan(ABC):
@@ -236,8 +204,8 @@ class Scan(ABC):
         except HeaderError as error:
             self.unusable = error
 
-    def opened(self, record: Record) -> tuple[Chunk, bytes]:
-        """A chunk that is one of those written, and whose turn it is; and its records.
+    def opened(self, record: Record) -> bytes:
+        """The records of a chunk that is one of those written, and whose turn it is.
 
         Raises:
             Damage: it is none of them, or damaged.
@@ -245,13 +213,10 @@ class Scan(ABC):
         head = container.chunk(record)
         data = container.chunk_data(record, decompressor=self._decompressor, head=head)
         self._order.check_chunk(head.uncompressed_crc, record.offset)
-        return head, data
+        return data
 
-    def continued(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
+    def continued(self, found: Mapping[str, Messages], offset: int) -> None:
         """Take messages by topic, which must be the next of their channels.
-
-        Returns:
-            How much too high their numbers are, by topic: as many as are missing before them.
 
         Raises:
             Damage: they are not; then nothing of them is taken.
@@ -283,12 +248,8 @@ class Scan(ABC):
             self._order.take(newest)
         self._numbers = self._numbers or numbers
         self._next |= ends
-        shifts = {}
         for topic, messages in verified.items():
-            before = self.counts.get(topic, 0)
-            shifts[topic] = (ends[topic] - len(messages) - before) % _SEQUENCES
-            self.counts[topic] = before + len(messages)
-        return shifts
+            self.counts[topic] = self.counts.get(topic, 0) + len(messages)
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:  # noqa: ARG002
         """So many messages are missing before those of the chunk at `offset`, by topic.

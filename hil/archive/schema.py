@@ -324,7 +324,7 @@ class SampleEncoder:
     def encode(
         self,
         stamp: NDArray[np.int64],
-        position: Array,
+        position: Array | None,
         velocity: Array | None,
         torque: Array | None,
         motor_current: Array | None,

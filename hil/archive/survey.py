@@ -1,7 +1,7 @@
 """Goes through a whole archive, past its damages, and says what of it stands.
 
 The reader stops at the first damage; a survey goes on, so that what follows can be saved. What it
-keeps has passed the same checks (`hil.archive.scan`), and beside them those of the index.
+keeps has passed the same checks (`hil.archive.scan`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,10 @@ from hil.archive import container, schema
 from hil.archive.chunk import KnownChannels, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import METADATA, OUTCOME
-from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.scan import NUMBERS, Contested, Order, Scan
+from hil.archive.scan import NUMBERS, Order, Scan
 from hil.errors import ArchiveError
 from hil.reading import opened
 
-_BETWEEN = (container.MESSAGE_INDEX, container.HEADER, container.DATA_END)
 _ASPECTS = {
     container.METADATA: "metadata",
     container.ATTACHMENT: "attachments",
@@ -36,8 +34,7 @@ class Fault(NamedTuple):
     """Something that is not as it must be.
 
     Attributes:
-        aspect: part of the profile: container, metadata, attachments, chunks, sequence, outcome
-            or index.
+        aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
         text: what is wrong, as a sentence without its end.
         loss: whether content is lost by it; otherwise it follows from what is there.
     """
@@ -54,20 +51,18 @@ class Piece(NamedTuple):
         offset: where it begins in the file.
         length: with its head.
         opcode: kind of record.
-        shift: of a chunk behind a loss, how much too high its messages count, by channel.
     """
 
     offset: int
     length: int
     opcode: int
-    shift: Mapping[int, int] | None = None
 
 
 Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
 
 
 class Survey(Scan):
-    """What stands of a file, and what does not.
+    """What stands of a file, and what does not; message indexes and summary are not looked at.
 
     Args:
         path: the file.
@@ -106,10 +101,6 @@ class Survey(Scan):
         self._seen: set[int] = set()
         self._lost_since = False
         self._ended = False
-        self._expected: list[bytes] = []  # what would be written instead of the present record
-        self._anew = McapWriter(self._expected.append)
-        self._indexes: list[bytes] = []  # message indexes that must come now
-        self._ends = False  # whether the data section has its end
 
     @property
     def losses(self) -> list[str]:
@@ -144,17 +135,12 @@ class Survey(Scan):
         return found.name if found else ""
 
     def run(self) -> None:
-        """Go through the file.
-
-        Raises:
-            Contested: two chunks claim the same cycles, and nobody knows which is right.
-        """
+        """Go through the file."""
         self._stream.seek(0)
+        skip = (container.MESSAGE_INDEX,)
         try:
-            for record in container.records(self._stream, self.size, check_end=False):
+            for record in container.records(self._stream, self.size, skip=skip, check_end=False):
                 self._examine(record)
-        except Contested:
-            raise
         except Damage as damage:
             self._lost_since = True  # and what is lost, counts and outcome will tell
             self._fault("container", damage, loss=False)
@@ -167,7 +153,7 @@ class Survey(Scan):
         try:
             places = self._summary.places if self._summary else []
         except Damage:
-            self._summary, places = None, []
+            places = []
         for place in places:
             if place[0] not in self._seen:
                 try:
@@ -186,47 +172,23 @@ class Survey(Scan):
 
     def _examine(self, record: Record) -> None:
         self._seen.add(record.offset)
-        self._expected.clear()
-        self._anew.position = record.offset
-        self._check_indexes(record)
         try:
             if record.opcode == container.HEADER:
                 header = container.parsed(Header, record.body, record.offset)
                 self.written_by = header.profile, header.library
-            elif record.opcode == container.DATA_END:
-                if record.body != bytes(4):
-                    damage = Damage(record.offset, "(DataEnd) is wrong")
-                    self._fault("index", damage, loss=False)
-                self._ends = True
-            elif record.opcode not in (*_ASPECTS, *_BETWEEN, container.SCHEMA, container.CHANNEL):
-                self._fault("container", Damage(record.offset, "is of an unknown kind"), loss=False)
             self.take(record)
-        except Contested:
-            raise
         except Damage as damage:
             aspect = _ASPECTS.get(record.opcode, "container")
-            self._fault(aspect, damage, loss=record.opcode not in _BETWEEN)
+            self._fault(aspect, damage, loss=record.opcode != container.HEADER)
         else:
             if record.opcode in (container.SCHEMA, container.CHANNEL):
                 self._keep(record)
 
-    def _check_indexes(self, record: Record) -> None:
-        """Compare the message indexes behind a chunk with those it must have."""
-        if record.opcode == container.MESSAGE_INDEX:
-            if record.data in self._indexes:
-                self._indexes.remove(record.data)
-            else:
-                self._fault("index", Damage(record.offset, "(message index) is wrong"), loss=False)
-        elif self._indexes:
-            self._indexes = []
-            self._fault("index", Damage(record.offset, "lacks a message index before"), loss=False)
-
-    def _keep(self, record: Record, shift: Mapping[int, int] | None = None) -> None:
-        self.pieces.append(Piece(record.offset, record.size, record.opcode, shift))
+    def _keep(self, record: Record) -> None:
+        self.pieces.append(Piece(record.offset, record.size, record.opcode))
 
     def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
         """Take header or outcome; another one is left as it is."""
-        self._anew.copy(record)
         super().take_metadata(record, name, entries)
         if name not in (METADATA, OUTCOME):
             self._keep(record)
@@ -237,32 +199,23 @@ class Survey(Scan):
         if name in self.attachments:
             raise Damage(record.offset, f"(attachment {name!r}) is there a second time")
         super().take_attachment(record)
-        self._anew.copy(record)
         self._keep(record)
 
     def take_chunk(self, record: Record) -> None:
         """Take a chunk, if it follows those before or what is missing will show."""
         if self._ended:
             raise Damage(record.offset, "(chunk) comes after a gap that nothing would show")
-        if self._order.closed:
-            return  # that nothing behind is believed was said
-        head, data = self.opened(record)
+        data = self.opened(record)
         known, definitions = KnownChannels(self.parser.known), self.definitions
         try:
             numbered = self.parser.messages(data, record.offset)
             self._recover_channels(numbered)
             found = self.parser.by_topic(numbered, record.offset)
-            shifts = self.continued(found, record.offset)
+            self.continued(found, record.offset)
         except Damage:
             self.parser.known, self.definitions = known, definitions  # what it says goes with it
             raise
-        entries = entries_of(numbered)
-        if (head.message_start_time, head.message_end_time) != span(entries):
-            self._fault("index", Damage(record.offset, "(chunk) states other times"), loss=False)
-        self._anew.add_chunk(head, entries)
-        self._indexes = self._expected[1:]  # behind the chunk itself
-        moved = {number: shifts[self.parser.known.channels[number].topic] for number in numbered}
-        self._keep(record, moved if any(moved.values()) else None)
+        self._keep(record)
         self._lost_since = False
         if self._visit is not None:
             self._visit(self, record, found)
@@ -271,18 +224,9 @@ class Survey(Scan):
         """Take channels that no record before announces from the summary."""
         if numbered.keys() <= self.parser.known.channels.keys():
             return
-        summary = self._summary or self._moved_summary()
-        self.definitions = summary.definitions if summary else []
+        self.definitions = self._summary.definitions if self._summary else []
         for item in self.definitions:
             self.parser.known.take(item)
-
-    def _moved_summary(self) -> Summary | None:
-        """The summary where a chunk of another length has come before it."""
-        here = self._stream.tell()
-        start = container.data_end(self._stream, self.size)
-        found = None if start is None else Summary.read(self._stream, self.size, start=start)
-        self._stream.seek(here)
-        return found
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:
         """Note that messages are missing; a gap in samples must show in the samples behind it."""
@@ -290,7 +234,7 @@ class Survey(Scan):
         if unseen and schema.CYCLE not in self.parser.known.topics:
             self._ended = True
             raise Damage(offset, "(chunk) comes after a gap that nothing would show")
-        if not self._lost_since:
+        if not self._lost_since and not self._order.repaired:
             damage = Damage(offset, "(chunk) does not continue the one before")
             self._fault("sequence", damage, loss=True)
 
@@ -303,7 +247,6 @@ class Survey(Scan):
             if name not in self.attachments:
                 self._fault("attachments", f"attachment {name!r} is missing", loss=True)
         self._check_outcome()
-        self._check_summary()
 
     def _check_outcome(self) -> None:
         outcome = self.outcome
@@ -312,8 +255,6 @@ class Survey(Scan):
             return
         if self.mixed:
             self._fault("outcome", "the outcome is that of another recording", loss=True)
-        if self._next.get(schema.CYCLE, 0) == outcome.samples:
-            self._order.check_end(self.size)
         counts = {
             "samples": (outcome.samples, self.samples),
             "events": (outcome.events, self.events),
@@ -327,26 +268,13 @@ class Survey(Scan):
                 text = f"{stated} {key} were written, {count} are there"
                 self._fault("outcome", text, loss=True)
 
-    def _check_summary(self) -> None:
-        for definition in self.parser.known.definitions:
-            self._anew.note(definition)
-        if self._summary is None or not self._ends:
-            self._fault(
-                "index", "the index at the end is missing or fails its checksum", loss=False
-            )
-        elif not self.counts:
-            return  # channels without messages stand in the summary alone
-        elif self._summary != Summary(self._anew.summary()[0]):
-            self._fault("index", "the index at the end does not fit the file", loss=False)
 
-
-def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) -> Survey:
+def survey(path: str | PathLike[str], visit: Visit | None = None) -> Survey:
     """Go through a file.
 
     Args:
         path: the file.
-        visit: makes what is called with each chunk that stands, with its messages by topic; a
-            file that must be gone through a second time is given to a new one.
+        visit: called with each chunk that stands, with its messages by topic.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -355,17 +283,13 @@ def survey(path: str | PathLike[str], visit: Callable[[], Visit] | None = None) 
     try:
         with opened(path) as stream:
             size = os.fstat(stream.fileno()).st_size
-            summary = Summary.read(stream, size)
+            # Found from head to head, since a chunk of another length may have come before it.
+            summary = Summary.read(stream, size, start=container.data_end(stream, size))
             order = replace(Order.read(stream, size, summary), gapless=False)
             if order.strange:
                 order = Order(gapless=False)  # a fault of the outcome will say so
-            while True:
-                found = Survey(path, stream, order, summary, visit() if visit else None)
-                try:
-                    found.run()
-                except Contested as contested:
-                    order = replace(order, until=contested)
-                else:
-                    return found
+            found = Survey(path, stream, order, summary, visit)
+            found.run()
+            return found
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error

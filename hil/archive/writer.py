@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.cdr import LogMessage, Rows, encode_log
+from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CHUNKS,
@@ -129,12 +129,11 @@ class ArchiveFile:
         for topic in topics:
             self.counts[topic] += len(batch.stamp)
 
-    def add_event(self, message: LogMessage) -> None:
+    def add_event(self, event: ArchivedEvent) -> None:
         """Add an event to the chunk in progress."""
         number = self.counts[EVENTS] % _MOST_NUMBERS
         with self._guarded():
-            data = encode_log(message)
-            self._writer.add_message(self._numbers[EVENTS], message.stamp, number, data)
+            self._writer.add_message(self._numbers[EVENTS], event.stamp, number, event.encode())
         self.counts[EVENTS] += 1
 
     def flush(self) -> None:
@@ -395,8 +394,7 @@ class ArchiveWriter:
         """
         if cycle is None:
             cycle = self._newest
-        event = ArchivedEvent(cycle * self._period, name, text, level, data or {})
-        self._file.add_event(event.to_log())
+        self._file.add_event(ArchivedEvent(cycle * self._period, name, text, level, data or {}))
 
     def flush(self) -> None:
         """Write out what is pending, chunk or not; for links that have fallen silent."""
@@ -590,20 +588,10 @@ def write_samples(
         durable=durable,
     )
     for start in range(0, len(samples.stamp), _SAMPLES_PER_CHUNK):
-        file.add(_encode(encoder, samples, slice(start, start + _SAMPLES_PER_CHUNK)))
+        part = slice(start, start + _SAMPLES_PER_CHUNK)
+        values = (samples.position, samples.velocity, samples.torque, samples.motor_current)
+        quantities = [None if one is None else one[part] for one in values]
+        file.add(encoder.encode(samples.stamp[part], *quantities))
         file.flush()
     file.finish({"outcome": "completed", "samples": str(len(samples.stamp)), "events": "0"})
     return path
-
-
-def _encode(encoder: SampleEncoder, samples: Samples, part: slice) -> Batch:
-    def cut(values: Array | None) -> Array | None:
-        return None if values is None else values[part]
-
-    return encoder.encode(
-        samples.stamp[part],
-        samples.position[part],
-        cut(samples.velocity),
-        cut(samples.torque),
-        cut(samples.motor_current),
-    )

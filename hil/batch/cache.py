@@ -36,7 +36,7 @@ from hil.cell import Cell
 from hil.files import replacing
 from hil.identify.options import Options
 from hil.identify.settings import Settings
-from hil.io.digest import digest, json_digest
+from hil.io import digest, json_digest
 from hil.reading import opened
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor

@@ -24,7 +24,7 @@ from hil.cell import Cell
 from hil.cell.schema import PayloadTable
 from hil.errors import ArchiveError, InputError
 from hil.identify.settings import stated_delay
-from hil.io.digest import digest, json_digest
+from hil.io import digest, json_digest
 from hil.progress import Reporter, Silent
 
 from .cache import BESIDE, Store, Where, arm_digest, belief_digest, code_digest

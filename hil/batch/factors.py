@@ -19,7 +19,7 @@ from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, known_warnings, source_of
-from hil.io.digest import file_digest
+from hil.io import file_digest
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay_compensation import rate_products

@@ -18,7 +18,7 @@ from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
 from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.identify.sources import Source, all_fitted
-from hil.io.digest import json_digest
+from hil.io import json_digest
 from hil.progress import Reporter, Silent, Task
 from hil.terminal_text import plural
 from identification import IdentificationError

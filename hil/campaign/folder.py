@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.header import REJECTED
 from hil.files import write_atomically
-from hil.io.digest import digest, file_digest, json_digest
+from hil.io import digest, file_digest, json_digest
 from hil.reading import is_no_file, json_of, lies_there, opened, text_of
 
 from . import folder_lock

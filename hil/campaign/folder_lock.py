@@ -6,8 +6,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from hil.io.lock import is_locked
-from hil.io.lock import locked as locked_file
+from hil.io import is_locked
+from hil.io import locked as locked_file
 
 from .errors import CampaignFolderError
 

@@ -301,17 +301,12 @@ def _robot(
     if cell is not None:
         return Robot.from_cell(cell, gravity=gravity, locked=locked, recorded=recorded)
     down = STANDARD_GRAVITY if gravity is None else gravity
-    if dh is not None:
-        return Robot.from_dh(
-            dh,
-            convention_of(convention),
-            friction=law,
-            gravity=down,
-            locked=locked,
-            recorded=recorded,
-        )
-    assert urdf is not None
-    return Robot.from_urdf(urdf, friction=law, gravity=down, locked=locked, recorded=recorded)
+    table = None if dh is None else convention_of(convention)
+    path = urdf or dh
+    assert path is not None
+    return Robot.from_urdf(
+        path, convention=table, friction=law, gravity=down, locked=locked, recorded=recorded
+    )
 
 
 def _positions(locked: list[str]) -> dict[str, float]:

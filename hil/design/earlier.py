@@ -24,7 +24,7 @@ from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.settings import samples_of
 from hil.identify.sources import cell_of, gather_sources
-from hil.io.digest import file_digest
+from hil.io import file_digest
 from hil.progress import Reporter
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor

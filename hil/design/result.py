@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import write_atomically
-from hil.io.digest import digest, json_digest
+from hil.io import digest, json_digest
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (

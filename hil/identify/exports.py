@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.io.digest import file_digest
+from hil.io import file_digest
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, ParamSpec, TypeVar
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, whosmat
 from scipy.io.matlab import varmats_from_mat
 
-from hil.archive.cdr import ENCAPSULATION, LayoutBuilder, LayoutError, MessageLayout
+from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
@@ -36,27 +36,7 @@ STAMP = "stamp"
 MOST_BYTES: Final = 4 << 30
 """Of messages that become arrays, all topics together."""
 
-_SIZES = {
-    "bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
-    "int32": 4, "uint32": 4, "float32": 4, "int64": 8, "uint64": 8, "float64": 8,
-}  # fmt: skip
-_FIELD = re.compile(r"(?P<type>[\w/]+)(?P<bound><=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<name>\w+)$")
-_CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
-_SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
-_LARGEST = 4096  # elements; what is larger is an image or a cloud of points
 _BATCH = 10_000  # messages
-_MOST_PLACES = 10_000  # in one message where a type is laid out
-_DEEPEST = 32  # types within types
-_LONGEST_COUNT = 9  # digits
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One line of a definition: `count` None for a single value, -1 for a sequence."""
-
-    kind: str
-    name: str
-    count: int | None
 
 
 class VaryingError(LayoutError):
@@ -175,124 +155,6 @@ def _stamps(columns: dict[str, NDArray[Any]], log_times: NDArray[np.int64]) -> N
     if seconds is None or rest is None or not (seconds.any() or rest.any()):
         return log_times
     return np.asarray(seconds.astype(np.int64) * 10**9 + rest)
-
-
-def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
-    """The layout of messages like this one, fields named by their paths.
-
-    Args:
-        kind: name of the type.
-        definition: its ros2msg text with all dependencies.
-        message: in plain little-endian CDR.
-
-    Raises:
-        LayoutError: the definition cannot be understood, or the message does not keep it.
-    """
-    if message[:4] != ENCAPSULATION:
-        raise LayoutError("its messages are not little-endian CDR")
-    walk = _Walk(_types(kind, definition), message)
-    walk.fields(_short(kind), "")
-    return walk.builder.build()
-
-
-class _Walk:
-    """Goes through one message along its definition, and lays out what it meets."""
-
-    def __init__(self, types: Mapping[str, tuple[_Field, ...]], message: bytes) -> None:
-        self.builder = LayoutBuilder()
-        self._types = types
-        self._message = message
-        self._places = 0
-
-    def fields(self, kind: str, path: str, depth: int = 0) -> None:
-        """Lay out the fields of a type; types may hold themselves, or nothing."""
-        if kind not in self._types:
-            raise LayoutError(f"its definition lacks {kind}")
-        self._places += 1
-        if depth > _DEEPEST or self._places > _MOST_PLACES:
-            raise LayoutError(f"its definition nests {kind} too deep or too often")
-        for one in self._types[kind]:
-            self._field(one, path + one.name, depth)
-
-    def _field(self, field: _Field, path: str, depth: int) -> None:
-        count = self._count() if field.count == -1 else field.count
-        if field.kind in _SIZES:
-            if count is not None and count > _LARGEST:
-                raise LayoutError(f"{path} has {count} elements")
-            if count != 0:
-                self._check_left(_SIZES[field.kind] * (count or 1))
-                self.builder.variable(path, field.kind, count)
-            return
-        for index in range(1 if count is None else count):
-            place = path if count is None else f"{path}/{index}"
-            if field.kind in ("string", "wstring"):
-                self._string(field.kind, place)
-            else:
-                self.fields(_short(field.kind), f"{place}/", depth + 1)
-
-    def _count(self) -> int:
-        count = self._number()
-        self.builder.count(count)
-        return count
-
-    def _string(self, kind: str, path: str) -> None:
-        if kind == "wstring":
-            raise LayoutError(f"{path} is a wstring")
-        length = self._number()
-        start = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4 + 4
-        text = self._message[start : start + length]
-        if len(text) < length or not text.endswith(b"\0"):
-            raise LayoutError(f"{path} does not fit into the message")
-        try:
-            self.builder.string(text[:-1].decode())
-        except UnicodeDecodeError as error:
-            raise LayoutError(f"{path} is not UTF-8") from error
-
-    def _number(self) -> int:
-        """The length that stands at the next place for one."""
-        at = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4
-        self._check_left(4)
-        return int.from_bytes(self._message[at : at + 4], "little")
-
-    def _check_left(self, size: int) -> None:
-        if self.builder.size + size > len(self._message):
-            raise LayoutError("its messages end before their last field")
-
-
-def _short(kind: str) -> str:
-    """``package/Type`` without ``msg``."""
-    return kind.replace("/msg/", "/")
-
-
-@lru_cache(maxsize=64)
-def _types(kind: str, definition: str) -> dict[str, tuple[_Field, ...]]:
-    """Fields by type, of a definition with its dependencies."""
-    own, *others = _SEPARATOR.split(definition)
-    package = _short(kind).partition("/")[0]
-    types = {_short(kind): tuple(_fields(own, package))}
-    for part in others:
-        head, _, text = part.partition("\n")
-        name = _short(head.removeprefix("MSG:").strip())
-        types[name] = tuple(_fields(text, name.partition("/")[0]))
-    return types
-
-
-def _fields(text: str, package: str) -> Iterator[_Field]:
-    for line in text.splitlines():
-        stated = line.partition("#")[0].strip()
-        if not stated or _CONSTANT.match(stated):
-            continue
-        # A default value may follow the name.
-        match = _FIELD.match(" ".join(stated.split()[:2]))
-        if match is None:
-            raise LayoutError(f"its definition has the line {stated!r}")
-        kind, count = match["type"], match["count"]
-        if kind in ("time", "duration"):
-            raise LayoutError("its definition is that of ROS 1")
-        if kind not in _SIZES and kind not in ("string", "wstring") and "/" not in kind:
-            kind = f"{package}/{kind}"
-        fixed = int(count[:_LONGEST_COUNT]) if count is not None and count.isdecimal() else -1
-        yield _Field(kind, match["name"], None if count is None else fixed)
 
 
 Array = NDArray[np.float64]

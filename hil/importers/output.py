@@ -14,7 +14,7 @@ from hil.archive import Samples, write_samples
 from hil.errors import SourceError
 from hil.importers.findings import clock_fault, examine
 from hil.importers.robot import Robot
-from hil.io.digest import file_digest
+from hil.io import file_digest
 
 Use = Literal["excitation", "validation", "standstill"]
 

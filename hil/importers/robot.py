@@ -51,6 +51,7 @@ class Robot:
         cls,
         path: str | PathLike[str],
         *,
+        convention: Convention | None = None,
         friction: FrictionLaw | None = None,
         gravity: Sequence[float] = STANDARD_GRAVITY,
         rotor_inertia: bool = True,
@@ -60,7 +61,9 @@ class Robot:
         """Describe a robot by its URDF and the settings of its model.
 
         Args:
-            path: the URDF file.
+            path: the URDF file, or a table of Denavit-Hartenberg parameters, which has no masses.
+            convention: of the rows of such a table, see :func:`hil.importers.dh.urdf_of_dh`; None
+                for a URDF.
             friction: friction law of every joint, None for `IMPORTED_LAW`.
             gravity: in the base frame [m/s²].
             rotor_inertia: give every joint a rotor inertia.
@@ -73,55 +76,7 @@ class Robot:
             InputError: the file cannot be read, is no usable URDF, or has no such joint.
         """
         path = Path(path)
-        try:
-            urdf = text_of(path)
-        except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            remedy = remedy_of(error, "name a URDF file")
-            raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
-        return cls._modelled(path, urdf, friction, gravity, rotor_inertia, locked, recorded)
-
-    @classmethod
-    def from_dh(
-        cls,
-        path: str | PathLike[str],
-        convention: Convention,
-        *,
-        friction: FrictionLaw | None = None,
-        gravity: Sequence[float] = STANDARD_GRAVITY,
-        rotor_inertia: bool = True,
-        locked: Mapping[str, float] | None = None,
-        recorded: Collection[str] | None = None,
-    ) -> Robot:
-        """Describe a robot by a table of Denavit-Hartenberg parameters alone: it has no masses.
-
-        Args:
-            path: of the table, see :func:`hil.importers.dh.urdf_of_dh`.
-            convention: of its rows.
-            friction: these and all others as for `from_urdf`.
-            gravity: in the frame before the first joint.
-            rotor_inertia: see there.
-            locked: see there.
-            recorded: see there.
-
-        Raises:
-            InputError: the file cannot be read, or is no such table.
-        """
-        path, urdf = Path(path), urdf_of_dh(path, convention)
-        return cls._modelled(path, urdf, friction, gravity, rotor_inertia, locked, recorded)
-
-    @classmethod
-    def _modelled(
-        cls,
-        path: Path,
-        urdf: str,
-        friction: FrictionLaw | None,
-        gravity: Sequence[float],
-        rotor_inertia: bool,
-        locked: Mapping[str, float] | None,
-        recorded: Collection[str] | None,
-    ) -> Robot:
-        """The robot of a description that was read from `path`."""
+        urdf = _urdf_text(path) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
         except ModelError as error:  # told of this file, and not of a cell that nobody wrote
@@ -185,6 +140,15 @@ class Robot:
     def attachments(self) -> dict[str, bytes]:
         """The texts as files of an archive."""
         return {"cell.toml": self.cell.encode(), "robot.urdf": self.urdf.encode()}
+
+
+def _urdf_text(path: Path) -> str:
+    try:
+        return text_of(path)
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        remedy = remedy_of(error, "name a URDF file")
+        raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
 
 
 def _cell_text(

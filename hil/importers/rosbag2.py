@@ -21,9 +21,10 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from hil.archive import Samples
+from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
 from hil.importers import mcap_messages
-from hil.importers.mcap_messages import JOINT_STATES, MOST_INFLATION, Topic
+from hil.importers.mcap_messages import JOINT_STATES, Topic
 from hil.importers.output import Use, write_imported
 from hil.importers.robot import NOT_RECORDED, Robot
 from hil.reading import opened

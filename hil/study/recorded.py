@@ -21,7 +21,7 @@ from hil.compare.trend import short_names
 from hil.errors import InputError
 from hil.identify.sources import cell_of
 from hil.identify.summary import planted_in
-from hil.io.digest import digest
+from hil.io import digest
 from hil.progress import Reporter
 from identification.excitation import Excitation
 

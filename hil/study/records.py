@@ -24,7 +24,7 @@ from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
-from hil.io.digest import json_digest
+from hil.io import json_digest
 from hil.progress import Reporter, Silent
 from hil.reading import text_of
 from hil.results import Frozen

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.design import preset
-from hil.io.digest import digest
+from hil.io import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from sim_fixtures.ns16 import CELL_PATH

@@ -15,20 +15,18 @@ from dataclasses import dataclass, field
 
 import lz4.frame
 import zstandard
+from mcap.records import Attachment, Chunk, Metadata
 
-from hil.archive import header
+from hil.archive import container, header
+from hil.archive.container import Damage, encoded
 from hil.archive.header import chunk_list
 from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_text import mutate_text
 from tests.hil.mcap_bytes import Indexed
+from tests.hil.mcap_bytes import record as record_of
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
-ATTACHMENT, METADATA, DATA_END = 0x09, 0x0C, 0x0F
-_HEAD = struct.Struct("<BQ")
-_CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQQ")
-_MOST_INSIDE = 1 << 20  # bytes of one chunk
+_PACKED = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 
 @dataclass
@@ -38,7 +36,7 @@ class Record:
     opcode: int
     body: bytes
     inside: list[Record] | None = None
-    compression: bytes = b""
+    compression: str = ""
     times: tuple[int, int] = field(default=(0, 0))
 
 
@@ -58,46 +56,34 @@ def mutate_mcap(data: bytes, most: int, seed: int) -> bytes:
 
 def taken_apart(data: bytes) -> list[Record] | None:
     """The records of the data section; None for bytes that are no MCAP at all."""
-    if not data.startswith(MAGIC):
+    if not data.startswith(container.MAGIC):
         return None
     records = []
-    for opcode, body in _split(data, len(MAGIC)):
-        if opcode in (DATA_END, FOOTER):
+    for opcode, body in _split(data[len(container.MAGIC) :]):
+        if opcode in (container.DATA_END, container.FOOTER):
             break
-        if opcode != MESSAGE_INDEX:
+        if opcode != container.MESSAGE_INDEX:
             records.append(_opened(opcode, body))
     return records
 
 
-def _split(data: bytes, at: int = 0) -> list[tuple[int, bytes]]:
-    found = []
-    while at + _HEAD.size <= len(data):
-        opcode, length = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
-        if length > len(data) - at:
-            break
-        found.append((opcode, data[at : at + length]))
-        at += length
+def _split(data: bytes) -> list[tuple[int, bytes]]:
+    """Opcodes and bodies, up to where the bytes are no record any more."""
+    found: list[tuple[int, bytes]] = []
+    with contextlib.suppress(Damage):
+        found.extend((record.opcode, record.body) for record in container.split(data, 0))
     return found
 
 
 def _opened(opcode: int, body: bytes) -> Record:
-    if opcode != CHUNK or len(body) < _CHUNK.size:
-        return Record(opcode, body)
-    start, end, _, _, length = _CHUNK.unpack_from(body)
-    compression = body[_CHUNK.size : _CHUNK.size + length]
-    packed = body[_CHUNK.size + length + 8 :]
-    try:
-        if compression == b"zstd":
-            plain = zstandard.ZstdDecompressor().decompress(packed, max_output_size=_MOST_INSIDE)
-        elif compression == b"lz4":
-            plain = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=_MOST_INSIDE)
-        else:
-            plain = packed
-    except (zstandard.ZstdError, RuntimeError, EOFError):
-        return Record(opcode, body)
-    inside = [Record(*piece) for piece in _split(plain)]
-    return Record(opcode, body, inside, compression, (start, end))
+    with contextlib.suppress(Damage):  # no chunk, or damaged beyond reading: as it is
+        if opcode == container.CHUNK:
+            head = container.chunk(container.Record(0, opcode, body, len(body)))
+            plain = container.decompressed(head, 0, zstandard.ZstdDecompressor())
+            inside = [Record(*piece) for piece in _split(plain)]
+            times = head.message_start_time, head.message_end_time
+            return Record(opcode, body, inside, head.compression, times)
+    return Record(opcode, body)
 
 
 def put_together(records: list[Record], *, index: bool) -> bytes:
@@ -110,26 +96,24 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
             one, {header.DESCRIPTION: described, header.CHUNKS: chunk_list(built.checksums)}
         )
         if index:
-            built.put(_HEAD.pack(one.opcode, len(body)) + body)
+            built.put(record_of(one.opcode, body))
             continue
-        if one.opcode == CHUNK and len(body) >= _CHUNK.size:
-            built.checksums.append(_CHUNK.unpack_from(body)[3])
-        file += _HEAD.pack(one.opcode, len(body)) + body
+        if one.opcode == container.CHUNK:
+            with contextlib.suppress(Damage):
+                head = container.chunk(container.Record(0, one.opcode, body, len(body)))
+                built.checksums.append(head.uncompressed_crc)
+        file += record_of(one.opcode, body)
     if index:
         return built.ended()
-    end = _HEAD.pack(DATA_END, 4) + bytes(4)
-    return bytes(file) + end + _HEAD.pack(FOOTER, 20) + bytes(20) + MAGIC
-
-
-def _joined(records: list[Record]) -> bytes:
-    return b"".join(_HEAD.pack(one.opcode, len(one.body)) + one.body for one in records)
+    end = record_of(container.DATA_END, bytes(4)) + record_of(container.FOOTER, bytes(20))
+    return bytes(file) + end + container.MAGIC
 
 
 def _described(records: list[Record]) -> str:
     """The checksum of the description, which the outcome repeats."""
     for one in records:
-        with contextlib.suppress(Exception):  # damaged beyond reading: nothing to repeat
-            name, entries = _entries(one.body) if one.opcode == METADATA else ("", {})
+        with contextlib.suppress(Damage):  # damaged beyond reading: nothing to repeat
+            name, entries = _entries(one) if one.opcode == container.METADATA else ("", {})
             if name == header.METADATA:
                 entries.pop("checksum", None)
                 return header.checksum(entries)
@@ -139,46 +123,27 @@ def _described(records: list[Record]) -> str:
 def _sealed(one: Record, seals: dict[str, str]) -> bytes:
     """The body with the checksums that fit it, and entries of the outcome that fit the rest."""
     if one.inside is not None:
-        plain = _joined(one.inside)
-        pack = {b"zstd": zstandard.ZstdCompressor().compress, b"lz4": lz4.frame.compress}
-        packed: bytes = pack.get(one.compression, bytes)(plain)
-        head = _CHUNK.pack(*one.times, len(plain), zlib.crc32(plain), len(one.compression))
-        return head + one.compression + struct.pack("<Q", len(packed)) + packed
-    if one.opcode == ATTACHMENT and len(one.body) > 4:
+        plain = b"".join(record_of(each.opcode, each.body) for each in one.inside)
+        packed = _PACKED.get(one.compression, bytes)(plain)
+        start, end = one.times
+        return _body(Chunk(one.compression, packed, end, start, zlib.crc32(plain), len(plain)))
+    if one.opcode == container.ATTACHMENT and len(one.body) > 4:
         return one.body[:-4] + zlib.crc32(one.body[:-4]).to_bytes(4, "little")
-    if one.opcode == METADATA:
-        with contextlib.suppress(Exception):  # damaged beyond reading: as it is
-            name, entries = _entries(one.body)
+    if one.opcode == container.METADATA:
+        with contextlib.suppress(Damage):  # damaged beyond reading: as it is
+            name, entries = _entries(one)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
-                return _metadata(name, {**entries, "checksum": header.checksum(entries)})
+                return _body(Metadata(name, header.sealed(entries)))
     return one.body
 
 
-def _entries(body: bytes) -> tuple[str, dict[str, str]]:
-    name, at = _text(body, 0)
-    (length,) = struct.unpack_from("<I", body, at)
-    at, end = at + 4, at + 4 + length
-    entries = {}
-    while at < end:
-        key, at = _text(body, at)
-        entries[key], at = _text(body, at)
-    return name, entries
+def _body(record: Attachment | Chunk | Metadata) -> bytes:
+    return encoded(record)[container.RECORD.size :]
 
 
-def _text(body: bytes, at: int) -> tuple[str, int]:
-    (length,) = struct.unpack_from("<I", body, at)
-    return body[at + 4 : at + 4 + length].decode(), at + 4 + length
-
-
-def _string(text: str) -> bytes:
-    data = text.encode("utf-8", "surrogateescape")
-    return struct.pack("<I", len(data)) + data
-
-
-def _metadata(name: str, entries: dict[str, str]) -> bytes:
-    pairs = b"".join(_string(key) + _string(value) for key, value in entries.items())
-    return _string(name) + struct.pack("<I", len(pairs)) + pairs
+def _entries(one: Record) -> tuple[str, dict[str, str]]:
+    return container.metadata(container.Record(0, one.opcode, one.body, len(one.body)))
 
 
 def _change(records: list[Record], rng: random.Random) -> None:
@@ -190,17 +155,17 @@ def _change(records: list[Record], rng: random.Random) -> None:
         if rng.random() < 0.15:
             one.times = (rng.choice((0, *one.times, 1 << 63)), rng.choice((*one.times, 0)))
         elif rng.random() < 0.2:
-            one.compression = rng.choice((b"", b"zstd", b"lz4", b"gzip"))
+            one.compression = rng.choice(("", "zstd", "lz4", "gzip"))
         elif rng.random() < 0.25:
             _shuffled(one.inside, rng)
         else:
             for message in rng.sample(one.inside, min(len(one.inside), rng.choice((1, 1, 3, 50)))):
                 _of_a_message(message, rng)
-    elif one.opcode == METADATA:
+    elif one.opcode == container.METADATA:
         _of_metadata(one, rng)
-    elif one.opcode == ATTACHMENT:
+    elif one.opcode == container.ATTACHMENT:
         _of_an_attachment(one, rng)
-    elif one.opcode in (SCHEMA, CHANNEL) and rng.random() < 0.7:
+    elif one.opcode in (container.SCHEMA, container.CHANNEL) and rng.random() < 0.7:
         words = mutate_text(one.body[4:], len(one.body) + 200, rng.getrandbits(32))
         one.body = one.body[:4] + words
     else:
@@ -226,7 +191,7 @@ def _shuffled(records: list[Record], rng: random.Random) -> None:
 
 
 def _of_a_message(message: Record, rng: random.Random) -> None:
-    if message.opcode != MESSAGE or len(message.body) < _MESSAGE.size:
+    if message.opcode != container.MESSAGE or len(message.body) < _MESSAGE.size:
         message.body = mutate_bytes(message.body, len(message.body) + 64, rng.getrandbits(32))
         return
     head = list(_MESSAGE.unpack_from(message.body))
@@ -251,32 +216,28 @@ def _of_a_message(message: Record, rng: random.Random) -> None:
 
 def _of_metadata(one: Record, rng: random.Random) -> None:
     try:
-        name, entries = _entries(one.body)
-    except (struct.error, UnicodeDecodeError):
+        name, entries = _entries(one)
+    except Damage:
         one.body = mutate_bytes(one.body, len(one.body) + 64, rng.getrandbits(32))
         return
     key = rng.choice([*entries, "period", "joint_names", "kind"])
-    kind = rng.random()
-    if kind < 0.2:
+    if rng.random() < 0.2:
         entries.pop(key, None)
     else:
-        old = entries.get(key, "").encode("utf-8", "surrogateescape")
-        changed = mutate_text(old or b"0", 6000, rng.getrandbits(32))
+        changed = mutate_text(entries.get(key, "").encode() or b"0", 6000, rng.getrandbits(32))
         entries[key] = changed.decode("utf-8", "replace")
-    one.body = _metadata(name, entries)
+    one.body = _body(Metadata(name, entries))
 
 
 def _of_an_attachment(one: Record, rng: random.Random) -> None:
     try:
-        name, at = _text(one.body, 16)
-        kind, at = _text(one.body, at)
-    except (struct.error, UnicodeDecodeError):
+        found = container.parsed(Attachment, one.body, 0)
+    except Damage:
         return
-    data = one.body[at + 8 : -4]
     if rng.random() < 0.1:
-        name = rng.choice(("../../x", "/dev/zero", "", "plan.json", "cell.toml", "init_packet.bin"))
+        names = ("../../x", "/dev/zero", "", "plan.json", "cell.toml", "init_packet.bin")
+        found.name = rng.choice(names)
     else:
-        change = mutate_bytes if name.endswith(".bin") else mutate_text
-        data = change(data, len(data) + 500, rng.getrandbits(32))
-    head = one.body[:16] + _string(name) + _string(kind)
-    one.body = head + struct.pack("<Q", len(data)) + data + bytes(4)
+        change = mutate_bytes if found.name.endswith(".bin") else mutate_text
+        found.data = change(found.data, len(found.data) + 500, rng.getrandbits(32))
+    one.body = _body(found)

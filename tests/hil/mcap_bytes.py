@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import zstandard
@@ -58,7 +59,21 @@ def heads(chunk: bytes) -> Iterator[Head]:
             yield Head(channel, sequence, log_time, item.offset, start + head.size)
 
 
-COPIED = (container.METADATA, container.ATTACHMENT, container.SCHEMA, container.CHANNEL)
+def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
+    """A copy with other words, of the same length, in an attachment; its checksum is right."""
+    assert len(old.encode()) == len(new.encode())
+    data, changed = bytearray(source.read_bytes()), 0
+    with source.open("rb") as stream:
+        for one in container.records(stream, len(data)):
+            if one.opcode == container.ATTACHMENT and old.encode() in one.body:
+                content = one.body[:-4].replace(old.encode(), new.encode())
+                begin = one.offset + container.RECORD.size
+                data[begin : one.end] = content + zlib.crc32(content).to_bytes(4, "little")
+                changed += 1
+    assert changed == 1
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_bytes(data)
+    return target
 
 
 class Indexed:

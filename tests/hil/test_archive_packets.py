@@ -175,25 +175,6 @@ def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
     assert open_archive(repaired.output).complete
 
 
-def test_flipped_bits_give_no_wrong_packet_and_no_foreign_error(tmp_path: Path, cell: Cell) -> None:
-    path = recorded(tmp_path, keeping_packets(cell), duration=0.15)
-    whole, expected = path.read_bytes(), packets_of(path)
-    random = np.random.default_rng(8)
-    damaged = tmp_path / "validation_000_a1.mcap"
-    for place in random.integers(0, 8 * len(whole), 400).tolist():
-        data = bytearray(whole)
-        data[place // 8] ^= 1 << place % 8
-        damaged.write_bytes(data)
-        try:
-            columns = open_archive(damaged, topics=[PACKETS]).columns
-        except ArchiveError:
-            continue
-        if "data" not in columns:
-            continue
-        found = [d[:n].tobytes() for d, n in zip(columns["data"], columns["length"], strict=True)]
-        assert found == [packet[3] for packet in expected][: len(found)], place
-
-
 def test_a_ring_says_how_many_packets_were_overwritten_and_keeps_the_newest() -> None:
     ring = PacketRing(4)
     for number in range(10):

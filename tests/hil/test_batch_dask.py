@@ -8,12 +8,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from functools import reduce
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hil.archive import container
 from hil.batch import cluster as dask_cluster
@@ -30,11 +27,9 @@ from hil.batch.cluster import (
 from hil.batch.run import reduced
 from hil.batch.types import BatchResult, Broken
 from hil.batch.workers import (
-    FAN_IN,
     LocalWorkers,
     Summed,
     Workers,
-    sum_run,
     sum_tree,
 )
 from hil.campaign import Campaign
@@ -79,22 +74,6 @@ def pair(cluster: Cluster) -> Cluster:
 
 def connected(cluster: Cluster, timeout: float = PATIENCE, patience: float = PATIENCE):
     return DaskWorkers(cluster.address, identity=work.identity, timeout=timeout, patience=patience)
-
-
-# The order of a sum
-
-
-@given(st.lists(st.one_of(st.none(), st.text(max_size=2)), max_size=200))
-def test_a_tree_adds_what_is_there_from_first_to_last(terms: list[str | None]) -> None:
-    present = [term for term in terms if term is not None]
-    assert sum_tree(terms, str.__add__) == (reduce(str.__add__, present) if present else None)
-
-
-@given(st.lists(st.floats(-1e10, 1e10), min_size=1, max_size=300))
-def test_a_run_may_be_added_apart_without_a_difference(terms: list[float]) -> None:
-    runs = [terms[k : k + FAN_IN] for k in range(0, len(terms), FAN_IN)]
-    whole = sum_tree(terms, float.__add__)
-    assert sum_tree([sum_run(run, float.__add__) for run in runs], float.__add__) == whole
 
 
 # What a cluster computes

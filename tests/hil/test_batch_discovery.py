@@ -31,9 +31,9 @@ from hil.identify.settings import Settings
 from hil.progress import Silent
 from identification.signals.samples import Preprocessing
 
-from .archive_edits import with_attachment
 from .batch_workers import Here
 from .conftest import small
+from .mcap_bytes import with_attachment
 
 SETTINGS = Settings(Preprocessing())
 PAYLOAD = "[robot.payload]\nmass = 3.0\ncentre = [0.02, 0.0, 0.08]\n\n[robot.friction]"

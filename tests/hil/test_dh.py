@@ -123,7 +123,7 @@ class TestKinematics:
 
     def test_nothing_is_known_of_masses_and_limits(self, tmp_path: Path) -> None:
         """So that no nominal model is made of what nobody said."""
-        robot = Robot.from_dh(table(tmp_path / "dh.csv", written(MIXED)), "standard")
+        robot = Robot.from_urdf(table(tmp_path / "dh.csv", written(MIXED)), convention="standard")
         cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
         assert robot.joint_names == ("turn", "slide", "elbow", "wrist")
         assert not cell.model.nominal.any()

@@ -13,70 +13,17 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.cli import app
 from hil.errors import InputError, SourceError
-from hil.importers import ColumnMap, Robot, import_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, state
 
 URDF = Path(__file__).parents[1] / "identification" / "two_link.urdf"
 
 
-def write_log(path: Path, header: str, columns: int, before: str = "") -> Path:
+def write_log(path: Path, header: str, columns: int) -> Path:
     time = np.arange(200) / 100.0
     rows = np.column_stack([time, *(np.sin(time * (k + 1)) for k in range(columns))])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
-    path.write_text("\n".join([*([before] if before else []), header, *lines]))
+    path.write_text("\n".join([header, *lines]))
     return path
-
-
-def column_map(**entries: object) -> ColumnMap:
-    return ColumnMap.model_validate({"time": {"column": "t"}, **entries})
-
-
-def test_a_pattern_counts_from_zero_where_the_log_does(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", "t,q_0,q_1,tau_0,tau_1", 4)
-    both = column_map(position={"columns": "q_{}"}, torque={"columns": "tau_{}"})
-    named = column_map(position={"columns": ["q_0", "q_1"]}, torque={"columns": ["tau_0", "tau_1"]})
-    robot = Robot.from_urdf(URDF)
-
-    found = import_log(log, tmp_path / "a.mcap", robot=robot, columns=both)
-    expected = import_log(log, tmp_path / "b.mcap", robot=robot, columns=named)
-
-    assert found.read_bytes() == expected.read_bytes()
-
-
-def test_a_joint_that_was_not_recorded_is_named_with_the_way_out(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", "t,q1,tau1", 2)
-    columns = column_map(position={"columns": "q{}"}, torque={"columns": "tau{}"})
-
-    with pytest.raises(SourceError, match=r"'q2' for \w+, joint 2 of 2.*--lock-others"):
-        import_log(log, tmp_path / "a.mcap", robot=Robot.from_urdf(URDF), columns=columns)
-
-
-def test_an_empty_line_of_a_header_leads_to_skip_rows(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", "t,q1,q2,tau1,tau2", 4, before="robot log\n\nrun 3")
-    columns = column_map(position={"columns": "q{}"}, torque={"columns": "tau{}"})
-
-    with pytest.raises(SourceError, match="skip_rows"):
-        import_log(log, tmp_path / "a.mcap", robot=Robot.from_urdf(URDF), columns=columns)
-
-
-@pytest.mark.parametrize(
-    ("entries", "words"),
-    [
-        ({"position": {"columns": "q{}", "scale": 0.0}}, "position.scale"),
-        (
-            {
-                "position": {"columns": "q{}"},
-                "drive": {"gear_ratio": [1.0, 1.0], "coupling": [[2, 2, 1.0]]},
-            },
-            "another joint",
-        ),
-    ],
-)
-def test_a_map_that_loses_or_doubles_a_joint_is_refused(
-    entries: dict[str, object], words: str
-) -> None:
-    with pytest.raises(ValueError, match=words):
-        column_map(**entries)
 
 
 @pytest.mark.parametrize(

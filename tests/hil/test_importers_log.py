@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.column_map import UNITS
 from hil.recordings import open_recording
-from tests.hil.three_joints import JOINTS, three_joint_robot
+from tests.hil.three_joints import imported, three_joint_robot
 
 
 @pytest.fixture
@@ -38,69 +39,55 @@ HEADER = "t,q1,q2,q3,tau1,tau2,tau3"
 VALUES[:, 0] = 0.01 * np.arange(20)
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return log(tmp_path / "a.csv", VALUES, HEADER)
+
+
+def read(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:
+    return imported(source, robot, **{"position": {"columns": "q{}"}, **entries})
+
+
 class TestColumns:
     @pytest.mark.parametrize("position", ["q{}", ("q1", "q2", "q3"), (1, 2, 3), ("q1", 2, "q3")])
-    def test_by_pattern_name_and_index(self, tmp_path, robot, position):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
-        columns = column_map(position={"columns": position}, torque={"columns": "tau{}"})
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        recording = open_recording(path)
-        assert recording.joint_names == JOINTS
-        assert np.array_equal(recording.position, VALUES[:, 1:4])
-        assert recording.torque is not None
-        assert np.array_equal(recording.torque, VALUES[:, 4:])
-        assert recording.motor_current is None
-
-    @pytest.mark.parametrize("delimiter", [",", ";", "\t", "|", " ", ", "])
-    def test_the_delimiter_is_found_out(self, tmp_path, robot, delimiter):
-        header = HEADER.replace(",", delimiter)
-        file = log(tmp_path / "a.txt", VALUES, header, delimiter)
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
-
-    def test_a_file_without_header_is_read_by_index(self, tmp_path, robot):
-        file = log(tmp_path / "a.txt", VALUES)
-        columns = column_map(position={"columns": (4, 5, 6)})
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, 4:])
+    def test_by_pattern_name_and_index(self, file, robot, position):
+        found = read(file, robot, position={"columns": position}, torque={"columns": "tau{}"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+        assert np.array_equal(found["torque"], VALUES[:, 4:])
+        assert "motor_current" not in found
 
     def test_comments_and_quotes_before_the_data(self, tmp_path, robot):
         header = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
-        file = log(tmp_path / "a.txt", VALUES, header)
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
-
-    def test_a_decimal_comma(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER.replace(",", ";"), ";")
-        file.write_text(file.read_text().replace(".", ","))
-        columns = column_map(format={"decimal": ","})
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+        found = read(log(tmp_path / "a.txt", VALUES, header), robot)
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
 
     def test_joints_in_another_order(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
-        columns = column_map(joints=("ankle", "hip", "knee"))
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, [2, 3, 1]])
+        """Velocities too."""
+        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3,v1,v2,v3")
+        velocity = {"columns": "v{}", "unit": "deg/s"}
+        found = read(file, robot, velocity=velocity, joints=("ankle", "hip", "knee"))
+        assert np.array_equal(found["position"], VALUES[:, [2, 3, 1]])
+        assert found["velocity"] == pytest.approx(np.radians(VALUES[:, [5, 6, 4]]), rel=1e-15)
 
 
 class TestTime:
-    def test_a_sample_rate_counts_samples(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
+    def test_a_sample_rate_counts_samples(self, file, robot):
         columns = column_map(sample_rate=3000.0)
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+        path = import_log(file, file.with_suffix(".mcap"), robot=robot, columns=columns)
         assert np.array_equal(open_recording(path).time, np.arange(20) * (1 / 3000.0))
 
     @pytest.mark.parametrize(
         ("unit", "times", "expected"),
         [
-            ("s", ["1700000000.123456789", "1700000000.123556790"], [1e9 * 0 + 0, 100001]),
+            ("s", ["1700000000.123456789", "1700000000.123556790"], [0, 100001]),
             ("ms", ["0", "0.5"], [0, 500_000]),
             ("us", ["1e6", "1000001"], [0, 1000]),
             ("ns", ["1700000000123456789", "1700000000123456791"], [0, 2]),
             ("s", ["-0.025", "0.05"], [0, 75_000_000]),
+            ("s", ["0", "0.01", "0.013", "0.5", "0.5001"],
+             [0, 10_000_000, 13_000_000, 500_000_000, 500_100_000]),
         ],
-    )
+    )  # fmt: skip
     def test_a_time_column_is_exact_to_the_nanosecond(self, tmp_path, robot, unit, times, expected):
         lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
         (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
@@ -112,83 +99,63 @@ class TestTime:
             [1e-9 * value for value in expected], abs=1e-16
         )
 
-    def test_irregular_steps_are_kept(self, tmp_path, robot):
-        steps = np.cumsum([0.0, 0.01, 0.013, 0.5, 0.0001])
-        values = VALUES[:5].copy()
-        values[:, 0] = steps
-        file = log(tmp_path / "a.csv", values, HEADER)
-        columns = column_map(time={"column": 0}, sample_rate=None)
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        assert open_recording(path).time == pytest.approx(steps, abs=1e-9)
-
 
 class TestUnitsAndGears:
-    def test_units_are_converted_to_si(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
-        columns = column_map(
+    def test_units_are_converted_to_si(self, file, robot):
+        found = read(
+            file,
+            robot,
             position={"columns": "q{}", "unit": "deg", "scale": (1, -1, 2)},
             motor_current={"columns": "tau{}", "unit": "mA"},
         )
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        recording = open_recording(path)
         expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
-        assert recording.position == pytest.approx(expected, rel=1e-15)
-        assert recording.motor_current == pytest.approx(VALUES[:, 4:] / 1000)
-        assert recording.torque is None
-
-    def test_a_speed_in_rpm(self):
+        assert found["position"] == pytest.approx(expected, rel=1e-15)
+        assert found["motor_current"] == pytest.approx(VALUES[:, 4:] / 1000)
+        assert "torque" not in found
         assert 3000 * UNITS["velocity"]["rpm"] == pytest.approx(2 * np.pi * 50)
 
     def test_motor_side_goes_to_joint_side_with_power_preserved(self, tmp_path, robot):
         """Made from joint values by an independent way: ratio by ratio, coupling by hand."""
         q, qd, tau_motor = np.random.default_rng(8).normal(size=(3, 30, 3))
         n1, n2, n3, n32 = 100.0, -80.0, 50.0, 25.0
-        ratios = np.array([n1, n2, n3])
 
         def motor(x):
             return np.column_stack([n1 * x[:, 0], n2 * x[:, 1], n3 * x[:, 2] + n32 * x[:, 1]])
 
-        file = log(tmp_path / "m.csv", np.hstack([motor(q), motor(qd), tau_motor]))
-        columns = column_map(
+        back = read(
+            log(tmp_path / "m.csv", np.hstack([motor(q), motor(qd), tau_motor])),
+            robot,
             position={"columns": (0, 1, 2), "side": "motor"},
             velocity={"columns": (3, 4, 5), "side": "motor"},
             torque={"columns": (6, 7, 8), "side": "motor"},
             drive={
-                "gear_ratio": tuple(ratios),
+                "gear_ratio": (n1, n2, n3),
                 "coupling": ((3, 2, n32),),
                 "joint_offset": (0.5, 0.0, -0.5),
             },
         )
-        path = import_log(file, tmp_path / "m.mcap", robot=robot, columns=columns)
-        back = open_archive(path).columns
         assert back["position"] == pytest.approx(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
         assert back["velocity"] == pytest.approx(qd, rel=1e-12)
         power_motors = np.sum(tau_motor * motor(qd), axis=1)
         assert np.sum(back["torque"] * qd, axis=1) == pytest.approx(power_motors, rel=1e-9)
         assert back["torque"][:, 1] == pytest.approx(n2 * tau_motor[:, 1] + n32 * tau_motor[:, 2])
 
-    def test_torque_constants_make_torques_of_currents(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
-        columns = column_map(
-            motor_current={"columns": "tau{}"},
-            drive={"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)},
-        )
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        recording = open_recording(path)
-        assert recording.motor_current is not None
-        assert np.array_equal(recording.motor_current, VALUES[:, 4:])
-        assert recording.torque == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
+    def test_torque_constants_make_torques_of_currents(self, file, robot):
+        drive = {"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)}
+        found = read(file, robot, motor_current={"columns": "tau{}"}, drive=drive)
+        assert np.array_equal(found["motor_current"], VALUES[:, 4:])
+        assert found["torque"] == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
 
-    def test_gears_follow_the_joints_of_the_log(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
-        columns = column_map(
+    def test_gears_follow_the_joints_of_the_log(self, file, robot):
+        found = read(
+            file,
+            robot,
             position={"columns": "q{}", "side": "motor"},
             joints=("ankle", "hip", "knee"),
             drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
         )
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
         expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
-        assert open_recording(path).position == pytest.approx(expected)
+        assert found["position"] == pytest.approx(expected)
 
 
 class TestBadInput:
@@ -197,7 +164,7 @@ class TestBadInput:
         [
             (
                 {"position": {"columns": "pos{}"}},
-                "no column 'pos1' for hip.*its columns are t, q1, q2",
+                "no column 'pos1' for hip, joint 1 of 3.*--lock-others.*its columns are t, q1, q2",
             ),
             ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
             ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
@@ -210,12 +177,11 @@ class TestBadInput:
         ],
     )
     def test_a_map_that_does_not_fit_is_refused_with_what_would(
-        self, tmp_path, robot, entries, sentence
+        self, file, robot, entries, sentence
     ):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
         with pytest.raises(SourceError, match=sentence):
-            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map(**entries))
-        assert not (tmp_path / "a.mcap").exists()
+            read(file, robot, **entries)
+        assert not file.with_suffix(".mcap").exists()
 
     @pytest.mark.parametrize(
         ("line", "sentence"),
@@ -228,38 +194,34 @@ class TestBadInput:
         ],
     )
     def test_a_cell_that_is_no_number_is_named_by_line_and_column(
-        self, tmp_path, robot, line, sentence
+        self, file, robot, line, sentence
     ):
-        file = log(tmp_path / "a.csv", VALUES, HEADER)
         lines = file.read_text().splitlines()
         file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
         with pytest.raises(SourceError, match=sentence):
-            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+            read(file, robot)
 
     @pytest.mark.parametrize("time", ["", "soon", "nan", "inf"])
     def test_a_time_that_is_no_number_is_named(self, tmp_path, robot, time):
         (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
-        columns = column_map(time={"column": "t"}, sample_rate=None)
         with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
-            import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+            read(tmp_path / "a.csv", robot, time={"column": "t"}, sample_rate=None)
 
     def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
         """Which of the numbers have no name cannot be known: the first, as pandas writes them?"""
         file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3")
         with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; give the others"):
-            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+            read(file, robot)
 
-    def test_files_of_different_length_are_refused(self, tmp_path, robot):
-        file = log(tmp_path / "q.csv", VALUES, HEADER)
+    def test_files_of_different_length_are_refused(self, tmp_path, file, robot):
         log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
-        columns = column_map(torque={"columns": "tau{}", "file": "tau.csv"})
         with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
-            import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
+            read(file, robot, torque={"columns": "tau{}", "file": "tau.csv"})
 
     def test_a_file_without_numbers_is_refused(self, tmp_path, robot):
         (tmp_path / "a.csv").write_text("t,q1\n")
         with pytest.raises(SourceError, match="has no row of numbers"):
-            import_log(tmp_path / "a.csv", tmp_path / "x.mcap", robot=robot, columns=column_map())
+            read(tmp_path / "a.csv", robot)
 
 
 QUANTITIES = {
@@ -292,27 +254,22 @@ class TestFilePerJoint:
         assert "q_2.txt" in archive.header.entries["source"]
 
     def test_a_list_names_them_in_any_order(self, folder, robot):
-        columns = column_map(
-            position={"files": ("q_3.txt", "q_1.txt", "q_2.txt"), "columns": (1,)},
-            joints=("ankle", "hip", "knee"),
-        )
-        path = import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+        position = {"files": ("q_3.txt", "q_1.txt", "q_2.txt"), "columns": (1,)}
+        found = read(folder, robot, position=position, joints=("ankle", "hip", "knee"))
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
 
     def test_each_may_call_its_column_by_the_joint(self, folder, robot):
         for joint in range(3):
             header = f"t,angle{joint + 1}"
             log(folder / f"{joint + 1}.csv", VALUES[:, [0, joint + 1]], header)
-        columns = column_map(position={"files": "{}.csv", "columns": "angle{}"})
-        path = import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+        found = read(folder, robot, position={"files": "{}.csv", "columns": "angle{}"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
 
     def test_arrays_have_a_file_each_as_well(self, folder, robot):
         for joint in range(3):
             np.save(folder / f"q{joint + 1}.npy", VALUES[:, joint + 1])
-        columns = column_map(position={"files": "q{}.npy"})
-        path = import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).position, VALUES[:, 1:4])
+        found = read(folder, robot, position={"files": "q{}.npy"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
 
     def test_the_time_stands_in_each_of_them_or_in_its_own(self, folder, robot):
         for time in ({"column": 0}, {"file": "t.txt"}):
@@ -323,9 +280,8 @@ class TestFilePerJoint:
 
     def test_joints_with_clocks_of_their_own_are_refused(self, folder, robot):
         np.savetxt(folder / "q_2.txt", VALUES[:, [0, 2]] + [0.001, 0.0])
-        columns = column_map(**QUANTITIES, time={"column": 0}, sample_rate=None)
         with pytest.raises(SourceError, match=r"q_2\.txt: time: has other times than q_1\.txt"):
-            import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
+            read(folder, robot, **QUANTITIES, time={"column": 0}, sample_rate=None)
 
     @pytest.mark.parametrize(
         ("position", "sentence"),
@@ -342,8 +298,7 @@ class TestFilePerJoint:
     def test_what_does_not_fit_is_named(self, folder, robot, position, sentence):
         np.savetxt(folder / "short.dat", VALUES[:5, 4])
         with pytest.raises(SourceError, match=sentence):
-            columns = column_map(position=position)
-            import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
+            read(folder, robot, position=position)
 
     @pytest.mark.parametrize(
         ("position", "sentence"),
@@ -368,46 +323,31 @@ class TestMoreColumnsThanJoints:
         file = log(tmp_path / "a.csv", self.WIDE, header)
         expected = rf"5 columns are called 'q{{}}' \(q{first} to q{first + 4}\).* 3 joints: hip"
         with pytest.raises(SourceError, match=f"position.columns: {expected}.*joints.*list of 3"):
-            import_log(file, tmp_path / "a.mcap", robot=robot, columns=column_map())
+            read(file, robot)
 
     def test_so_are_files_and_arrays(self, tmp_path, robot):
         np.savez(tmp_path / "a.npz", **{f"q{k}": self.WIDE[:, k] for k in range(4)})
         with pytest.raises(SourceError, match=r"4 columns are called 'q\{\}' \(q0 to q3\)"):
-            import_log(tmp_path / "a.npz", tmp_path / "a.mcap", robot=robot, columns=column_map())
+            read(tmp_path / "a.npz", robot)
         for k in range(4):
             np.savetxt(tmp_path / f"q{k}.txt", self.WIDE[:, k])
         with pytest.raises(SourceError, match=r"4 files are called 'q\{\}.txt'"):
-            columns = column_map(position={"files": "q{}.txt"})
-            import_log(tmp_path, tmp_path / "a.mcap", robot=robot, columns=columns)
+            read(tmp_path, robot, position={"files": "q{}.txt"})
 
     def test_the_map_may_name_all_joints_or_the_columns(self, tmp_path, robot):
         file = log(tmp_path / "a.csv", self.WIDE, "q1,q2,q3,q4,q5")
         ways = [
-            (column_map(joints=("ext", "ankle", "knee", "hip", "ext_2")), [3, 2, 1]),
-            (column_map(position={"columns": ("q2", "q3", "q5")}), [1, 2, 4]),
+            ({"joints": ("ext", "ankle", "knee", "hip", "ext_2")}, [3, 2, 1]),
+            ({"position": {"columns": ("q2", "q3", "q5")}}, [1, 2, 4]),
         ]
-        for columns, expected in ways:
-            path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-            assert np.array_equal(open_recording(path).position, self.WIDE[:, expected])
-            path.unlink()
+        for entries, expected in ways:
+            assert np.array_equal(read(file, robot, **entries)["position"], self.WIDE[:, expected])
+            file.with_suffix(".mcap").unlink()
 
-    def test_arrays_count_from_zero_where_they_do(self, tmp_path, robot):
+    def test_logs_count_from_zero_where_they_do(self, tmp_path, robot):
         np.savez(tmp_path / "a.npz", **{f"q{k}": self.WIDE[:, k] for k in range(3)})
-        path = import_log(
-            tmp_path / "a.npz", tmp_path / "a.mcap", robot=robot, columns=column_map()
-        )
-        assert np.array_equal(open_recording(path).position, self.WIDE[:, :3])
-
-
-class TestVelocity:
-    def test_reaches_the_archive_in_the_order_of_the_joints(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3,v1,v2,v3")
-        columns = column_map(
-            velocity={"columns": "v{}", "unit": "deg/s"}, joints=("ankle", "hip", "knee")
-        )
-        path = import_log(file, tmp_path / "a.mcap", robot=robot, columns=columns)
-        expected = np.radians(VALUES[:, [5, 6, 4]])
-        assert open_archive(path).columns["velocity"] == pytest.approx(expected, rel=1e-15)
+        for source in (tmp_path / "a.npz", log(tmp_path / "b.csv", self.WIDE[:, :3], "q0,q1,q2")):
+            assert np.array_equal(read(source, robot)["position"], self.WIDE[:, :3])
 
 
 class TestMapFile:
@@ -440,6 +380,12 @@ class TestMapFile:
             ("sample_rate = 5\nposition = 3\n", "position: must be a table"),
             ("sample_rate = 5\n[position]\nfiles = 3\n", "position.files: must be a name with"),
             ("sample_rate = \n", "cannot be read"),
+            ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nscale = 0.0\n", "position.scale"),
+            (
+                "sample_rate = 5\n[position]\ncolumns = 'q{}'\n"
+                "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n",
+                "another joint",
+            ),
         ],
     )
     def test_a_bad_one_is_refused_by_field(self, tmp_path, text, sentence):

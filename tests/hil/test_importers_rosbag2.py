@@ -1,21 +1,29 @@
-"""rosbag2 recordings become archives: joints by name, stamps to the nanosecond, clear refusals."""
+"""rosbag2 recordings and other people's MCAP files become archives: joint states of ROS 2 by their
+names, stamps to the nanosecond; other messages by a column map; clear refusals."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
+import zstandard
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from typer.testing import CliRunner
 
-from hil.archive import open_archive
+from hil.archive import Archive, open_archive
 from hil.cell import Cell
+from hil.cli import app
 from hil.errors import InputError, SourceError
-from hil.importers import Robot, import_rosbag2, recorded_joints
+from hil.importers import ColumnMap, Robot, import_log, import_rosbag2, recorded_joints
+from hil.importers.arrays import read_mcap
 from hil.recordings import open_recording
 from identification import FrictionLaw
 from identification.signals.recording import RecordingError
@@ -31,6 +39,34 @@ URDF = """<robot name="two"><link name="base"/>
 <limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
 <joint name="ankle" type="revolute"><parent link="upper"/><child link="lower"/><axis xyz="0 1 0"/>
 <origin xyz="0 0 0.4"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint></robot>"""
+
+COUNT = 300
+EPOCH = 1_700_000_000_000_000_000
+STAMPS = EPOCH + 8_000_000 * np.arange(COUNT)
+RANDOM = np.random.default_rng(11)
+POSITION, VELOCITY, EFFORT = RANDOM.normal(size=(3, COUNT, 2))
+DRIVES = """\
+# What a vendor's driver says of each drive.
+std_msgs/Header header
+uint8 OK = 0
+bool enabled
+Drive[2] drives
+float32[] temperature
+string firmware
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: vendor_msgs/Drive
+int8 mode
+float64 angle  # deg, motor side
+float64 current
+"""
 
 
 @pytest.fixture
@@ -86,6 +122,21 @@ def states(count: int = 5, **changes: Any) -> list[tuple[int, bytes]]:
         state(start + 8_000_001 * i, [0.1 * i, -i], effort=[10.0 + i, 20.0 + i], **changes)
         for i in range(count)
     ]
+
+
+Messages = list[tuple[int, bytes]]
+Import = Callable[..., Archive]
+
+
+@pytest.fixture
+def imported(tmp_path: Path, robot: Robot) -> Import:
+    """Imports a bag of these messages."""
+
+    def run(messages: Messages, **options: Any) -> Archive:
+        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
+        return open_archive(import_rosbag2(file, tmp_path / "a.mcap", robot=robot, **options))
+
+    return run
 
 
 class TestRobot:
@@ -168,51 +219,37 @@ class TestRobot:
 
 
 class TestImport:
-    def test_joints_come_in_the_order_of_the_urdf(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/joint_states": (STATE, states())})
-        archive = open_archive(import_rosbag2(file, tmp_path / "a.mcap", robot=robot))
+    def test_joints_come_in_the_order_of_the_urdf(self, imported):
+        archive = imported(states())
         assert archive.complete
         assert archive.joint_names == ("hip", "ankle")
         assert archive.columns["position"].tolist() == [[-i, 0.1 * i] for i in range(5)]
         assert archive.columns["torque"].tolist() == [[20.0 + i, 10.0 + i] for i in range(5)]
 
-    def test_stamps_are_those_of_the_headers_to_the_nanosecond(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/joint_states": (STATE, states())})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
-        archive = open_archive(path)
+    def test_stamps_are_those_of_the_headers_to_the_nanosecond(self, imported):
+        archive = imported(states())
         start = 1_700_000_000 * 10**9 + 123
         assert archive.columns["stamp"].tolist() == [start + 8_000_001 * i for i in range(5)]
         assert archive.header.entries["clock"] == "header"
-        assert open_recording(path).time.tolist() == pytest.approx(
+        assert open_recording(archive.path).time.tolist() == pytest.approx(
             [8.000001e-3 * i for i in range(5)], abs=1e-15
         )
 
-    def test_empty_headers_leave_the_bags_stamps(self, tmp_path, robot):
-        messages = [(5 + 8 * i, state(0, [i, i])[1]) for i in range(3)]
-        file = bag(tmp_path / "b.db3", {"/joint_states": (STATE, messages)})
-        archive = open_archive(import_rosbag2(file, tmp_path / "a.mcap", robot=robot))
+    def test_empty_headers_leave_the_bags_stamps(self, imported):
+        archive = imported([(5 + 8 * i, state(0, [i, i])[1]) for i in range(3)])
         assert archive.columns["stamp"].tolist() == [5, 13, 21]
         assert archive.header.entries["clock"] == "bag"
 
-    def test_what_was_not_recorded_is_not_invented(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, [state(9, [1, 2]), state(10, [1, 3])])})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
-        assert set(open_archive(path).columns) == {"stamp", "position"}
-        assert open_recording(path).torque is None
+    @pytest.mark.parametrize("velocity", [(), (np.nan, np.nan)])
+    def test_what_was_not_recorded_is_not_invented(self, imported, velocity):
+        """ros2_control publishes NaN for what the hardware does not measure."""
+        archive = imported([state(8_000_000 * i, [1, i], velocity=velocity) for i in range(3)])
+        assert set(archive.columns) == {"stamp", "position"}
+        assert open_recording(archive.path).torque is None
 
-    def test_velocity_reaches_the_archive(self, tmp_path, robot):
-        messages = [state(8_000_000 * i, [1, 2], velocity=[0.5, -i]) for i in range(3)]
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
-        assert open_archive(path).columns["velocity"].tolist() == [[-i, 0.5] for i in range(3)]
-
-    def test_nan_throughout_is_no_quantity(self, tmp_path, robot):
-        """ros2_control publishes it for what the hardware does not measure."""
-        nothing = [np.nan, np.nan]
-        messages = [state(8_000_000 * i, [1, i], velocity=nothing) for i in range(3)]
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
-        assert set(open_archive(path).columns) == {"stamp", "position"}
+    def test_velocity_reaches_the_archive(self, imported):
+        archive = imported([state(8_000_000 * i, [1, 2], velocity=[0.5, -i]) for i in range(3)])
+        assert archive.columns["velocity"].tolist() == [[-i, 0.5] for i in range(3)]
 
     def test_recorded_joints_are_those_of_the_fullest_message(self, tmp_path):
         messages = [state(5, [0.01], names=["finger"]), *states(2)]
@@ -223,26 +260,17 @@ class TestImport:
         with pytest.raises(SourceError, match="has no message with joints"):
             recorded_joints(empty)
 
-    def test_effort_can_be_declared_a_motor_current(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, states())})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot, effort="motor_current")
-        recording = open_recording(path)
-        assert recording.torque is None
-        assert recording.motor_current is not None
-        assert recording.motor_current[0].tolist() == [20.0, 10.0]
+    def test_effort_can_be_declared_a_motor_current(self, imported):
+        archive = imported(states(), effort="motor_current")
+        assert "torque" not in archive.columns
+        assert archive.columns["motor_current"][0].tolist() == [20.0, 10.0]
 
-    def test_messages_of_a_gripper_on_the_same_topic_are_passed_over(self, tmp_path, robot):
-        mixed = [*states(3), state(5, [0.01], names=["finger"])]
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, mixed)})
-        archive = open_archive(import_rosbag2(file, tmp_path / "a.mcap", robot=robot))
-        assert archive.n_samples == 3
+    def test_messages_of_a_gripper_on_the_same_topic_are_passed_over(self, imported):
+        assert imported([*states(3), state(5, [0.01], names=["finger"])]).n_samples == 3
 
-    def test_names_may_differ_from_the_urdfs(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, states(names=["j2", "j1"]))})
-        path = import_rosbag2(
-            file, tmp_path / "a.mcap", robot=robot, joint_names={"j1": "hip", "j2": "ankle"}
-        )
-        assert open_archive(path).columns["position"][3].tolist() == [-3, pytest.approx(0.3)]
+    def test_names_may_differ_from_the_urdfs(self, imported):
+        archive = imported(states(names=["j2", "j1"]), joint_names={"j1": "hip", "j2": "ankle"})
+        assert archive.columns["position"][3].tolist() == [-3, pytest.approx(0.3)]
 
     def test_a_folder_of_split_files_is_one_recording(self, tmp_path, robot):
         folder = tmp_path / "bag"
@@ -254,10 +282,8 @@ class TestImport:
         assert archive.n_samples == 6
         assert archive.header.entries["source"] == '["bag_0.db3", "bag_1.db3"]'
 
-    def test_the_archive_says_where_it_comes_from(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, states())})
-        path = import_rosbag2(file, tmp_path / "a.mcap", robot=robot, held_joints=["hip"])
-        recording = open_recording(path)
+    def test_the_archive_says_where_it_comes_from(self, imported):
+        recording = open_recording(imported(states(), held_joints=["hip"]).path)
         assert recording.held_joints == ("hip",)
         expected = {"kind": "imported", "importer": "rosbag2", "topic": "/js", "archive": "a.mcap"}
         assert expected.items() <= recording.provenance.items()
@@ -321,10 +347,9 @@ class TestBadInput:
             ([(3, b"\x00\x01\x00\x00rubbish")], "message 0 cannot be decoded"),
         ],
     )
-    def test_messages_that_cannot_be_used_are_named(self, tmp_path, robot, messages, sentence):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
+    def test_messages_that_cannot_be_used_are_named(self, imported, messages, sentence):
         with pytest.raises(SourceError, match=sentence):
-            import_rosbag2(file, tmp_path / "a.mcap", robot=robot)
+            imported(messages)
 
     def test_files_that_are_no_bag_are_named(self, tmp_path, robot):
         (tmp_path / "x.db3").write_text("time,q1")
@@ -336,17 +361,14 @@ class TestBadInput:
         with pytest.raises(SourceError, match=r"has no \.db3 and no \.mcap file"):
             import_rosbag2(tmp_path / "empty", tmp_path / "a.mcap", robot=robot)
 
-    def test_a_repeated_clock_is_kept_and_refused_by_the_recording(self, tmp_path, robot):
-        messages = [state(8, [1, 2]), state(16, [1, 3]), state(16, [1, 4])]
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
-        recording = open_recording(import_rosbag2(file, tmp_path / "a.mcap", robot=robot))
+    def test_a_repeated_clock_is_kept_and_refused_by_the_recording(self, imported):
+        archive = imported([state(8, [1, 2]), state(16, [1, 3]), state(16, [1, 4])])
         with pytest.raises(RecordingError, match="the clock repeats at sample 2"):
-            recording.checked()
+            open_recording(archive.path).checked()
 
-    def test_unknown_held_joints_are_named(self, tmp_path, robot):
-        file = bag(tmp_path / "b.db3", {"/js": (STATE, states())})
+    def test_unknown_held_joints_are_named(self, imported):
         with pytest.raises(SourceError, match="no joint is called 'knee'"):
-            import_rosbag2(file, tmp_path / "a.mcap", robot=robot, held_joints=["knee"])
+            imported(states(), held_joints=["knee"])
 
 
 class TestRealRecordings:
@@ -389,3 +411,260 @@ class TestRealRecordings:
         source = shared_data / "ur10_unisa" / "validation_trajectory.db3"
         with pytest.raises(SourceError, match="trajectory_msgs/msg/JointTrajectory"):
             import_rosbag2(source, tmp_path / "x.mcap", robot=robot)
+
+
+DEFINITION, _ = STORE.generate_msgdef(STATE, ros_version=2)
+
+
+def many() -> Messages:
+    """Joint states with all quantities, the joints in another order than the robot's."""
+    return [
+        state(int(stamp), q, velocity=qd, effort=tau)
+        for stamp, q, qd, tau in zip(
+            STAMPS, POSITION[:, ::-1], VELOCITY[:, ::-1], EFFORT[:, ::-1], strict=True
+        )
+    ]
+
+
+def mcap(
+    path: Path,
+    topics: dict[str, tuple[str, str, str, list[tuple[int, bytes]]]],
+    **options: Any,
+) -> Path:
+    """An MCAP file; topics as type, definition, encoding and messages."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2")
+        for topic, (kind, definition, encoding, messages) in topics.items():
+            schema = writer.register_schema(kind, "ros2msg", definition.encode())
+            channel = writer.register_channel(topic, encoding, schema)
+            for number, (time, data) in enumerate(messages):
+                writer.add_message(channel, time, data, time, number)
+        writer.finish()
+    return path
+
+
+def joint_states(path: Path, **options: Any) -> Path:
+    return mcap(path, {"/joint_states": (STATE, DEFINITION, "cdr", many())}, **options)
+
+
+def assert_imported(path: Path, *, torque: bool = True) -> None:
+    archive = open_archive(path)
+    assert archive.complete, archive.missing
+    columns = archive.columns
+    assert columns["stamp"].tolist() == STAMPS.tolist()
+    assert columns["position"].tobytes() == POSITION.tobytes()
+    assert columns["velocity"].tobytes() == VELOCITY.tobytes()
+    assert ("torque" in columns) == torque
+    effort = columns["torque" if torque else "motor_current"]
+    assert effort.tobytes() == EFFORT.tobytes()
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_joint_states_of_any_mcap_file(
+    tmp_path: Path, robot: Robot, compression: CompressionType, use_chunking: bool
+) -> None:
+    source = joint_states(
+        tmp_path / "x.mcap",
+        compression=compression,
+        chunk_size=20_000,
+        use_chunking=use_chunking,
+        use_summary_offsets=False,
+    )
+    assert_imported(import_rosbag2(source, tmp_path / "out.mcap", robot=robot))
+
+
+def test_a_file_without_index_or_checksums_is_read_as_well(tmp_path: Path, robot: Robot) -> None:
+    source = joint_states(
+        tmp_path / "x.mcap",
+        enable_crcs=False,
+        use_statistics=False,
+        repeat_schemas=False,
+        repeat_channels=False,
+    )
+    assert_imported(import_rosbag2(source, tmp_path / "out.mcap", robot=robot))
+
+
+def test_efforts_may_be_motor_currents(tmp_path: Path, robot: Robot) -> None:
+    source = joint_states(tmp_path / "x.mcap")
+    out = import_rosbag2(source, tmp_path / "out.mcap", robot=robot, effort="motor_current")
+    assert_imported(out, torque=False)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("mode", ["none", "file", "message"])
+def test_bags_of_either_storage_compressed_or_not(
+    tmp_path: Path, robot: Robot, storage: StoragePlugin, mode: str
+) -> None:
+    writer = BagWriter(tmp_path / "bag", version=9, storage_plugin=storage)
+    if mode != "none":
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/joint_states", STATE, typestore=STORE)
+        for time, data in many():
+            writer.write(connection, time, data)
+    assert_imported(import_rosbag2(tmp_path / "bag", tmp_path / "out.mcap", robot=robot))
+
+
+def test_the_parts_of_a_split_bag_follow_each_other_by_number(tmp_path: Path, robot: Robot) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    everything = many()
+    for part in range(12):
+        some = everything[part * 25 : (part + 1) * 25]
+        mcap(folder / f"bag_{part}.mcap", {"/joint_states": (STATE, DEFINITION, "cdr", some)})
+    # A part in which no joint state was recorded.
+    mcap(
+        folder / "bag_12.mcap", {"/note": ("std_msgs/msg/String", "string data", "cdr", [(1, b"")])}
+    )
+    packed = zstandard.compress((folder / "bag_3.mcap").read_bytes())
+    (folder / "bag_3.mcap.zstd").write_bytes(packed)
+    (folder / "bag_3.mcap").unlink()
+    assert_imported(import_rosbag2(folder, tmp_path / "out.mcap", robot=robot))
+
+
+def test_an_archive_of_ours_can_be_imported_like_any_other(tmp_path: Path, robot: Robot) -> None:
+    first = import_rosbag2(joint_states(tmp_path / "x.mcap"), tmp_path / "a.mcap", robot=robot)
+    assert_imported(import_rosbag2(first, tmp_path / "b.mcap", robot=robot))
+
+
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_joint_states_in_another_encoding_are_refused_by_its_name(
+    tmp_path: Path, robot: Robot, encoding: str
+) -> None:
+    topics = {"/joints": ("foxglove.JointStates", "", encoding, [(1, b"{}")])}
+    source = mcap(tmp_path / "x.mcap", topics)
+    with pytest.raises(SourceError, match=f"/joints \\(foxglove.JointStates in {encoding}\\)"):
+        import_rosbag2(source, tmp_path / "out.mcap", robot=robot)
+    with pytest.raises(SourceError, match=f"/joints: foxglove.JointStates in {encoding} is not"):
+        import_log(source, tmp_path / "out.mcap", robot=robot, columns=by_map())
+
+
+@pytest.mark.parametrize("kept", [0, 3, 40, 5000, -1])
+def test_files_that_are_cut_off_are_refused_in_a_sentence(
+    tmp_path: Path, robot: Robot, kept: int
+) -> None:
+    source = joint_states(tmp_path / "x.mcap", chunk_size=5000)
+    source.write_bytes(source.read_bytes()[:kept])
+    with pytest.raises(SourceError, match="no MCAP file, or cut off"):
+        import_rosbag2(source, tmp_path / "out.mcap", robot=robot)
+
+
+def test_a_damaged_chunk_is_noticed(tmp_path: Path, robot: Robot) -> None:
+    source = joint_states(tmp_path / "x.mcap", compression=CompressionType.NONE)
+    data = bytearray(source.read_bytes())
+    data[data.index(POSITION[150, ::-1].tobytes())] ^= 1
+    source.write_bytes(data)
+    with pytest.raises(SourceError, match="no MCAP file, or cut off"):
+        import_rosbag2(source, tmp_path / "out.mcap", robot=robot)
+
+
+def by_map(**more: Any) -> ColumnMap:
+    return ColumnMap.model_validate(
+        {
+            "time": {"column": "/drives/stamp", "unit": "ns"},
+            "joints": ["hip", "ankle"],
+            "position": {
+                "columns": ["/drives/drives/0/angle", "/drives/drives/1/angle"],
+                "unit": "deg",
+                "side": "motor",
+            },
+            "motor_current": {"columns": ["/drives/drives/0/current", "/drives/drives/1/current"]},
+            "drive": {"gear_ratio": [100.0, -50.0]},
+            **more,
+        }
+    )
+
+
+def drives(path: Path, *, firmware: str = "2.1", with_states: bool = False) -> Path:
+    """A vendor's own messages, serialised by rosbags."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(DRIVES, "vendor_msgs/msg/Drives"))
+    types = store.types
+    angle = np.rad2deg(POSITION) * [100.0, -50.0]
+    messages = []
+    for row, stamp in enumerate(STAMPS.tolist()):
+        time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        message = types["vendor_msgs/msg/Drives"](
+            header=types["std_msgs/msg/Header"](stamp=time, frame_id=""),
+            enabled=True,
+            drives=[
+                types["vendor_msgs/msg/Drive"](mode=4, angle=angle[row, i], current=EFFORT[row, i])
+                for i in range(2)
+            ],
+            temperature=np.array([40.0, 41.0 + row, 42.0], np.float32),
+            firmware=firmware if row == COUNT - 1 else "2.1",
+        )
+        messages.append((stamp, bytes(store.serialize_cdr(message, "vendor_msgs/msg/Drives"))))
+    topics = {"/drives": ("vendor_msgs/msg/Drives", DRIVES, "cdr", messages)}
+    if with_states:
+        topics["/joint_states"] = (STATE, DEFINITION, "cdr", many())
+        topics["/json"] = ("anything", "", "json", [(1, b"{}")])
+    return mcap(path, topics, chunk_size=10_000)
+
+
+def test_messages_of_any_type_are_imported_with_a_column_map(tmp_path: Path, robot: Robot) -> None:
+    out = import_log(
+        drives(tmp_path / "x.mcap"), tmp_path / "out.mcap", robot=robot, columns=by_map()
+    )
+    columns = open_archive(out).columns
+    assert columns["stamp"].tolist() == STAMPS.tolist()
+    np.testing.assert_allclose(columns["position"], POSITION, rtol=0, atol=1e-12)
+    assert columns["motor_current"].tobytes() == EFFORT.tobytes()
+    recording = open_recording(out)
+    assert recording.motor_current is not None
+
+
+def test_positions_of_one_topic_go_with_currents_of_another(tmp_path: Path, robot: Robot) -> None:
+    columns = by_map(
+        position={"columns": "/joint_states/position"},
+        time={"column": "/joint_states/stamp", "unit": "ns"},
+        joints=["ankle", "hip"],
+    )
+    source = drives(tmp_path / "x.mcap", with_states=True)
+    archive = open_archive(import_log(source, tmp_path / "o.mcap", robot=robot, columns=columns))
+    assert archive.columns["position"].tobytes() == POSITION.tobytes()
+    assert archive.columns["motor_current"].tobytes() == EFFORT[:, ::-1].tobytes()
+
+
+def test_every_number_of_a_message_is_an_array_named_by_its_path(tmp_path: Path) -> None:
+    arrays = read_mcap(drives(tmp_path / "x.mcap"))
+    assert set(arrays) == {
+        "/drives/stamp", "/drives/enabled", "/drives/temperature",
+        *(f"/drives/drives/{i}/{name}" for i in range(2) for name in ("mode", "angle", "current")),
+    }  # fmt: skip
+    assert arrays["/drives/temperature"].shape == (COUNT, 3)
+    assert arrays["/drives/temperature"].dtype == np.float32
+    assert arrays["/drives/temperature"][7].tolist() == [40.0, 48.0, 42.0]
+    assert set(arrays["/drives/drives/1/mode"].tolist()) == {4}
+
+
+@pytest.mark.parametrize(
+    ("firmware", "why"), [("2.2", "differ in names"), ("2.10-beta", "differ in length")]
+)
+def test_a_topic_whose_messages_are_not_alike_is_refused_with_the_reason(
+    tmp_path: Path, robot: Robot, firmware: str, why: str
+) -> None:
+    source = drives(tmp_path / "x.mcap", firmware=firmware)
+    with pytest.raises(SourceError, match=f"/drives: its messages {why}"):
+        import_log(source, tmp_path / "o.mcap", robot=robot, columns=by_map())
+
+
+def test_an_array_that_is_not_there_is_refused_with_those_that_are(
+    tmp_path: Path, robot: Robot
+) -> None:
+    columns = by_map(position={"columns": "/drives/position"})
+    with pytest.raises(SourceError, match=r"no array '/drives/position'.*/drives/temperature"):
+        import_log(drives(tmp_path / "x.mcap"), tmp_path / "o.mcap", robot=robot, columns=columns)
+
+
+def test_on_the_command_line_it_goes_by_the_name_of_the_file_s_kind(tmp_path: Path) -> None:
+    (tmp_path / "two.urdf").write_text(URDF)
+    source = joint_states(tmp_path / "x.mcap")
+    for name in ("mcap", "rosbag2"):
+        out = tmp_path / f"{name}.mcap"
+        given = ["import", name, str(source), "-o", str(out), "--urdf", str(tmp_path / "two.urdf")]
+        done = CliRunner().invoke(app, given)
+        assert done.exit_code == 0, done.output
+        assert_imported(out)

@@ -1,4 +1,7 @@
-"""One interval of a link into one archive: what belongs to it, and how it ended."""
+"""One interval of a link into one archive: what belongs to it, and how it ended.
+
+And what came while no archive was open: the newest of it, of the session that began last.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,12 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, StateChanged
+from drivers.packet_records import PACKET_DTYPE
 from drivers.packets import InitPacket
 from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
+from hil.archive.process import RECENT, Recent
 from hil.cell import Cell
 from hil.simulation import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
@@ -139,3 +144,40 @@ def test_a_spec_gains_what_is_known_later(spec: ArchiveSpec) -> None:
     assert more.metadata == {"simulated": "yes", "accepted_init": "yes"}
     assert more.attachments == {"init_packet.bin": b"x"}
     assert spec.attachments == {}
+
+
+def at(*numbers: int) -> NDArray[np.void]:
+    """Records of these cycles."""
+    rows = np.zeros(len(numbers), cycle_dtype(2))
+    rows["cycle"] = numbers
+    return rows
+
+
+def packets(*cycles: int) -> NDArray[np.void]:
+    """Both directions of each cycle."""
+    rows = np.zeros(2 * len(cycles), PACKET_DTYPE)
+    rows["cycle"] = np.repeat(cycles, 2)
+    return rows
+
+
+@pytest.mark.parametrize("batch", [7, 20, 333, 2 * RECENT])
+def test_records_and_their_packets_go_together(batch: int) -> None:
+    recent, numbers = Recent(), range(3 * RECENT)
+    for begin in numbers[::batch]:
+        part = numbers[begin : begin + batch]
+        recent.keep(at(*part), [], packets(*part))
+    kept, _, kept_packets = recent.take_session()
+    assert RECENT <= len(kept) < RECENT + batch
+    assert kept["cycle"].tolist() == list(numbers[-len(kept) :])
+    assert kept_packets["cycle"].tolist() == np.repeat(kept["cycle"], 2).tolist()
+
+
+def test_only_the_session_that_began_last_counts_and_is_given_once() -> None:
+    recent = Recent()
+    recent.keep(at(7, 8, 0, 1), [], packets(7, 8, 0, 1))
+    recent.keep(at(2), [], packets(2))
+    kept, events, kept_packets = recent.take_session()
+    assert kept["cycle"].tolist() == [0, 1, 2]
+    assert kept_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
+    assert not events
+    assert not len(recent.take_session().records)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from hil.importers import Robot
+from hil.archive import open_archive
+from hil.importers import ColumnMap, Robot, import_log
 
 JOINTS = ("hip", "knee", "ankle")
 
@@ -23,3 +25,10 @@ def three_joint_robot(folder: Path) -> Robot:
     path = folder / "three.urdf"
     path.write_text("".join([*parts, "</robot>"]))
     return Robot.from_urdf(path)
+
+
+def imported(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:
+    """The columns of a log's archive, which lies beside it, at 100 Hz unless the map says else."""
+    columns = ColumnMap.model_validate({"sample_rate": 100.0, **entries})
+    path = import_log(source, source.with_suffix(".mcap"), robot=robot, columns=columns)
+    return dict(open_archive(path).columns)

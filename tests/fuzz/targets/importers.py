@@ -19,9 +19,8 @@ from tests.fuzz.mutate_bytes import mutate_bytes
 from tests.fuzz.mutate_mcap import mutate_mcap
 from tests.fuzz.mutate_text import mutate_text
 from tests.fuzz.targets import Target, place_of
-from tests.hil.test_importers_mcap import STORE, mcap
-from tests.hil.test_importers_mcap import states as messages
-from tests.hil.test_importers_rosbag2 import STATE, URDF, bag, states
+from tests.hil.test_importers_rosbag2 import STATE, STORE, URDF, bag, mcap, states
+from tests.hil.test_importers_rosbag2 import many as messages
 
 TEXT, MAP, NPZ, NPY, MATLAB, SQLITE, BAG, MESSAGES, PACKED, FIELDS = range(10)
 """First byte of an input: what the others are a file of."""

@@ -448,14 +448,18 @@ class TestSizes:
         del plain
         self.assert_small(path, "claims 67108864 bytes")
 
-    def test_a_frame_that_is_larger_than_its_chunk_says(self, written, tmp_path):
-        frame = zstandard.compress(bytes(1 << 27))
+    @pytest.mark.parametrize(
+        ("stated", "reason"), [(True, "another length than it claims"), (False, "decompressed")]
+    )
+    def test_a_frame_that_is_larger_than_its_chunk_says(self, stated, reason, written, tmp_path):
+        """Whether the frame states its own size or not, it is not decompressed, or not far."""
+        frame = zstandard.ZstdCompressor(write_content_size=stated).compress(bytes(1 << 27))
         head = struct.pack("<QQQI", 0, 0, 1000, 0) + mcap_bytes.text("zstd")
         bomb = mcap_bytes.record(container.CHUNK, head + struct.pack("<Q", len(frame)) + frame)
         at = written.chunks[0].offset
         path = tmp_path / NAME
         path.write_bytes(written.data[:at] + bomb + written.data[at:])
-        self.assert_small(path, "another length than it claims")
+        self.assert_small(path, reason)
 
     def test_a_record_as_long_as_a_sparse_file(self, written, tmp_path):
         at = written.chunks[0].offset

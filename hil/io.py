@@ -1,18 +1,42 @@
-"""One process at a time in a folder: a lock that goes with the process that holds it."""
+"""Files and folders: SHA-256 digests, and the lock of a folder that goes with its process."""
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from hil.reading import opened
 
 _FLAGS: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """The folder may come from elsewhere: no link is followed, and no pipe waited for."""
 _PAUSE: Final = 0.02
+
+
+def digest(content: str | bytes) -> str:
+    """Digest of a text, as UTF-8, or of bytes."""
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
+
+
+def json_digest(value: Any) -> str:
+    """Digest of a JSON value; the order of keys does not count."""
+    return digest(json.dumps(value, sort_keys=True))
+
+
+def file_digest(path: Path) -> str:
+    """Digest of all bytes of a file.
+
+    Raises:
+        OSError: there is none, it is no regular file, or it cannot be read.
+    """
+    with opened(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Moments that somebody else wrote are read, or are none; reading them never fails."""
+"""Numbers and moments that somebody else wrote are read, or are none; reading never fails."""
 
 from __future__ import annotations
 
@@ -8,7 +8,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.reading import instant
+from hil.reading import instant, port_number, whole_number
+
+
+@given(st.integers(0, 10**18 - 1))
+def test_a_number_is_read_as_it_was_written(number: int) -> None:
+    assert whole_number(str(number)) == number
+
+
+@given(st.one_of(st.text(), st.text("0123456789²٣-+_ ."), st.integers(4000, 6000).map("7".__mul__)))
+def test_any_text_is_a_number_of_some_size_or_none(text: str) -> None:
+    found = whole_number(text)
+    assert found is None or (0 <= found < 2**63 and text.lstrip("0") in (str(found), ""))
+
+
+def test_what_is_missing_is_none() -> None:
+    assert whole_number(None) is None
+    assert whole_number("") is None
+
+
+def test_ports_are_those_that_there_are() -> None:
+    assert [port_number(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]
+    assert not any(map(port_number, ("", "0", "65536", "-1", "ten", "9" * 5000)))
 
 
 @given(
