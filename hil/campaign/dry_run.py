@@ -8,20 +8,24 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 import numpy as np
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, OperatorStopError
 from hil.files import write_or_tell
 from hil.reading import json_of, lies_there, text_of
 
-from .errors import CampaignFolderError
+from .errors import AgainstGravityError, CampaignFolderError, DryRunError
 from .folder import CampaignFolder, read_back
 from .gravity_check import AGAINST, GravityCheck
-from .operator import DryRunSummary
+from .intervals import Interval
+
+if TYPE_CHECKING:
+    from .run import Run
+    from .runner import Runner
 
 SIMULATED: Final = "simulated"
 """Metadata: whether nothing but a simulated arm can have moved, "yes" or "no". The link says so,
@@ -40,6 +44,8 @@ def made_by(path: Path, only_simulated: bool) -> bool:
     except ArchiveError:
         return False
 
+
+DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""
@@ -232,20 +238,119 @@ class DryRun:
         """This dry run, accepted by whoever runs the program."""
         return replace(self, accepted=Acceptance.now())
 
-    def summary(self, campaign: str) -> DryRunSummary:
-        """What a person is to accept."""
-        return DryRunSummary(
-            campaign=campaign,
-            plan_hash=self.plan_hash,
-            archives=self.archives,
-            override=self.override,
-            duration=self.duration,
-            simulated=self.simulated,
-            joint_names=self.joint_names,
-            current_share=np.array(self.current_share),
-            following_error=np.array(self.following_error),
-            missed=self.missed,
-            late=self.late,
-            against_gravity=self.against_gravity,
-            gravity_not_seen=self.gravity_not_seen,
+
+class DryRunStage:
+    """Every motion that will be sent at full speed, once and slowly.
+
+    Args:
+        run: whose excitation and validation motions are looked at; repetitions of one once.
+
+    Attributes:
+        intervals: the motions under the names of their slow runs.
+        state: whether a person has accepted what was done; "left out" where the caller did without.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.state: DryRunState = "left out" if run.unrehearsed else "to be accepted"
+        self._motions = [
+            one for one in run.wanted
+            if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
+        ]  # fmt: skip
+        self.intervals = [
+            replace(one, kind="dryrun", index=k) for k, one in enumerate(self._motions)
+        ]
+        # Nobody knows beforehand what will contradict: only what an earlier run saw is accepted.
+        self._known = run.accept_torque if run.accept_torque and self.found() else ()
+
+    def found(self) -> DryRun | None:
+        """The dry run of exactly this plan and kind of arm; None where none counts."""
+        if self._run.unrehearsed:
+            return None
+        return DryRun.that_counts(
+            self._run.folder,
+            plan_hash=self._run.plan_hash,
+            motions=len(self._motions),
+            simulated=self._run.simulated,
         )
+
+    def missing(self) -> list[Interval]:
+        """Each motion that was not run slowly yet."""
+        if self._run.unrehearsed:
+            return []
+        both = zip(self._motions, self.intervals, strict=True)
+        return [one for one, slow in both if self._whole(slow) is None]
+
+    def run(self, runner: Runner) -> None:
+        """Run what is missing, slowly, and have it accepted.
+
+        Raises:
+            DryRunError, OperatorStopError: see `settle`.
+        """
+        missing = [slow for slow in self.intervals if self._whole(slow) is None]
+        if self._run.unrehearsed or not missing:
+            return
+        for slow in missing:
+            name = runner.play(slow, slow.index + 1, len(self._motions), OVERRIDE)
+            self._run.entering.enter(slow, name)
+        self.settle()
+
+    def settle(self) -> None:
+        """Write down what was done, once all of it is, and have it accepted.
+
+        Raises:
+            DryRunError: it must be accepted now and is not.
+            OperatorStopError: a stop was asked for instead of an answer.
+        """
+        run, found = self._run, self.found()
+        if run.unrehearsed:
+            return
+        if found is None:
+            names = [name for slow in self.intervals if (name := self._whole(slow)) is not None]
+            if len(names) < len(self._motions):
+                return
+            found = DryRun.of(
+                run.folder, run.cell, names, plan_hash=run.plan_hash, simulated=run.simulated
+            )
+            found.save(run.folder.dry_run)
+        if found.accepted is None:
+            unknown = [joint for joint in found.against_gravity if joint not in self._known]
+            if not self._agreed(found, unknown):
+                if not run.dry_run_only:
+                    raise not_accepted(run.folder, unknown)
+                return
+            found.accepted_now().save(run.folder.dry_run)
+        self.state = "accepted"
+
+    def _agreed(self, found: DryRun, unknown: Sequence[str]) -> bool:
+        """Whether the caller accepts, or the operator; unknown joints only the operator."""
+        run = self._run
+        if run.accept_dry_run and not unknown:
+            return True
+        agreed = run.operator.can_answer and run.operator.accept_dry_run(found)
+        if run.operator.can_answer and not agreed and run.stop.requested:
+            raise OperatorStopError(
+                f"{run.folder.root}: stopped instead of an answer; its slow dry run was done, and "
+                "is not accepted."
+            )
+        return agreed
+
+    def _whole(self, slow: Interval) -> str | None:
+        """Name of its whole archive, if this kind of arm made it."""
+        folder = self._run.folder
+        name = folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(folder.archives / name, self._run.simulated)
+        return name if made else None
+
+
+def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
+    """What is raised where a dry run that was done is not accepted.
+
+    Args:
+        folder: of the campaign.
+        against: joints whose torque runs against the model's gravity, and that nobody named.
+    """
+    if against:
+        return AgainstGravityError(folder.root, against, AGAINST)
+    how = f"if the motions looked right, run `hil run {folder.root} --accept-dry-run`"
+    return DryRunError(folder.root, "was done, but is not accepted", how)

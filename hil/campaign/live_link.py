@@ -62,7 +62,7 @@ from .motion_link import (
     not_ready,
     unwatched,
 )
-from .motion_watch import MotionWatch, unwatched_motion
+from .operator import MotionWatch, unwatched_motion
 from .stop import Stop
 
 BEAT: Final = 0.05

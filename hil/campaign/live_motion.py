@@ -17,9 +17,15 @@ from hil.errors import ControllerFault
 
 from .errors import write_error
 from .motion_link import drives_in_force
-from .motion_watch import MotionWatch
-from .progress import PacketCounts, ProgressDisplay, duration_of, guard_in_force
-from .steering import NOT_BEGUN, Steering
+from .operator import MotionWatch
+from .steering import (
+    NOT_BEGUN,
+    PacketCounts,
+    ProgressDisplay,
+    Steering,
+    duration_of,
+    guard_in_force,
+)
 from .stop import Stop
 
 if TYPE_CHECKING:
@@ -143,7 +149,7 @@ class LiveMotion:
             self._exchange.stop()
             self._stop_passed = True
         if not self._view.motion_ended:
-            self._steering.follow(self._exchange)
+            self._steering.follow(self._exchange, display.messages)
         if display.due:
             display.take(self._reader.drain())
             status = self._view.status

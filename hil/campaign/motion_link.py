@@ -22,7 +22,7 @@ from hil.archive.recorder import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
-from .motion_watch import MotionWatch, unwatched_motion
+from .operator import MotionWatch, unwatched_motion
 from .stop import Stop
 
 BEGIN_TIMEOUT: Final = 60.0

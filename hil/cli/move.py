@@ -16,7 +16,7 @@ import typer
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
 from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
+from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
 from hil.cli.arguments import JsonOption

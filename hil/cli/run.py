@@ -13,7 +13,7 @@ from rich.console import Console
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.campaign import Campaign, Link, stop_on_interrupt
-from hil.campaign.execution_result import RunResult
+from hil.campaign.run import RunResult
 from hil.cell_link import require_watchable
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.cli.payload import payload_lines

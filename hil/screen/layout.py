@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 from rich.text import Text
 
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
-from hil.campaign.operator import DriftCurve, RunStatus
+from hil.campaign.operator import DriftCurve, MotionProgress, OperatorRequest, RunStatus
 from hil.terminal_text import printable
 
 from . import marks

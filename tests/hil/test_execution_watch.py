@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from hil.campaign.execution_watch import RunWatch
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus, RunWatch
 from hil.campaign.stop import Stop
 
 

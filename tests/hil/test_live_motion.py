@@ -19,7 +19,7 @@ from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
+from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import Cell
 from hil.cell.link import stays_here
 from hil.cli.record import record

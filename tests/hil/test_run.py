@@ -26,11 +26,10 @@ from hil.campaign.errors import (
     MotionFailedError,
     RepetitionsRejectedError,
 )
-from hil.campaign.execution_result import RunResult
 from hil.campaign.gravity_check import agreement
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
+from hil.campaign.run import RunResult
 from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
@@ -67,7 +66,7 @@ class Person:
     ) -> None:
         self.accepts, self.requests = accepts, requests
         self.seen: list[RunStatus] = []
-        self.asked: list[DryRunSummary] = []
+        self.asked: list[DryRun] = []
 
     def show(self, status: RunStatus) -> None:
         self.seen.append(status)
@@ -75,7 +74,7 @@ class Person:
     def request(self) -> OperatorRequest:
         return self.requests(self.seen[-1])
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, summary: DryRun) -> bool:
         self.asked.append(summary)
         return self.accepts
 
@@ -220,7 +219,7 @@ def test_a_person_is_asked_and_a_no_ends_the_run(make: Make) -> None:
     (summary,) = nobody.asked
     assert summary.plan_hash == campaign.folder.plan_hash
     assert summary.simulated
-    assert 0.0 < summary.current_share.max() < 1.0
+    assert 0.0 < max(summary.current_share) < 1.0
     somebody = Person()
     assert "dryrun" not in kinds(campaign.run(operator=somebody)), "what is done is not done again"
     assert len(somebody.asked) == 1

@@ -30,19 +30,18 @@ from hil.campaign import (
     Link,
     MotionRefusedError,
     NotRehearsedError,
-    quality_entry,
+    quality,
 )
 from hil.campaign.conduct import conduct_of
 from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
-from hil.campaign.execution_result import RunResult
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.folder_lock import LOCK
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus
 from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.run import RunResult
 from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, WarmUp
 from hil.cell import Cell
@@ -79,7 +78,7 @@ class Person:
     def request(self) -> OperatorRequest:
         return OperatorRequest() if self.status is None else self.requests(self.status)
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, summary: DryRun) -> bool:
         del summary
         return True
 
@@ -239,7 +238,7 @@ def test_the_link_says_which_kind_of_arm_moved_whatever_the_caller_says(
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
     if said is None:  # as of a version that left it to the caller
-        monkeypatch.setattr("hil.campaign.execution.provenance_of", lambda *_, **__: {})
+        monkeypatch.setattr("hil.campaign.run.provenance_of", lambda *_, **__: {})
     campaign.run(twin, provenance=said, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
@@ -486,7 +485,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     def dies(*_: object) -> None:
         raise Killed
 
-    monkeypatch.setattr(quality_entry, "amend_outcome", dies)
+    monkeypatch.setattr(quality, "amend_outcome", dies)
     with suppress(Killed):
         campaign.run(operator=Person(slow_second), unrehearsed=True)
     monkeypatch.undo()
@@ -620,8 +619,8 @@ def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(mak
 def test_a_script_that_slows_each_repetition_for_a_moment_does_not_move_the_arm_for_ever(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.campaign.repeating.MOST_BY_HAND", 2)
-    monkeypatch.setattr("hil.campaign.progress.SHOWN_EVERY", 0.0)
+    monkeypatch.setattr("hil.campaign.runner.MOST_BY_HAND", 2)
+    monkeypatch.setattr("hil.campaign.steering.SHOWN_EVERY", 0.0)
     campaign, stop = make(), Stop()
 
     def at_its_begin(status: RunStatus) -> OperatorRequest:
@@ -666,7 +665,7 @@ def test_an_arm_that_rests_for_hours_in_mid_campaign_is_warmed_up_anew(
     """Between two repetitions, or while a person holds the next one before it begins."""
     campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
     passed = [0.0]
-    monkeypatch.setattr("hil.campaign.warmup_stage.time.time", lambda: clock() + passed[0])
+    monkeypatch.setattr("hil.campaign.warmup.time.time", lambda: clock() + passed[0])
 
     class Leaves(Person):
         def show(self, status: RunStatus) -> None:
@@ -763,7 +762,7 @@ def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) ->
     stop = Stop()
 
     class Leaves(Person):
-        def accept_dry_run(self, summary: DryRunSummary) -> bool:
+        def accept_dry_run(self, summary: DryRun) -> bool:
             stop.requested = True
             return False
 

@@ -26,8 +26,7 @@ import pytest
 from rich.console import Console, Group
 
 from drivers.states import State
-from hil.campaign.motion_watch import Latency, MotionProgress, OperatorRequest
-from hil.campaign.operator import DriftCurve, RunStatus
+from hil.campaign.operator import DriftCurve, Latency, MotionProgress, OperatorRequest, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
 from hil.cell.link import with_link
