@@ -20,7 +20,7 @@ from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
 from .errors import CampaignFolderError, WrongObjectError
-from .folder import CampaignFolder
+from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
 from .motion_link import MotionLink
 from .operator import Operator, Unattended
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 import shutil
 
 from hil.errors import HilError
-
-from .folder_lock import LOCK
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -20,7 +20,7 @@ from hil.campaign import Campaign, NotRehearsedError, Stop
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.rehearsal import Rehearsal
-from hil.campaign.rehearsal_twin import SPREAD, Twin
+from hil.campaign.rehearsal_run import SPREAD, Twin
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import OperatorStopError

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.campaign import Campaign, design
-from hil.campaign.rehearsal_twin import FASTEST, Twin
+from hil.campaign.rehearsal_run import FASTEST, Twin
 from hil.cell import Cell
 from hil.cli import app
 from hil.progress import Silent

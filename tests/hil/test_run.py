@@ -19,14 +19,13 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
-from hil.campaign.dry_run import OVERRIDE, DryRun
+from hil.campaign.dry_run import OVERRIDE, DryRun, agreement
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
     MotionFailedError,
     RepetitionsRejectedError,
 )
-from hil.campaign.gravity_check import agreement
 from hil.campaign.operator import OperatorRequest, RunStatus
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
 from hil.campaign.run import RunResult

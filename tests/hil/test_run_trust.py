@@ -36,8 +36,7 @@ from hil.campaign.conduct import conduct_of
 from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
-from hil.campaign.folder import CampaignFolder
-from hil.campaign.folder_lock import LOCK
+from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.operator import OperatorRequest, RunStatus
 from hil.campaign.rehearsal import Rehearsal
@@ -722,7 +721,7 @@ def test_a_warm_up_motion_whose_run_was_killed_before_it_was_noted_is_not_made_a
 def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.campaign.folder_lock.LOCK_PATIENCE", 30.0)
+    monkeypatch.setattr("hil.campaign.folder.LOCK_PATIENCE", 30.0)
     folder = CampaignFolder(tmp_path)
     lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_SH)
