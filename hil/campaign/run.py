@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -12,7 +11,7 @@ from hil.archive import ArchiveHeader, ArchiveSpec
 from hil.archive.live import LiveView
 from hil.cell import Cell
 from hil.progress import Reporter
-from hil.recording import dated_anew, origin_of
+from hil.recording import archive_spec, dated_anew, origin_of
 from hil.version import software
 
 from .dry_run import SIMULATED, DryRunState, said_of
@@ -165,41 +164,29 @@ class Run:
 
     def spec(self, interval: Interval) -> ArchiveSpec:
         """The archive of the next attempt at an interval."""
-        cell, name = self.cell, self.folder.next_name(interval.kind, interval.index)
+        name = self.folder.next_name(interval.kind, interval.index)
         # One seed is one campaign to the byte, whatever its folder is called.
         simulated = self.provenance.get(SIMULATED) == said_of(True)
         named = {} if simulated else {"campaign": self.folder.root.resolve().name}
-        return ArchiveSpec(
-            self.folder.archives / name.filename,
-            joint_names=cell.joint_names,
-            period=cell.period,
-            metadata={
-                **named,
-                "cell": cell.name,
-                "plan_hash": self.plan_hash,
-                **{f"software.{name}": version for name, version in software().items()},
-                **dated_anew(self.provenance),
-            },
-            attachments={
-                "cell.toml": cell.text.encode(),
-                "robot.urdf": cell.urdf.encode(),
-                "drive_train.json": cell.drive_table.model_dump_json().encode(),
-                "plan.json": json.dumps(self._plan_of(interval)).encode(),
-            },
-            durable=not self.virtual if self.durable is None else self.durable,
-        )
+        metadata = {
+            **named,
+            "plan_hash": self.plan_hash,
+            **{f"software.{package}": version for package, version in software().items()},
+            **dated_anew(self.provenance),
+        }
+        moves = moves_to_dict(interval.moves)
+        if interval.kind in REPEATED:  # with how it was found
+            plan = {"excitation": self.plan.excitation.to_dict(), **moves}
+        else:
+            plan = {"trajectory": interval.trajectory.to_dict(), **moves}
+        durable = not self.virtual if self.durable is None else self.durable
+        path = self.folder.archives / name.filename
+        return archive_spec(self.cell, path, metadata, plan, durable=durable)
 
     def made(self, header: ArchiveHeader) -> bool:
         """Whether an archive with this header was made of exactly this plan, by such an arm."""
         arm = self.provenance.get(SIMULATED)
         return header.plan_hash == self.plan_hash and header.simulated == arm
-
-    def _plan_of(self, interval: Interval) -> dict[str, Any]:
-        """The trajectory of an interval, its moves, and how an excitation was found."""
-        moves = moves_to_dict(interval.moves)
-        if interval.kind in REPEATED:
-            return {"excitation": self.plan.excitation.to_dict(), **moves}
-        return {"trajectory": interval.trajectory.to_dict(), **moves}
 
 
 def provenance_of(run: Run) -> dict[str, str]:
