@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,12 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, free_port
+from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 
 PATIENCE: Final = 0.5
 """s that the controller waits for an answer, as no real one does: a computer that runs tests need
 not be fit for a robot."""
-_END: Final = 20.0
 
 
 @dataclass(eq=False)
@@ -36,7 +32,7 @@ class UdpController:
     cell_path: Path
     host: str
     port: int
-    _process: subprocess.Popen[str] = field(repr=False)
+    _simulator: SimulatorProcess = field(repr=False)
     _summary: dict[str, Any] | None = field(default=None, repr=False)
 
     @classmethod
@@ -64,19 +60,10 @@ class UdpController:
         (folder / "udp_robot.urdf").write_text(own.urdf, encoding="utf-8")
         path.write_text(own.text, encoding="utf-8")
         given = [argument for fault in faults for argument in ("--fault", fault)]
-        command = [
-            sys.executable, "-m", "hil", "simulate", str(path),
-            "--udp", f"{LOOPBACK}:{port}", "--json", "--patience", str(PATIENCE), *given, *options,
-        ]  # fmt: skip
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            start_new_session=True,
+        simulator = SimulatorProcess.start(
+            path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(PATIENCE), *given, *options
         )
-        controller = cls(own, path, LOOPBACK, port, process)
+        controller = cls(own, path, LOOPBACK, port, simulator)
         try:
             yield controller
         finally:
@@ -85,15 +72,15 @@ class UdpController:
     @property
     def running(self) -> bool:
         """Whether its session goes on, or has yet to begin."""
-        return self._process.poll() is None
+        return self._simulator.running
 
     def press_drive_on(self) -> None:
         """Press the button that switches the drive on again."""
-        self._process.send_signal(signal.SIGUSR1)
+        self._simulator.process.send_signal(signal.SIGUSR1)
 
     def press_emergency_stop(self) -> None:
         """Press the emergency stop."""
-        self._process.send_signal(signal.SIGUSR2)
+        self._simulator.process.send_signal(signal.SIGUSR2)
 
     def finish(self) -> dict[str, Any]:
         """End the session (the arm stands, the drive goes off, then mode 504).
@@ -103,13 +90,6 @@ class UdpController:
             nothing if it had to be killed.
         """
         if self._summary is None:
-            if self.running:
-                self._process.send_signal(signal.SIGTERM)
-            try:
-                text = self._process.communicate(timeout=_END)[0]
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                text = self._process.communicate()[0]
-            lines = text.strip().splitlines()
-            self._summary = json.loads(lines[-1]) if lines else {}
+            self._simulator.finish()
+            self._summary = self._simulator.end()
         return self._summary
