@@ -50,7 +50,7 @@ from hil.archive.supervised import (
     Serving,
 )
 from hil.cell import Cell
-from hil.cell.link import stays_here
+from hil.cell.cell import stays_here
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 
 from .exchange_view import ExchangeView

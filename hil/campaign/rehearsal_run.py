@@ -24,7 +24,6 @@ from drivers.transports import SimulatedTransport
 from drivers.transports.faults import Delay, Duplicate, Fault, Lose
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
 from hil.files import make_folder
 from hil.identify.estimating import estimate_with
@@ -44,7 +43,6 @@ from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
 from identification.validation.prediction import over_all, prediction_error
-from planner.toml_text import toml_value
 from sim_fixtures import ServoSettings, SimulatedDrive, SimulationError, UnmodelledEffects
 
 from .campaign import Campaign
@@ -109,11 +107,13 @@ class Twin:
         rng = np.random.default_rng(seed)
         planted = _varied(cell, rng)
         settings, assumed = _simulation(cell, planted, seed)
-        text = _with_table(cell.text, "simulation", settings)
-        text = replaced_value(text, "controller", "transport", toml_value("simulated"))
-        fewer = min(repetitions, cell.campaign.repetitions)
-        text = replaced_value(text, "campaign", "repetitions", fewer)
-        twin = Cell.from_texts(text, cell.urdf, cell.path)
+        twin = cell.with_values(
+            {
+                **{f"simulation.{key}": value for key, value in settings.items()},
+                "controller.transport": "simulated",
+                "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
+            }
+        )
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool, drive: SimulatedDrive | None = None) -> Link:
@@ -273,15 +273,6 @@ def _servo(cell: Cell) -> ServoSettings:
     """A current loop as late as the cell says that its currents are."""
     lag = (LOOP_CYCLES - cell.controller.current_delay_cycles) * cell.period
     return ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP)))
-
-
-def _with_table(text: str, table: str, settings: dict[str, Any]) -> str:
-    """The text of a cell file with these settings in a table, added where there is none."""
-    if f"[{table}]" not in text:
-        text += f"\n[{table}]\n"
-    for key, value in settings.items():
-        text = replaced_value(text, table, key, toml_value(value))
-    return text
 
 
 MOST_SIGMA: Final = 4.0

@@ -8,7 +8,6 @@ from typing import Final
 from drivers.transports import SimulatedTransport
 from hil.campaign import Campaign, Link, design
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.progress import Silent
 from hil.simulation import simulated_controller, simulated_link
 from sim_fixtures import SimulatedController
@@ -29,10 +28,7 @@ SHORT: Final = {
 
 def shortened(cell: Cell) -> Cell:
     """The cell with a campaign of seconds instead of minutes, in its text too."""
-    text = cell.text
-    for key, value in SHORT.items():
-        text = replaced_value(text, "campaign", key, value)
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    return cell.with_values({f"campaign.{key}": value for key, value in SHORT.items()})
 
 
 def run_campaign(root: Path, cell: Cell) -> Campaign:

@@ -240,22 +240,20 @@ def test_only_this_computer_is_known_to_be_no_robot(host: str, simulated: bool) 
         ("arm", 5),
         ("max_gap", -1),
         ("max_gap", 6),
-        ("other_axes", "[[1, 0]]"),
+        ("other_axes", [[1, 0]]),
         ("port", 0),
     ],
 )
-def test_settings_of_the_link_have_bounds(key: str, value: int | str) -> None:
+def test_settings_of_the_link_have_bounds(key: str, value: object) -> None:
     cell = Cell.load(CELL_PATH)
-    text = replaced_value(cell.text, "controller", key, value)
     with pytest.raises(CellError, match=rf"controller\.{key}"):
-        Cell.from_texts(text, cell.urdf, cell.path)
+        cell.with_link(**{key: value})
 
 
 def test_the_session_is_set_up_as_the_cell_says() -> None:
     cell = Cell.load(CELL_PATH)
-    text = replaced_value(cell.text, "controller", "arm", 2)
-    text = replaced_value(text, "controller", "other_axes", "[[1, 7], [2, 1]]")
-    settings = Cell.from_texts(text, cell.urdf, cell.path).session_settings(accept_init=True)
+    linked = cell.with_link(arm=2, other_axes=[[1, 7], [2, 1]])
+    settings = linked.session_settings(accept_init=True)
     assert settings == {
         "mode": 4,
         "arm": 2,

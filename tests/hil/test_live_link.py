@@ -23,7 +23,6 @@ from hil.campaign import (
 from hil.campaign.live_link import LiveLink
 from hil.campaign.quick_design import design
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
@@ -34,12 +33,9 @@ PATIENT = ("--patience", "2")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
 
 
-def on_loopback(cell: Cell, **changes: str) -> Cell:
+def on_loopback(cell: Cell, **changes: float) -> Cell:
     """The cell with its controller on this computer."""
-    text = cell.text
-    for old, new in changes.items():
-        text = replaced_value(text, "drive_train", old, new)
-    changed = Cell.from_texts(text, cell.urdf, cell.path)
+    changed = cell.with_values({f"drive_train.{key}": value for key, value in changes.items()})
     return changed.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
 
 
@@ -114,7 +110,7 @@ def test_two_runs_of_one_campaign_are_one_too_many(
 def test_each_difference_of_the_init_packet_is_named_before_anything_moves(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    wrong = on_loopback(cell, k65="0.045", k54="0.02")
+    wrong = on_loopback(cell, k65=0.045, k54=0.02)
     right = tmp_path / "controller"
     right.mkdir()
     (right / "cell.toml").write_text(cell.text)
@@ -159,8 +155,7 @@ def test_a_refusal_comes_with_its_flight_recorder(
 ) -> None:
     # So slow a way to the first posture, and the fault so late, that it strikes on that way even
     # where a loaded computer takes seconds to begin.
-    text = replaced_value(cell.text, "campaign", "approach_speed", 0.01)
-    slow = Cell.from_texts(text, cell.urdf, cell.path)
+    slow = cell.with_values({"campaign.approach_speed": 0.01})
     campaign = campaign_of(tmp_path / "refused", on_loopback(slow), plan)
     fault = ("--fault", "following-error@5000x1000:axis=2:slip")
     with (

@@ -21,7 +21,7 @@ from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import Cell
-from hil.cell.link import stays_here
+from hil.cell.cell import stays_here
 from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ControllerFault

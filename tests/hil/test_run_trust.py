@@ -44,7 +44,6 @@ from hil.campaign.run import RunResult
 from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, WarmUp
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.cli import app
 from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
@@ -108,8 +107,7 @@ def make(tmp_path: Path, designed: Campaign) -> Make:
     def made(name: str = "campaign", *, real: bool = False, **settings: float) -> Campaign:
         cell = fast_cell(tmp_path, **{"repetitions": 1, **settings})
         if real:
-            text = cell.with_link(transport="udp", host="192.0.2.7").text
-            cell = Cell.from_texts(text, cell.urdf, cell.path)
+            cell = cell.with_link(transport="udp", host="192.0.2.7")
         campaign = Campaign.create(tmp_path / name, cell, designed.plan)
         pass_rehearsal(campaign.folder)
         return campaign
@@ -174,15 +172,10 @@ def test_a_link_to_another_arm_is_refused_and_one_to_the_same_elsewhere_is_not(
     tmp_path: Path, dry: Campaign
 ) -> None:
     campaign = copied(dry, tmp_path / "campaign")
-    text = replaced_value(campaign.cell.text, "limits", "velocity_deg", "[300.0, 300.0]")
-    other = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    other = campaign.cell.with_values({"limits.velocity_deg": [300.0, 300.0]})
     with pytest.raises(CampaignFolderError, match=r"opened with another cell \(\[limits\]"):
         campaign.run(simulated_link(other))
-    there = Cell.from_texts(
-        replaced_value(campaign.cell.text, "controller", "port", 4711),
-        campaign.cell.urdf,
-        campaign.cell.path,
-    )
+    there = campaign.cell.with_link(port=4711)
     assert campaign.run(simulated_link(there)).complete
 
 
@@ -278,8 +271,7 @@ def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
 ) -> None:
     """The arm was jogged elsewhere since; `approach_speed` of this cell is full speed."""
     campaign = copied(dry, tmp_path / "campaign")
-    text = replaced_value(campaign.cell.text, "simulation", "initial_deg", "[70.0, -70.0]")
-    elsewhere = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    elsewhere = campaign.cell.with_values({"simulation.initial_deg": [70.0, -70.0]})
     result = campaign.run(simulated_link(elsewhere))
     ways = [name for name in result.archives if name.startswith("move")]
     assert len(ways) >= 2
@@ -290,8 +282,7 @@ def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
 def test_the_controllers_own_figures_do_not_replace_those_that_were_checked(
     tmp_path: Path, designed: Campaign
 ) -> None:
-    gears = replaced_value(designed.cell.text, "drive_train", "gear_ratio", "[101.0, -80.0]")
-    wrong = Cell.from_texts(gears, designed.cell.urdf, designed.cell.path)
+    wrong = designed.cell.with_values({"drive_train.gear_ratio": [101.0, -80.0]})
     campaign = Campaign.create(tmp_path / "campaign", wrong, designed.plan)
     pass_rehearsal(campaign.folder)
     controller = simulated_controller(designed.cell)

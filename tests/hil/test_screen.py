@@ -29,7 +29,6 @@ from drivers.states import State
 from hil.campaign.operator import DriftCurve, Latency, MotionProgress, OperatorRequest, RunStatus
 from hil.campaign.stop import Stop
 from hil.cell import Cell
-from hil.cell.link import with_link
 from hil.cell.schema import CanTable
 from hil.lines import put
 from hil.screen import Screen, layout, marks
@@ -127,7 +126,7 @@ def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
     cell = Cell.load(CELL_PATH)
 
     def said(**link: Any) -> str:
-        return far_end_of(Cell.from_texts(with_link(cell.text, **link), cell.urdf, CELL_PATH))
+        return far_end_of(cell.with_link(**link))
 
     assert said() == said(transport="udp", host="127.0.0.1") == "SIMULATED"
     assert said(transport="udp") == "10.2.12.150"
