@@ -27,11 +27,20 @@ from hil.cell.unknown import UnknownFieldsError
 from hil.cli.doctor import doctor
 from hil.doctor import probe
 from hil.doctor.check import Check, Status
+from hil.doctor.diagnosis import (
+    Diagnosis,
+    Fitness,
+    as_json,
+    examine,
+    histogram,
+    in_words,
+    judge,
+    remedies,
+    show,
+)
 from hil.doctor.link import CanLink, UdpLink, controller_in, link_of
 from hil.doctor.machine import disk_checks
 from hil.doctor.measure import RESERVE, Latency, disk_trial, measure, obtained, run_probe
-from hil.doctor.report import as_json, histogram, remedies, show
-from hil.doctor.run import Diagnosis, Fitness, examine, in_words, judge
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
 

@@ -9,12 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.doctor import link as port
-from hil.doctor import network as route
-from hil.doctor.check import Check, Status
-from hil.doctor.link import CanLink, can_check
-from hil.doctor.network import coalescing, device_check, firewall, network_checks
-from hil.doctor.system import Answer
-from tests.hil.doctor.made_up_system import Tree
+from hil.doctor import link as route
+from hil.doctor.check import Answer, Check, Status
+from hil.doctor.link import CanLink, can_check, coalescing, device_check, firewall, network_checks
+from tests.hil.doctor.conftest import Tree
 
 ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
 eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0
