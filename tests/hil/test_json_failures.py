@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from hil.archive import Samples, write_samples
 from hil.archive.supervised import Failed
 from hil.campaign import Campaign
-from hil.campaign.errors import write_error
+from hil.campaign.live_link import write_error
 from hil.cli import COMMANDS, app, main
 from hil.cli.failing import as_json, exit_code_of
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError
