@@ -13,9 +13,8 @@ from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.intervals import at_limit, beyond, player_of
 from hil.campaign.motion_link import MotionLink
-from hil.campaign.operator import MotionWatch, unwatched_motion
+from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
-from hil.campaign.stop import Stop
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks

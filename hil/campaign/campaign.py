@@ -23,12 +23,11 @@ from .errors import CampaignFolderError, WrongObjectError
 from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
 from .motion_link import MotionLink
-from .operator import Operator, Unattended
+from .operator import Operator, Stop, Unattended
 from .plan import CampaignPlan
 from .quick_design import plan_around
 from .rehearsal import Rehearsal
 from .status import CampaignStatus, status_of
-from .stop import Stop
 
 if TYPE_CHECKING:
     from hil.identify import Identification, Options

@@ -41,7 +41,7 @@ from .motion_link import (
     not_ready,
     unwatched,
 )
-from .operator import MotionWatch, unwatched_motion
+from .operator import MotionWatch, Stop, unwatched_motion
 from .steering import (
     ASKED_EVERY,
     NOT_BEGUN,
@@ -50,7 +50,6 @@ from .steering import (
     Steering,
     duration_of,
 )
-from .stop import Stop
 
 Array = NDArray[np.float64]
 DRAIN_CYCLES = 100

@@ -65,7 +65,7 @@ from .motion_link import (
     not_ready,
     unwatched,
 )
-from .operator import MotionWatch, unwatched_motion
+from .operator import MotionWatch, Stop, unwatched_motion
 from .steering import (
     NOT_BEGUN,
     PacketCounts,
@@ -74,7 +74,6 @@ from .steering import (
     duration_of,
     guard_in_force,
 )
-from .stop import Stop
 
 BEAT: Final = 0.05
 """s between two heartbeats; the exchange stops the arm after 0.5 s without one."""

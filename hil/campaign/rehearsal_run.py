@@ -50,8 +50,8 @@ from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedE
 from .folder import CampaignFolder
 from .intervals import require_runnable, wanted
 from .link import Link
+from .operator import Stop
 from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
-from .stop import Stop
 
 Array = NDArray[np.float64]
 

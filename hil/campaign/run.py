@@ -19,10 +19,9 @@ from .folder import CampaignFolder
 from .intervals import Interval, wanted
 from .link import Link
 from .motion_link import MotionLink
-from .operator import Operator, RunWatch
+from .operator import Operator, RunWatch, Stop
 from .plan import CampaignPlan, moves_to_dict
 from .quality import Entering, Rejected
-from .stop import Stop
 
 if TYPE_CHECKING:
     from .campaign import Campaign

@@ -26,8 +26,7 @@ from hil.archive.recorder import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
-from .operator import Latency, MotionProgress, MotionWatch
-from .stop import Stop
+from .operator import Latency, MotionProgress, MotionWatch, Stop
 
 NOT_BEGUN: Final = "it had not begun"
 """Why a motion ends that was stopped before it was asked for."""

@@ -23,7 +23,7 @@ from identification.model.robot import RobotModel
 from planner import JointLimits
 
 from .checks import check_assumed, check_built, check_lengths, check_locked, check_turning
-from .errors import CellError, first_error
+from .errors import CellError, first_error, require_known
 from .robot import robot_model
 from .schema import (
     BoundsTable,
@@ -39,7 +39,6 @@ from .schema import (
     WorkspaceTable,
 )
 from .text import with_values
-from .unknown import require_known
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec

@@ -24,7 +24,7 @@ from hil.importers import (
     import_rosbag2,
     recorded_joints,
 )
-from hil.lines import say
+from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
 

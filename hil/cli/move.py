@@ -22,9 +22,8 @@ from hil.cell_link import cell_link
 from hil.cli.arguments import JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
-from hil.lines import say
 from hil.move import THERE, Way, axis_alone, posture, send, straight_way, turned
-from hil.progress import Task
+from hil.progress import Task, say
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
 from hil.terminal_text import printable

@@ -13,7 +13,6 @@ from hil.cli.arguments import JsonOption
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.importers import convention_of
-from hil.lines import say
 from hil.new import (
     Known,
     NewCell,
@@ -24,6 +23,7 @@ from hil.new import (
     read_init,
     with_clear_home,
 )
+from hil.progress import say
 from hil.reading import port_number
 
 PORT = 1000

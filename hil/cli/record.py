@@ -20,7 +20,7 @@ from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.errors import ControllerFault, HilError, OperatorStopError
-from hil.lines import say
+from hil.progress import say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 from hil.terminal_text import printable

@@ -51,8 +51,8 @@ def controller_in(path: Path) -> ControllerTable:
         CellError: the file cannot be used, or `[controller]` is not known.
     """
     from hil.cell import Cell
+    from hil.cell.errors import UnknownFieldsError
     from hil.cell.schema import ControllerTable
-    from hil.cell.unknown import UnknownFieldsError
 
     try:
         return Cell.load(path).controller

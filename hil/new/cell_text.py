@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell import Cell, CellError
+from hil.cell.errors import UNKNOWN, WHERE
 from hil.cell.text import urdf_limits, with_values
-from hil.cell.unknown import UNKNOWN, WHERE
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.motion_checks import collision_checker

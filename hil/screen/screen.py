@@ -25,14 +25,12 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.campaign.dry_run import DryRun
-from hil.campaign.operator import OperatorRequest, RunStatus
-from hil.campaign.stop import Stop
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
-from hil.lines import put
-from hil.progress import Silent, Task
+from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
 
-from . import layout, marks
+from . import layout
 from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
@@ -129,7 +127,7 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 
 
 def _table(title: str, found: DryRun) -> Table:
-    heading = f"Dry run of {title}, {marks.clock(found.duration)} long"
+    heading = f"Dry run of {title}, {layout.clock(found.duration)} long"
     table = Table(title=Text(printable(heading)))
     table.add_column("joint")
     table.add_column("largest following error", justify="right")
@@ -395,8 +393,8 @@ class Screen:
     def _left(self, status: RunStatus) -> str:
         waiting = self._pace.left(status)
         if waiting is None:
-            return f"{marks.clock(status.time_left)} of motion left"
-        return f"{marks.clock(waiting)} left"
+            return f"{layout.clock(status.time_left)} of motion left"
+        return f"{layout.clock(waiting)} left"
 
     def _open(self) -> None:
         self._undo = contextlib.ExitStack()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hil.campaign.operator import OperatorRequest, RunStatus, RunWatch
-from hil.campaign.stop import Stop
+from hil.campaign.operator import OperatorRequest, RunStatus, RunWatch, Stop
 
 
 class Failing:

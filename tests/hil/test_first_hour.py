@@ -14,8 +14,8 @@ import pytest
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import with_values
-from hil.cell.unknown import UnknownFieldsError
 from hil.demo_link import free_port
 from tests.docs import typed
 
@@ -97,7 +97,7 @@ def test_the_copy_of_the_simulated_arms_cell_is_whole_and_reaches_the_controller
 
 
 def test_the_list_names_every_field_that_hil_new_leaves_open() -> None:
-    from hil.cell.unknown import WHERE
+    from hil.cell.errors import WHERE
 
     items = re.findall(r"(?m)^- (`.*?):", DOCUMENT.read_text("utf-8"))
     said = {field for item in items for field in re.findall(r"`(\w+)`", item)}

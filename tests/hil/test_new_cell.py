@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from hil.new.controller import _nothing_moves
 from typer.testing import CliRunner
 
 from drivers.init_check import compare
@@ -21,15 +22,14 @@ from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import urdf_limits
-from hil.cell.unknown import UnknownFieldsError
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
-from hil.new.controller import _nothing_moves
 from hil.progress import Silent
 from hil.simulation import simulated_link
 from hil.testing import shortened

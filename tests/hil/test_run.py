@@ -26,10 +26,9 @@ from hil.campaign.errors import (
     MotionFailedError,
     RepetitionsRejectedError,
 )
-from hil.campaign.operator import OperatorRequest, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
 from hil.campaign.run import RunResult
-from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
 from hil.identify.sources import gather_sources

@@ -38,10 +38,9 @@ from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.operator import OperatorRequest, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
-from hil.campaign.stop import Stop
 from hil.campaign.warmup import COLD_AFTER, WarmUp
 from hil.cell import Cell
 from hil.cli import app

@@ -26,12 +26,18 @@ import pytest
 from rich.console import Console, Group
 
 from drivers.states import State
-from hil.campaign.operator import DriftCurve, Latency, MotionProgress, OperatorRequest, RunStatus
-from hil.campaign.stop import Stop
+from hil.campaign.operator import (
+    DriftCurve,
+    Latency,
+    MotionProgress,
+    OperatorRequest,
+    RunStatus,
+    Stop,
+)
 from hil.cell import Cell
 from hil.cell.schema import CanTable
-from hil.lines import put
-from hil.screen import Screen, layout, marks
+from hil.progress import put
+from hil.screen import Screen, layout
 from hil.screen.keys import Keyboard, after, single_keys, typed
 from hil.screen.layout import Shown, lines
 from hil.screen.screen import Pace, ScreenError, far_end_of
@@ -179,15 +185,15 @@ def test_a_temperature_is_shown_if_there_is_one() -> None:
 
 
 def test_a_bar_is_as_long_as_its_share() -> None:
-    assert marks.bar(0.5, 10).plain == "█████·····"
-    assert marks.bar(0.0, 4).plain == "····"
-    assert marks.bar(1.0, 4).plain == "████"
-    assert marks.bar(1.01, 4).plain == "███▶"
-    assert marks.bar(float("nan"), 4).plain == "?   "
-    assert [marks.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
+    assert layout.bar(0.5, 10).plain == "█████·····"
+    assert layout.bar(0.0, 4).plain == "····"
+    assert layout.bar(1.0, 4).plain == "████"
+    assert layout.bar(1.01, 4).plain == "███▶"
+    assert layout.bar(float("nan"), 4).plain == "?   "
+    assert [layout.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
         "0.4%", "9.9%", " 10%", " 50%", "130%",
     ]  # fmt: skip
-    assert marks.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
+    assert layout.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
 
 
 def test_a_plain_line_says_the_same() -> None:

@@ -22,8 +22,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from hil.cell import Cell
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.schema import ControllerTable
-from hil.cell.unknown import UnknownFieldsError
 from hil.cli.doctor import doctor
 from hil.doctor import probe
 from hil.doctor.check import Check, Status
