@@ -19,7 +19,7 @@ from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import AcceptInitOption, JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.move import THERE, Way, axis_alone, posture, send, straight_way, turned
@@ -80,14 +80,7 @@ def move(
             "goes no faster than the cell's approach_speed.",
         ),
     ] = False,
-    accept_init: Annotated[
-        bool,
-        typer.Option(
-            "--accept-init",
-            help="Use the controller's gear ratios, calibration and coupling where they differ "
-            "from the cell's; the archive says so.",
-        ),
-    ] = False,
+    accept_init: AcceptInitOption = False,
     only_axis: Annotated[
         bool,
         typer.Option(

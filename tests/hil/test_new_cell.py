@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from hil.new.controller import _nothing_moves
 from typer.testing import CliRunner
 
 from drivers.init_check import compare
@@ -30,6 +29,7 @@ from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
+from hil.new.known import _nothing_moves
 from hil.progress import Silent
 from hil.simulation import simulated_link
 from hil.testing import shortened
@@ -262,7 +262,7 @@ def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
     ("options", "sentence"),
     [
         (["--fix", "elbow"], "has no moving joint elbow; it has hip, knee"),
-        (["--fix", "hip=high"], "'hip=high' is no JOINT=POSITION"),
+        (["--fix", "hip=high"], "'hip=high' is no NAME=NUMBER"),
         (["--from-controller", "a:b"], "is no HOST or HOST:PORT"),
         (["--from-controller", "a:70000"], "is no HOST or HOST:PORT"),
         (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is no HOST or HOST:PORT"),
