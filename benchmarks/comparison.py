@@ -24,7 +24,6 @@ from typing import Any, Final
 from hil import Campaign, Cell
 from hil.batch.workers import LocalWorkers
 from hil.campaign import design
-from hil.cell.text import replaced_value
 from hil.compare import compare_campaigns, gather
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
@@ -36,13 +35,13 @@ FACTOR: Final = 1.35
 
 def with_more_friction(cell: Cell) -> Cell:
     """The same cell, whose simulated arm has more friction on one axis."""
-    text = cell.text
+    changed: dict[str, list[float]] = {}
     for key in ("coulomb", "viscous"):
         assert cell.file.simulation is not None
         values = list(getattr(cell.file.simulation, key))
         values[AXIS] *= FACTOR
-        text = replaced_value(text, "simulation", key, str(values))
-    return Cell.from_texts(text, cell.urdf, cell.path)
+        changed[f"simulation.{key}"] = values
+    return cell.with_values(changed)
 
 
 def measure(repetitions: int) -> dict[str, Any]:

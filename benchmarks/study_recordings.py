@@ -18,7 +18,6 @@ import numpy as np
 
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.files import make_folder
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
@@ -102,11 +101,8 @@ class Kept:
 def study_cell() -> Cell:
     """The NS 16 cell with one repetition, its arm at home when it is switched on."""
     cell = Cell.load(CELL_PATH)
-    text = cell.text
-    for key, value in _CAMPAIGN.items():
-        text = replaced_value(text, "campaign", key, value)
-    text = replaced_value(text, "simulation", "initial_deg", str(cell.campaign.home_deg))
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    campaign = {f"campaign.{key}": value for key, value in _CAMPAIGN.items()}
+    return cell.with_values({**campaign, "simulation.initial_deg": cell.campaign.home_deg})
 
 
 def study_plan(folder: Path, cell: Cell) -> CampaignPlan:
@@ -150,12 +146,13 @@ def _with_effect(cell: Cell, condition: Condition) -> Cell:
     """The cell with this effect alone at the size it names, if it is one of them."""
     if condition not in EFFECTS:
         return cell
-    text = cell.text
-    for other, setting in EFFECTS.items():
-        if other != condition:
-            none = str([0.0] * len(cell.joint_names)) if other == "elasticity" else 0.0
-            text = replaced_value(text, "simulation", setting, none)
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    return cell.with_values(
+        {
+            f"simulation.{setting}": [0.0] * len(cell.joint_names) if other == "elasticity" else 0.0
+            for other, setting in EFFECTS.items()
+            if other != condition
+        }
+    )
 
 
 def _run(

@@ -15,7 +15,7 @@ import numpy as np
 from hil import Cell
 from hil.archive import open_archive
 from hil.campaign import stop_on_interrupt
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
+from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell_link import cell_link
 from hil.move import send, straight_way
 

@@ -13,7 +13,6 @@ from hil import Campaign, Cell
 from hil.batch.run import Plan, reidentify
 from hil.batch.workers import LocalWorkers
 from hil.campaign import design
-from hil.cell.text import replaced_value
 from hil.progress import Silent
 
 HERE = Path(__file__).parent
@@ -27,8 +26,7 @@ def record(root: Path) -> None:
     )
     plan = design(arm, Silent())
     for month, shoulder in (("2026-04", 8.2), ("2026-05", 8.2), ("2026-06", 12.3)):
-        text = replaced_value(arm.text, "simulation", "coulomb", f"[{shoulder}, 3.1]")
-        cell = Cell.from_texts(text, arm.urdf, arm.path)
+        cell = arm.with_values({"simulation.coulomb": [shoulder, 3.1]})
         Campaign.create(root / month, cell, plan).run(unrehearsed=True)
 
 

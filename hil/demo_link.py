@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import IO
+from typing import IO, Any
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
@@ -39,44 +40,61 @@ class SimulatorProcess:
     """
 
     process: subprocess.Popen[bytes]
-    _words: IO[bytes]
+    _words: IO[bytes] = field(repr=False)
+    _figures: IO[bytes] = field(repr=False)
 
     @classmethod
     def start(cls, cell: Path, *options: str) -> SimulatorProcess:
         """Start a controller for a cell file."""
-        words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        words, figures = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - for its life
         process = subprocess.Popen(
             [*SIMULATE, str(cell), "--json", *options],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            stdout=figures,
             stderr=words,
             start_new_session=True,
         )
-        return cls(process, words)
+        return cls(process, words, figures)
+
+    @property
+    def running(self) -> bool:
+        """Whether its session goes on, or has yet to begin."""
+        return self.process.poll() is None
 
     def finish(self) -> None:
         """Ask it to end the session: the arm stands, the drive goes off, then mode 504."""
-        if self.process.poll() is None:
+        if self.running:
             self.process.send_signal(signal.SIGTERM)
 
     def failure(self) -> str | None:
         """What it said before it failed; None while it runs, or if it ended properly."""
         if not self.process.poll():
             return None
-        self._words.seek(0)
-        lines = self._words.read().decode(errors="replace").splitlines()
-        said = [line.strip() for line in lines if any(letter.isalpha() for letter in line)]
+        said = [line for line in _lines(self._words) if any(letter.isalpha() for letter in line)]
         errors = [line for line in said if line.startswith("error:")]
         return (errors or said or [f"exit status {self.process.returncode}"])[-1]
 
-    def end(self) -> None:
-        """Wait for its end; kill it if it does not come."""
+    def end(self) -> dict[str, Any]:
+        """Wait for its end; kill it if it does not come.
+
+        Returns:
+            what it counted, see `docs/simulate.md`: cycles, replies, missed, late, intervals, …;
+            nothing if it had to be killed.
+        """
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(END_TIMEOUT)
-        if self.process.poll() is None:
+        if self.running:
             self.process.kill()
             self.process.wait()
+        lines = _lines(self._figures)
         self._words.close()
+        self._figures.close()
+        return json.loads(lines[-1]) if lines else {}
+
+
+def _lines(file: IO[bytes]) -> list[str]:
+    file.seek(0)
+    return [line.strip() for line in file.read().decode(errors="replace").splitlines()]
 
 
 @contextmanager

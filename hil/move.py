@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,18 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
-from hil.archive import ArchiveSpec
 from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.intervals import at_limit, beyond, player_of
 from hil.campaign.motion_link import MotionLink
-from hil.campaign.motion_watch import MotionWatch, unwatched_motion
+from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
-from hil.campaign.stop import Stop
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
-from hil.recording import kind_entry, origin_of
+from hil.recording import archive_spec, kind_entry, origin_of
 from planner import Move, PiecewiseCubic, PlanFile, in_child, plan_moves
 
 Array = NDArray[np.float64]
@@ -224,27 +221,14 @@ def send(
     checks = checks_in_force(cell, link.connection, way.checks)
     if checks is not way.checks:
         _require(checks, way.trajectory)
-    player = player_of(cell, way.trajectory)
-    spec = ArchiveSpec(
+    spec = archive_spec(
+        cell,
         path,
-        joint_names=cell.joint_names,
-        period=cell.period,
-        metadata={
-            "cell": cell.name,
-            **kind_entry(path, "move"),
-            **origin_of(cell, only_simulated=link.only_simulated),
-        },
-        attachments={
-            "cell.toml": cell.text.encode(),
-            "robot.urdf": cell.urdf.encode(),
-            "drive_train.json": cell.drive_table.model_dump_json().encode(),
-            "plan.json": json.dumps(
-                {"trajectory": way.trajectory.to_dict(), **moves_to_dict(way.moves)}
-            ).encode(),
-        },
+        {**kind_entry(path, "move"), **origin_of(cell, only_simulated=link.only_simulated)},
+        {"trajectory": way.trajectory.to_dict(), **moves_to_dict(way.moves)},
         durable=durable,
     )
-    return link.run(player, spec, stop, watch=watch)
+    return link.run(player_of(cell, way.trajectory), spec, stop, watch=watch)
 
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic) -> None:

@@ -1,4 +1,4 @@
-"""How long work reports itself: a progress bar on a terminal, plain lines elsewhere."""
+"""What a person reads: single lines, and how far long work is (a bar, or plain lines)."""
 
 from __future__ import annotations
 
@@ -25,6 +25,20 @@ from hil.terminal_text import printable
 
 # Columns that a bar takes at least.
 _NARROWEST = 8
+
+
+def put(console: Console, text: str) -> None:
+    """Print one line as it is, without markup; broken between words where a person reads it.
+
+    What steers a terminal is written out.
+    """
+    whole = not console.is_terminal
+    console.print(printable(text), markup=False, emoji=False, highlight=False, soft_wrap=whole)
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print one line to standard output, or to standard error."""
+    put(Console(stderr=err), text)
 
 
 class Reporter(Protocol):

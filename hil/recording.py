@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from hil.archive import CONTROLLERS_OWN, ArchiveName, ArchiveSpec
 from hil.campaign import Recorded, Stop
@@ -48,24 +50,43 @@ def record(
         OperatorStopError: stopped before it came.
         ArchiveWriteError: the archive cannot be written.
     """
-    spec = ArchiveSpec(
+    metadata = {"motion": CONTROLLERS_OWN, **kind_entry(path, kind), **origin_of(cell)}
+    spec = archive_spec(cell, path, metadata, durable=durable)
+    return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
+
+
+def archive_spec(
+    cell: Cell,
+    path: Path,
+    metadata: Mapping[str, str],
+    plan: Mapping[str, Any] | None = None,
+    *,
+    durable: bool,
+) -> ArchiveSpec:
+    """An archive of a cell's arm, which needs nothing else to be identified from.
+
+    Args:
+        cell: travels in the archive, with its URDF and drive train.
+        path: of the archive, which must not exist.
+        metadata: beside the cell's name.
+        plan: the motion that was planned; None for one of the controller's own.
+        durable: wait at each flush until the disk has the data.
+    """
+    attachments = {
+        "cell.toml": cell.text.encode(),
+        "robot.urdf": cell.urdf.encode(),
+        "drive_train.json": cell.drive_table.model_dump_json().encode(),
+    }
+    if plan is not None:
+        attachments["plan.json"] = json.dumps(plan).encode()
+    return ArchiveSpec(
         path,
         joint_names=cell.joint_names,
         period=cell.period,
-        metadata={
-            "motion": CONTROLLERS_OWN,
-            "cell": cell.name,
-            **kind_entry(path, kind),
-            **origin_of(cell),
-        },
-        attachments={
-            "cell.toml": cell.text.encode(),
-            "robot.urdf": cell.urdf.encode(),
-            "drive_train.json": cell.drive_table.model_dump_json().encode(),
-        },
+        metadata={"cell": cell.name, **metadata},
+        attachments=attachments,
         durable=durable,
     )
-    return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
 
 
 def archive_path(output: Path, kind: str) -> Path:

@@ -12,9 +12,9 @@ from .intervals import Interval, require_runnable
 from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink, Progress, Recorded
+from .operator import Stop, stop_on_interrupt
 from .plan import CampaignPlan, PlannedMotion
 from .quick_design import design, plan_around
-from .stop import Stop, stop_on_interrupt
 
 __all__ = [
     "Campaign",

@@ -20,27 +20,24 @@ from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
 from .errors import CampaignFolderError, WrongObjectError
-from .execution_result import RunResult
-from .folder import CampaignFolder
+from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
 from .motion_link import MotionLink
-from .operator import Operator
+from .operator import Operator, Stop, Unattended
 from .plan import CampaignPlan
 from .quick_design import plan_around
 from .rehearsal import Rehearsal
 from .status import CampaignStatus, status_of
-from .stop import Stop
 
 if TYPE_CHECKING:
     from hil.identify import Identification, Options
     from sim_fixtures import SimulatedDrive
 
+    from .run import RunResult
 
 import shutil
 
 from hil.errors import HilError
-
-from .folder_lock import LOCK
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -282,24 +279,25 @@ class Campaign:
             CampaignFolderError: the folder was changed, or another run is at work on it.
             OutputError: what came of it cannot be written down.
         """
-        from .execution import Choices, run_campaign  # which knows campaigns
+        from .execution import execute  # which knows campaigns
+        from .run import Run
 
-        return run_campaign(
-            self,
-            link,
-            stop,
-            reporter,
-            operator=operator,
-            provenance=provenance,
-            choices=Choices(
+        return execute(
+            Run(
+                self,
+                link,
+                stop or Stop(),
+                reporter or Silent(),
+                operator or Unattended(),
+                said=provenance,
+                durable=durable,
                 unrehearsed=unrehearsed,
                 dry_run_only=dry_run_only,
                 accept_dry_run=accept_dry_run,
                 accept_torque=tuple(accept_torque),
-                durable=durable,
                 live=live,
                 repetitions=repetitions,
-            ),
+            )
         )
 
 

@@ -8,20 +8,26 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, OperatorStopError
 from hil.files import write_or_tell
 from hil.reading import json_of, lies_there, text_of
 
-from .errors import CampaignFolderError
+from .errors import AgainstGravityError, CampaignFolderError, DryRunError
 from .folder import CampaignFolder, read_back
-from .gravity_check import AGAINST, GravityCheck
-from .operator import DryRunSummary
+from .intervals import Interval
+
+if TYPE_CHECKING:
+    from .run import Run
+    from .runner import Runner
+
+Array = NDArray[np.float64]
 
 SIMULATED: Final = "simulated"
 """Metadata: whether nothing but a simulated arm can have moved, "yes" or "no". The link says so,
@@ -41,11 +47,106 @@ def made_by(path: Path, only_simulated: bool) -> bool:
         return False
 
 
+DryRunState = Literal["accepted", "to be accepted", "left out"]
+
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""
 FORMAT_VERSION: Final = 2
 """1 did not look at torques."""
 _FIELDS: Final = ("cycle", "gap", "position", "target_position", "target_current")
+
+
+AGAINST: Final = (
+    "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
+)
+CLEAR: Final = 0.5
+"""Correlation from which torque and gravity belong together, or against each other."""
+_LEAST_SHARE: Final = 0.05
+"""Gravity as a share of the rms torque below which the joint has none to speak of."""
+_LEAST_SAMPLES: Final = 100
+_STEP: Final = 0.01
+"""s between samples that are looked at."""
+_GRAVITY_FIELDS: Final = ("position", "commanded_position", "torque")
+
+
+@dataclass(frozen=True)
+class GravityCheck:
+    """What slow motion says of the sign of each joint's torque.
+
+    At a fifth of full speed inertia is next to nothing: what a joint's torque is beside friction is
+    gravity. The measured torque is regressed on the nominal model's gravity with Coulomb and
+    viscous friction beside it; the correlation of what friction leaves of both tells whether they
+    agree. A torque of the wrong sign, a `joint_sign` or zero position that mirrors the arm, or
+    masses that are not there make it negative. There is no constant beside them: the sign of a
+    weight that hardly changes counts as well.
+
+    Attributes:
+        against: joints whose torque runs against the model's gravity.
+        not_seen: joints with too little gravity, beside friction, to tell.
+    """
+
+    against: tuple[str, ...]
+    not_seen: tuple[str, ...]
+
+    @classmethod
+    def of(cls, cell: Cell, paths: Sequence[Path]) -> GravityCheck:
+        """What the archives of a dry run say.
+
+        Raises:
+            ArchiveError: one of them cannot be read.
+        """
+        parts = [_slow_motion(path, cell.period) for path in paths]
+        q, qd, torque = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        still, model = np.zeros_like(q), cell.model
+        rigid = np.where(model.friction_columns, 0.0, cell.nominal_values())
+        gravity = model.torque(rigid, q, still, still) + model.load_torque(q, still, still)
+        found = agreement(gravity, torque, qd, model.moving(qd))
+        names = np.array(cell.joint_names)
+        return cls(
+            against=tuple(names[found < -CLEAR].tolist()),
+            not_seen=tuple(names[~(np.abs(found) >= CLEAR)].tolist()),
+        )
+
+
+def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np.bool_]) -> Array:
+    """Correlation of gravity and torque beside friction, -1 to 1, for each joint (n,).
+
+    Args:
+        gravity: by the model (m, n) [N·m].
+        torque: measured (m, n) [N·m].
+        velocity: (m, n) [rad/s].
+        moving: rows of each joint that count (m, n): friction is known in direction there.
+
+    Returns:
+        NaN for a joint that hardly moves, or that gravity hardly loads.
+    """
+    found = np.full(gravity.shape[1], np.nan)
+    for joint in range(len(found)):
+        rows = moving[:, joint]
+        if rows.sum() < _LEAST_SAMPLES:
+            continue
+        speed = velocity[rows, joint]
+        both = np.column_stack([gravity[rows, joint], torque[rows, joint]])
+        size = np.sqrt(np.mean(both[:, 1] ** 2))
+        friction = np.column_stack([np.sign(speed), speed])
+        rest = both - friction @ np.linalg.lstsq(friction, both, rcond=None)[0]
+        weight, measured = np.linalg.norm(rest, axis=0)
+        if weight > _LEAST_SHARE * size * np.sqrt(rows.sum()) and measured > 0.0:
+            found[joint] = rest[:, 0] @ rest[:, 1] / (weight * measured)
+    return found
+
+
+def _slow_motion(path: Path, period: float) -> tuple[Array, Array, Array]:
+    """Position, planned velocity and torque (m, n) of one archive, each every `_STEP`."""
+    columns = open_archive(path, fields=_GRAVITY_FIELDS).recorded(*_GRAVITY_FIELDS)
+    commanded = columns["commanded_position"]
+    step = max(1, round(_STEP / period))
+    rows = np.flatnonzero(~np.isnan(commanded).any(axis=1))[::step]
+    if len(rows) < 2:
+        empty = np.zeros((0, commanded.shape[1]))
+        return empty, empty, empty
+    velocity = np.gradient(commanded[rows], step * period, axis=0)
+    return columns["position"][rows], velocity, columns["torque"][rows]
 
 
 @dataclass(frozen=True)
@@ -232,20 +333,119 @@ class DryRun:
         """This dry run, accepted by whoever runs the program."""
         return replace(self, accepted=Acceptance.now())
 
-    def summary(self, campaign: str) -> DryRunSummary:
-        """What a person is to accept."""
-        return DryRunSummary(
-            campaign=campaign,
-            plan_hash=self.plan_hash,
-            archives=self.archives,
-            override=self.override,
-            duration=self.duration,
-            simulated=self.simulated,
-            joint_names=self.joint_names,
-            current_share=np.array(self.current_share),
-            following_error=np.array(self.following_error),
-            missed=self.missed,
-            late=self.late,
-            against_gravity=self.against_gravity,
-            gravity_not_seen=self.gravity_not_seen,
+
+class DryRunStage:
+    """Every motion that will be sent at full speed, once and slowly.
+
+    Args:
+        run: whose excitation and validation motions are looked at; repetitions of one once.
+
+    Attributes:
+        intervals: the motions under the names of their slow runs.
+        state: whether a person has accepted what was done; "left out" where the caller did without.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.state: DryRunState = "left out" if run.unrehearsed else "to be accepted"
+        self._motions = [
+            one for one in run.wanted
+            if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
+        ]  # fmt: skip
+        self.intervals = [
+            replace(one, kind="dryrun", index=k) for k, one in enumerate(self._motions)
+        ]
+        # Nobody knows beforehand what will contradict: only what an earlier run saw is accepted.
+        self._known = run.accept_torque if run.accept_torque and self.found() else ()
+
+    def found(self) -> DryRun | None:
+        """The dry run of exactly this plan and kind of arm; None where none counts."""
+        if self._run.unrehearsed:
+            return None
+        return DryRun.that_counts(
+            self._run.folder,
+            plan_hash=self._run.plan_hash,
+            motions=len(self._motions),
+            simulated=self._run.simulated,
         )
+
+    def missing(self) -> list[Interval]:
+        """Each motion that was not run slowly yet."""
+        if self._run.unrehearsed:
+            return []
+        both = zip(self._motions, self.intervals, strict=True)
+        return [one for one, slow in both if self._whole(slow) is None]
+
+    def run(self, runner: Runner) -> None:
+        """Run what is missing, slowly, and have it accepted.
+
+        Raises:
+            DryRunError, OperatorStopError: see `settle`.
+        """
+        missing = [slow for slow in self.intervals if self._whole(slow) is None]
+        if self._run.unrehearsed or not missing:
+            return
+        for slow in missing:
+            name = runner.play(slow, slow.index + 1, len(self._motions), OVERRIDE)
+            self._run.entering.enter(slow, name)
+        self.settle()
+
+    def settle(self) -> None:
+        """Write down what was done, once all of it is, and have it accepted.
+
+        Raises:
+            DryRunError: it must be accepted now and is not.
+            OperatorStopError: a stop was asked for instead of an answer.
+        """
+        run, found = self._run, self.found()
+        if run.unrehearsed:
+            return
+        if found is None:
+            names = [name for slow in self.intervals if (name := self._whole(slow)) is not None]
+            if len(names) < len(self._motions):
+                return
+            found = DryRun.of(
+                run.folder, run.cell, names, plan_hash=run.plan_hash, simulated=run.simulated
+            )
+            found.save(run.folder.dry_run)
+        if found.accepted is None:
+            unknown = [joint for joint in found.against_gravity if joint not in self._known]
+            if not self._agreed(found, unknown):
+                if not run.dry_run_only:
+                    raise not_accepted(run.folder, unknown)
+                return
+            found.accepted_now().save(run.folder.dry_run)
+        self.state = "accepted"
+
+    def _agreed(self, found: DryRun, unknown: Sequence[str]) -> bool:
+        """Whether the caller accepts, or the operator; unknown joints only the operator."""
+        run = self._run
+        if run.accept_dry_run and not unknown:
+            return True
+        agreed = run.operator.can_answer and run.operator.accept_dry_run(found)
+        if run.operator.can_answer and not agreed and run.stop.requested:
+            raise OperatorStopError(
+                f"{run.folder.root}: stopped instead of an answer; its slow dry run was done, and "
+                "is not accepted."
+            )
+        return agreed
+
+    def _whole(self, slow: Interval) -> str | None:
+        """Name of its whole archive, if this kind of arm made it."""
+        folder = self._run.folder
+        name = folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(folder.archives / name, self._run.simulated)
+        return name if made else None
+
+
+def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
+    """What is raised where a dry run that was done is not accepted.
+
+    Args:
+        folder: of the campaign.
+        against: joints whose torque runs against the model's gravity, and that nobody named.
+    """
+    if against:
+        return AgainstGravityError(folder.root, against, AGAINST)
+    how = f"if the motions looked right, run `hil run {folder.root} --accept-dry-run`"
+    return DryRunError(folder.root, "was done, but is not accepted", how)

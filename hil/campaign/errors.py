@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -10,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive.supervised import Failed
-from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError, UnsafeError
+from hil.errors import ControllerFault, HilError, InputError, UnsafeError
 from hil.terminal_text import plural
 
 
@@ -142,11 +140,3 @@ class ArmChangedError(RepetitionsRejectedError):
             "near it. If it can be put back as it was, do so and run the campaign again; if the "
             "later ones are right, begin a new campaign.",
         )
-
-
-def write_error(failed: Failed) -> ArchiveWriteError:
-    """What is raised where the archive process cannot write."""
-    error = ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
-    if failed.errno is not None:
-        error.__cause__ = OSError(failed.errno, os.strerror(failed.errno))
-    return error

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, Final
 from hil.archive import ArchiveName
 from hil.archive.header import REJECTED
 from hil.files import write_atomically
-from hil.io import digest, file_digest, json_digest
+from hil.io import digest, file_digest, is_locked, json_digest, locked
 from hil.reading import is_no_file, json_of, lies_there, opened, text_of
 
-from . import folder_lock
 from .errors import CampaignFolderError, NotRehearsedError
 
 if TYPE_CHECKING:
@@ -67,6 +66,9 @@ def first_of(error: ValidationError) -> str:
     return f"{place}: {first['msg']}" if place else str(first["msg"])
 
 
+LOCK: Final = "campaign.lock"
+LOCK_PATIENCE: Final = 0.5
+"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
 MESH: Final = "mesh "
 """Begins the entry of a mesh, by its name in the URDF."""
 MISSING: Final = "missing"
@@ -269,12 +271,21 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: another run is at work on it, or the disk refuses.
         """
-        return folder_lock.locked(self.root)
+
+        def refusal(error: OSError) -> CampaignFolderError:
+            if isinstance(error, BlockingIOError):
+                return CampaignFolderError(
+                    self.root, "another run is at work on it", "wait for its end, or stop it"
+                )
+            problem = f"{LOCK} cannot be written ({error.strerror})"
+            return CampaignFolderError(self.root, problem, "make it a writable file")
+
+        return locked(self.root / LOCK, refusal, patience=LOCK_PATIENCE)
 
     @property
     def busy(self) -> bool:
         """Whether a run is at work on the folder at this moment."""
-        return folder_lock.busy(self.root)
+        return is_locked(self.root / LOCK)
 
     def seal(self) -> None:
         """Begin the manifest with the checksums of what the campaign is about."""

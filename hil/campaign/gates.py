@@ -2,30 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from drivers.drive_train import TURN
-from hil.archive import ArchiveHeader, open_archive
+from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
 from .controller_limits import narrower_thresholds
-from .dry_run import DryRun, said_of
-from .errors import AgainstGravityError, CampaignFolderError, DryRunError, NotRehearsedError
+from .dry_run import DryRun, DryRunStage, not_accepted, said_of
+from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .gravity_check import AGAINST
-from .motion_link import MotionLink
+from .motion_link import Connection
 from .rehearsal import Rehearsal
+
+if TYPE_CHECKING:
+    from .run import Run
 
 _ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
 """Keys of `[controller]` that say where it is, and not what is exchanged."""
 _MADE_BY: Final = {"yes": "a simulated arm", "no": "a real arm"}
 """By what an archive says of itself."""
+
+
+def require_gates(run: Run, dry_run: DryRunStage) -> None:
+    """Refuse what was not rehearsed, or whose dry run nobody can accept; nothing has moved yet.
+
+    Raises:
+        NotRehearsedError, DryRunError: each says what to do.
+        CampaignFolderError: folder, archives or link are not those of this campaign.
+    """
+    _require_one_world(run)
+    _require_own_link(run)
+    if run.unrehearsed:
+        _require_simulated(run)
+        return
+    if (warning := require_rehearsed(run.folder, run.plan_hash).warning) is not None:
+        run.notes.append(warning)
+        run.reporter.say(f"note: {warning}")
+    _require_dry_run(run, dry_run.found())
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
@@ -53,76 +71,57 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     return found
 
 
-def require_simulated(folder: CampaignFolder, only_simulated: bool) -> None:
-    """Refuse to leave out rehearsal and dry run where an arm may move.
-
-    Raises:
-        NotRehearsedError: the link may lead to a real controller.
-    """
-    if not only_simulated:
+def _require_simulated(run: Run) -> None:
+    """Refuse to leave out rehearsal and dry run where an arm may move."""
+    root = run.folder.root
+    if not run.simulated:
         raise NotRehearsedError(
-            folder.root,
+            root,
             "was not rehearsed, and its link leads out of this computer",
             "only a simulated controller on this computer (127.0.0.1) is driven without a "
-            f"rehearsal: run `hil rehearse {folder.root}`",
+            f"rehearsal: run `hil rehearse {root}`",
         )
 
 
-def require_one_world(folder: CampaignFolder, only_simulated: bool) -> None:
+def _require_one_world(run: Run) -> None:
     """Refuse to mix a simulated arm and a real one in one campaign.
 
     What a simulated arm did slowly says nothing of the room around a real one, and what either
-    did must not be pooled.
-
-    Raises:
-        CampaignFolderError: an archive that is there is of the other kind, or does not say of
-            which it is.
+    did must not be pooled. Archives that cannot be read are made anew.
     """
-    for header in _headers(folder):
-        made_by = header.simulated
-        if made_by != said_of(only_simulated):
-            break
-    else:
-        return
-    what = _MADE_BY.get(made_by, "an arm that they do not name (an earlier version wrote them)")
-    link = "a simulated one" if only_simulated else "a real one"
-    raise CampaignFolderError(
-        folder.root,
-        f"holds archives of {what}, and its link leads to {link}",
-        "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
-    )
-
-
-def _headers(folder: CampaignFolder) -> Iterator[ArchiveHeader]:
-    """What the archives that can be read say of themselves; those that cannot are made anew."""
-    for entry in folder.manifest():
+    for entry in run.folder.manifest():
+        path = run.folder.archives / entry.name
+        made_by: str | None = said_of(run.simulated)
         with suppress(ArchiveError):
-            if (folder.archives / entry.name).is_file():
-                yield open_archive(folder.archives / entry.name, fields=()).header
+            if path.is_file():
+                made_by = open_archive(path, fields=()).header.simulated
+        if made_by == said_of(run.simulated):
+            continue
+        what = _MADE_BY.get(
+            made_by or "", "an arm that they do not name (an earlier version wrote them)"
+        )
+        link = "a simulated one" if run.simulated else "a real one"
+        raise CampaignFolderError(
+            run.folder.root,
+            f"holds archives of {what}, and its link leads to {link}",
+            "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
+        )
 
 
-def require_link_of(cell: Cell, link: MotionLink, root: Path) -> None:
+def _require_own_link(run: Run) -> None:
     """Refuse a link that was opened for another arm than the campaign's.
 
     The address may differ, and what is planted in a simulated arm; a link that does not say what
     it was opened for is used as it is.
-
-    Args:
-        cell: of the campaign.
-        link: the caller's.
-        root: of the campaign.
-
-    Raises:
-        CampaignFolderError: URDF, limits, drive train or exchange are not the campaign's.
     """
-    other = getattr(link, "cell", None)
-    if not isinstance(other, Cell) or other is cell:
+    other = getattr(run.link, "cell", None)
+    if not isinstance(other, Cell) or other is run.cell:
         return
-    ours, theirs = _as_linked(cell), _as_linked(other)
+    ours, theirs = _as_linked(run.cell), _as_linked(other)
     differ = [name for name in ours if ours[name] != theirs[name]]
     if differ:
         raise CampaignFolderError(
-            root,
+            run.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",
             "open the link with the campaign's own cell (`campaign.cell`)",
         )
@@ -141,37 +140,44 @@ def _as_linked(cell: Cell) -> dict[str, Any]:
     }
 
 
-def require_own_figures(link: MotionLink, root: Path) -> None:
-    """Refuse a controller whose figures replace those that everything was checked with.
+def _require_dry_run(run: Run, found: DryRun | None) -> None:
+    """Refuse before anything moves, where nobody could accept the dry run that is to come."""
+    if found is None and run.accept_dry_run and not run.simulated:
+        raise DryRunError(
+            run.folder.root,
+            "cannot be accepted before it was done",
+            f"run `hil run {run.folder.root} --dry-run`, watch the arm, and accept it then",
+        )
+    if run.operator.can_answer or run.dry_run_only or run.accept_dry_run:
+        return
+    if found is None:
+        how = f"run `hil run {run.folder.root} --dry-run` and watch the arm"
+        raise DryRunError(run.folder.root, "was not done, and nobody is here to accept it", how)
+    if found.accepted is None:
+        raise not_accepted(run.folder, found.against_gravity)
+
+
+def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None) -> None:
+    """Refuse a controller whose figures are not those that everything was checked with.
+
+    Args:
+        run: what is run.
+        connection: to the controller.
+        found: the dry run, for what was needed then; None where there is none.
 
     Raises:
-        NotRehearsedError: names the differences.
+        NotRehearsedError: names the differences, or each joint whose following error trips the
+            controller sooner than the rehearsal allowed, and both thresholds.
     """
-    known = link.connection
-    if known.adopted and known.differences:
+    root, cell = run.folder.root, run.cell
+    if connection.adopted and connection.differences:
         raise NotRehearsedError(
             root,
             "was rehearsed and checked with the cell file's drive train, and this link uses the "
-            f"controller's ({'; '.join(known.differences)})",
+            f"controller's ({'; '.join(connection.differences)})",
             "write the controller's figures into the cell file and rehearse",
         )
-
-
-def require_rehearsed_thresholds(
-    cell: Cell, link: MotionLink, root: Path, found: DryRun | None
-) -> None:
-    """Refuse a controller that trips at a smaller following error than the rehearsal allowed.
-
-    Args:
-        cell: of the campaign.
-        link: connected.
-        root: of the campaign.
-        found: its dry run, for what was needed then; None where there is none.
-
-    Raises:
-        NotRehearsedError: names each joint and both thresholds.
-    """
-    below = narrower_thresholds(cell, link.connection)
+    below = narrower_thresholds(cell, connection)
     if not below:
         return
     needed = "what the motions need at full speed, no model tells"
@@ -188,50 +194,3 @@ def require_rehearsed_thresholds(
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "
         "or widen them in the controller",
     )
-
-
-def require_dry_run(
-    folder: CampaignFolder,
-    found: DryRun | None,
-    *,
-    can_answer: bool,
-    accept: bool,
-    only_simulated: bool,
-) -> None:
-    """Refuse before anything moves, where nobody could accept the dry run that is to come.
-
-    Args:
-        folder: of the campaign.
-        found: the dry run that counts (`DryRun.that_counts`), None for none.
-        can_answer: whether there is a person to ask.
-        accept: whether the caller accepts beforehand.
-        only_simulated: whether nothing but a simulated arm can move.
-
-    Raises:
-        DryRunError: it was not done, or is not accepted.
-    """
-    if found is None and accept and not only_simulated:
-        raise DryRunError(
-            folder.root,
-            "cannot be accepted before it was done",
-            f"run `hil run {folder.root} --dry-run`, watch the arm, and accept it then",
-        )
-    if can_answer or accept or (found is not None and found.accepted is not None):
-        return
-    if found is None:
-        how = f"run `hil run {folder.root} --dry-run` and watch the arm"
-        raise DryRunError(folder.root, "was not done, and nobody is here to accept it", how)
-    raise not_accepted(folder, found.against_gravity)
-
-
-def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
-    """What is raised where a dry run that was done is not accepted.
-
-    Args:
-        folder: of the campaign.
-        against: joints whose torque runs against the model's gravity, and that nobody named.
-    """
-    if against:
-        return AgainstGravityError(folder.root, against, AGAINST)
-    how = f"if the motions looked right, run `hil run {folder.root} --accept-dry-run`"
-    return DryRunError(folder.root, "was done, but is not accepted", how)

@@ -41,10 +41,15 @@ from .motion_link import (
     not_ready,
     unwatched,
 )
-from .motion_watch import MotionWatch, unwatched_motion
-from .progress import PacketCounts, ProgressDisplay, duration_of
-from .steering import ASKED_EVERY, NOT_BEGUN, Polite, Steering
-from .stop import Stop
+from .operator import MotionWatch, Stop, unwatched_motion
+from .steering import (
+    ASKED_EVERY,
+    NOT_BEGUN,
+    PacketCounts,
+    ProgressDisplay,
+    Steering,
+    duration_of,
+)
 
 Array = NDArray[np.float64]
 DRAIN_CYCLES = 100
@@ -387,8 +392,7 @@ class _Watching:
             if self.display.due:
                 state, progress = self._link.session.state, progress_of(self._source)
                 self.display.show(self._watch, state, self._counts(), *progress)
-            motion = Polite(self._link.session, self.display.messages)
-            self._steering.follow(motion)
+            self._steering.follow(self._link.session, self.display.messages)
             rests = progress_of(self._source)[1] == 0.0
             if not (self._steering.held and rests) or stop.requested:
                 return

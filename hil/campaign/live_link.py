@@ -9,32 +9,37 @@ the three notices the death of the others, and then the arm comes to rest on its
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Self
+from typing import Final, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DriverError
-from drivers.events import MotionEnded
+from drivers.errors import DriverError, RequestError
+from drivers.events import MotionEnded, Outcome
 from drivers.exchange import (
+    NO_ARCHIVE,
     NO_SUPERVISOR,
     ExchangeProcess,
     ExchangeSettings,
     RealTimeSettings,
     RingReader,
+    WithdrawnError,
 )
+from drivers.exchange.control import Pulse
 from drivers.motion_source import MotionSource
 from drivers.packet_records import CAPACITY
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView, LiveViewError, Serve
+from hil.archive.recorder import describe
 from hil.archive.supervised import (
     ArchiveProcessHandle,
     Close,
@@ -45,16 +50,14 @@ from hil.archive.supervised import (
     Serving,
 )
 from hil.cell import Cell
-from hil.cell.link import stays_here
-from hil.errors import ControllerFault
+from hil.cell.cell import stays_here
+from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 
-from .errors import write_error
 from .exchange_view import ExchangeView
-from .live_motion import LiveMotion
-from .live_recording import LiveRecording
 from .motion_link import (
     END_TIMEOUT,
     Connection,
+    Progress,
     Recorded,
     Watch,
     described,
@@ -62,8 +65,15 @@ from .motion_link import (
     not_ready,
     unwatched,
 )
-from .motion_watch import MotionWatch, unwatched_motion
-from .stop import Stop
+from .operator import MotionWatch, Stop, unwatched_motion
+from .steering import (
+    NOT_BEGUN,
+    PacketCounts,
+    ProgressDisplay,
+    Steering,
+    duration_of,
+    guard_in_force,
+)
 
 BEAT: Final = 0.05
 """s between two heartbeats; the exchange stops the arm after 0.5 s without one."""
@@ -496,3 +506,405 @@ class LiveLink:
                 trouble = f"{failure}; {self.open_path} is not complete"
             self.exchange.close()
         return trouble
+
+
+SLOW_DISK: Final = 1.0
+"""s at once that a disk takes for a flush when something is wrong with it."""
+REST_TIMEOUT: Final = 30.0
+"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
+
+
+class LiveMotion:
+    """One motion on a `LiveLink`.
+
+    Whatever happens here delays no answer: the exchange is asked through shared memory.
+    """
+
+    def __init__(self, link: LiveLink, stop: Stop, watch: MotionWatch, override: float) -> None:
+        self._link, self._stop, self._watch = link, stop, watch
+        self._view, self._exchange = link.view, link.exchange
+        self._steering = Steering(watch, override)
+        self._reader = link.reader()
+        self._stop_passed = False
+
+    def run(self, source: MotionSource, spec: ArchiveSpec) -> MotionEnded:
+        """See `MotionLink.run`."""
+        self._wait_for_begin(source)  # no archive is opened while a hold stands
+        self._link.open_archive(spec, from_now=True, until_ended=True)
+        # That may have taken seconds: nothing is asked for that is no longer wanted.
+        while self._wanted(source):
+            self._require_same_session()
+            self._view.forget_motion()
+            display = self._display(source)
+            self._link.heart.begin()
+            try:
+                self._submit(source, spec)
+                return self._supervised(display, spec)
+            except WithdrawnError:
+                continue  # it was stopped, held or slowed meanwhile, or a new session began
+            finally:
+                self._link.heart.rest()
+        self._link.complete("stopped", NOT_BEGUN)
+        return MotionEnded("stopped", NOT_BEGUN, -1, -1)
+
+    def _supervised(self, display: ProgressDisplay, spec: ArchiveSpec) -> MotionEnded:
+        """How the motion that was asked for ended."""
+        due = math.inf
+        while True:
+            self._look(display)
+            if (idle := self._view.not_begun()) is not None:
+                return self._give_up(idle)
+            answer = self._link.archive.answer(POLL, self._link.job)
+            if isinstance(answer, Closed):
+                return self._ending(answer)
+            if isinstance(answer, Failed):
+                self._link.open_path = ""
+                self._come_to_rest()
+                raise write_error(answer)
+            self._raise_failure()
+            if self._view.motion_ended or self._view.failure() is not None:
+                due = min(due, time.monotonic() + REST_TIMEOUT)
+            if time.monotonic() > due:
+                what = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
+                raise ControllerFault(f"the motion is over, but {what}")
+
+    def _wanted(self, source: MotionSource) -> bool:
+        """Whether the motion is still to begin; waits while it is held."""
+        try:
+            return self._wait_for_begin(source)
+        except ControllerFault as error:
+            self._link.complete("void", str(error))
+            raise
+
+    def _wait_for_begin(self, source: MotionSource) -> bool:
+        """See `Steering.begin`; what the exchange says meanwhile is not lost."""
+        begins = self._steering.begin(source, self._stop, self._view.look)
+        self._view.look()
+        return begins
+
+    def _still_wanted(self) -> bool:
+        """Whether it may begin the next moment, as it was handed over."""
+        self._link.heart.turn()
+        self._view.look()
+        same_session = self._view.inits == self._link.inits
+        return same_session and self._steering.unchanged(self._stop)
+
+    def _require_same_session(self) -> None:
+        """A controller that began anew may announce limits that no motion was checked against."""
+        self._view.look()
+        if self._view.inits > self._link.inits:
+            why = "the controller began a new session since it was connected"
+            self._link.complete("void", why)
+            raise ControllerFault(
+                f"{why}; nothing was sent, run again: its limits are checked anew"
+            )
+
+    def _submit(self, source: MotionSource, spec: ArchiveSpec) -> None:
+        try:
+            self._exchange.submit(source, self._still_wanted)
+        except WithdrawnError:
+            raise
+        except RequestError as error:
+            self._link.complete("refused", str(error))
+            why = self._link.heart.explained(str(error))
+            raise ControllerFault(f"{why}; {spec.path} says so") from error
+        except DriverError as error:
+            self._raise_failure()
+            self._exchange.stop()
+            self._view.look()
+            why = self._view.failure() or str(error)
+            closed = self._link.complete("void", why)
+            raise ControllerFault(f"{why}; {spec.path} is {closed.outcome}") from error
+
+    def _look(self, display: ProgressDisplay) -> None:
+        """Take in what is new, pass requests on, and show it if that is due."""
+        self._link.heart.turn()
+        display.note(self._view.look())
+        if self._stop.requested and not self._stop_passed:
+            self._exchange.stop()
+            self._stop_passed = True
+        if not self._view.motion_ended:
+            self._steering.follow(self._exchange, display.messages)
+        if display.due:
+            display.take(self._reader.drain())
+            status = self._view.status
+            display.show(
+                self._watch, self._view.state, self._counts(), status.motion_time, status.rate
+            )
+
+    def _display(self, source: MotionSource) -> ProgressDisplay:
+        connection, cell = self._link.connection, self._link.cell
+        drives = drives_in_force(cell, connection)
+        guard = guard_in_force(cell, drives, connection.init)
+        self._reader.drain()
+        return ProgressDisplay(drives, guard, self._steering, duration_of(source), self._counts())
+
+    def _counts(self) -> PacketCounts:
+        status = self._view.status
+        return PacketCounts(
+            status.answered,
+            status.missed,
+            status.late,
+            status.unanswered,
+            tuple(status.latencies),
+            1e-6 * status.worst_turnaround_us,
+        )
+
+    def _ending(self, closed: Closed) -> MotionEnded:
+        self._link.count(closed)
+        self._view.look()
+        if self._view.ended is not None:
+            ended = self._view.ended
+            return replace(ended, reason=self._explained(ended.reason, closed))
+        if closed.outcome in get_args(Outcome) and self._view.motion_ended:
+            outcome: Outcome = closed.outcome  # type: ignore[assignment]
+            reason = self._explained(closed.reason, closed)
+            return MotionEnded(outcome, reason, closed.interval, -1)
+        failure = self._view.failure() or closed.reason
+        alone = "the controller gets no answers and acts by its own watch"
+        raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
+
+    def _explained(self, reason: str, closed: Closed) -> str:
+        """Why a motion ended, with the cause where a process of ours did not get on."""
+        if reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
+            waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
+            return f"{reason} ({waited}: look after that disk)"
+        return self._link.heart.explained(reason)
+
+    def _give_up(self, why: str) -> MotionEnded:
+        """A motion that has not begun is dropped; without an archive it cannot begin any more."""
+        path, refused = self._link.open_path, self._view.refused
+        outcome = "void" if refused is None else "refused"
+        self._link.complete(outcome, why if refused is None else str(refused.error))
+        self._exchange.stop()
+        if refused is None:
+            raise ControllerFault(f"{why}; nothing was sent ({path})")
+        return MotionEnded("refused", str(refused.error), -1, -1)
+
+    def _raise_failure(self) -> None:
+        """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
+        path = self._link.open_path
+        if (failure := self._link.archive_failure()) is not None:
+            rests = "the arm was brought to rest"
+            if not self._come_to_rest():
+                state = self._view.state.name
+                rests = f"the arm was asked to stop, but was not seen at rest ({state})"
+            raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
+
+    def _come_to_rest(self) -> bool:
+        """Whether the motion has ended; the exchange stops it by itself, but is asked to again."""
+        self._exchange.stop()
+        deadline = time.monotonic() + REST_TIMEOUT
+        while not self._view.motion_ended and time.monotonic() < deadline:
+            if self._view.failure() is not None:
+                return False
+            self._link.heart.turn()
+            self._view.look()
+            time.sleep(POLL)
+        return self._view.motion_ended
+
+
+SILENCE = 1.0
+"""s without a packet after which nobody is there to be answered."""
+NOBODY = frozenset((State.SYNC, State.INIT, State.ENDED))
+"""States in which no session is going on."""
+TARGET_MOVED = 1e-5
+"""rad; a target at rest does not change at all, but its rounding may."""
+ARM_MOVED = 5e-4
+"""rad; more than an encoder's noise, less than any motion makes in a second."""
+REST = 1.0
+"""s of the controller's time without motion after which the arm is at rest."""
+OFF = 1.0
+"""s with the drive off after which answers end; a session that is being ended is ended by then."""
+
+
+class Standstill:
+    """Looks at records for the last motion of target or arm. A joint not known counts as moving.
+
+    Args:
+        period: cycle of the controller, s.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._cycles = round(REST / period)
+        self._target: NDArray[np.float64] | None = None
+        self._position: NDArray[np.float64] | None = None
+        self._since = 0
+
+    def take(self, records: NDArray[np.void]) -> bool:
+        """Whether the arm has been at rest for `REST` at the end of the next records (k,)."""
+        if not len(records):
+            return False
+        for record in records:
+            target, position, cycle = record["target_position"], record["position"], record["cycle"]
+            still = (
+                self._target is not None
+                and self._position is not None
+                and cycle > self._since
+                and bool(np.all(np.abs(target - self._target) <= TARGET_MOVED))
+                and bool(np.all(np.abs(position - self._position) <= ARM_MOVED))
+            )
+            if not still:
+                self._target, self._position = target.copy(), position.copy()
+                self._since = int(cycle)
+        return int(records["cycle"][-1]) - self._since >= self._cycles
+
+
+class LiveRecording:
+    """One recording on a `LiveLink`.
+
+    The controller's own program goes on when a recording ends, for whatever reason, and what it
+    does with a PC that falls silent in the middle of a motion is not known. So answers go on until
+    the arm has stood still for a second, the drive is off, the session has ended or nothing is
+    heard any more; or until the operator insists.
+    """
+
+    def __init__(self, link: LiveLink, stop: Stop, watch: Watch) -> None:
+        self._link, self._stop, self._watch = link, stop, watch
+        self._view = link.view
+        self._reader: RingReader = link.reader()
+        self._position: Array | None = None
+
+    def run(self, spec: ArchiveSpec, duration: float | None, wait: float | None) -> Recorded:
+        """Wait for the controller, record, and answer until the arm rests."""
+        self._await_controller(wait)
+        self._link.connection.require_usable(self._link.cell)
+        inits = self._view.inits
+        self._link.open_archive(spec, from_now=False, until_ended=False)
+        self._reader = self._link.reader()
+        try:
+            recorded = self._record(spec, duration, inits)
+        except (ArchiveWriteError, ControllerFault) as error:
+            self._answer_until_rest(f"the recording failed ({error})")
+            raise
+        self._answer_until_rest("recording complete")
+        return recorded
+
+    def _await_controller(self, wait: float | None) -> None:
+        until = None if wait is None else time.monotonic() + wait
+        while self._link.connection.init is None:
+            self._view.look()
+            self._show(over="")
+            if self._stop.requested:
+                raise OperatorStopError("ended before the controller came: nothing was recorded")
+            if (failure := self._view.failure()) is not None:
+                raise ControllerFault(f"{failure}: nothing was recorded")
+            if until is not None and time.monotonic() > until:
+                status = self._view.status
+                table = self._link.cell.controller
+                who = table.host if table.transport == "udp" else "the controller"
+                some = status.answered > 0 or self._view.not_understood
+                what = "no init packet" if some else "nothing"
+                also = f"; {self._view.not_understood}" if self._view.not_understood else ""
+                raise ControllerFault(
+                    f"{what} heard from {who} within {wait:g} s ({status.foreign} packets from "
+                    f"elsewhere{also}): nothing was recorded"
+                )
+            time.sleep(POLL)
+
+    def _record(self, spec: ArchiveSpec, duration: float | None, inits: int) -> Recorded:
+        while True:
+            ending = self._ends(duration, restarted=self._view.inits > inits)
+            self._take()
+            self._show(over="")
+            if ending is not None:
+                break
+            if (failed := self._link.failed_write()) is not None:
+                raise write_error(failed)
+            if (failure := self._link.archive_failure()) is not None:
+                raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
+        seconds = (self._view.status.cycle + 1) * self._link.cell.period
+        closed = self._link.complete(*ending)
+        return Recorded(
+            closed.outcome,
+            closed.reason,
+            closed.records,
+            closed.records_lost,
+            seconds=seconds,
+            events_lost=closed.events_lost,
+            missed=closed.missed,
+            late=closed.late,
+            untaken=closed.untaken,
+        )
+
+    def _ends(self, duration: float | None, *, restarted: bool) -> tuple[str, str] | None:
+        """Outcome and reason of a recording that is to end now, or None."""
+        # The process first: what it said and how the session stood at its end is known then.
+        failure = self._view.failure()
+        self._view.look()
+        status, period = self._view.status, self._link.cell.period
+        over = (
+            restarted,
+            status.state == State.ENDED,
+            failure,
+            self._view.lost,
+            self._stop.requested,
+        )
+        asked = duration is not None and (status.cycle + 1) * period >= duration
+        if self._view.refused is not None and (asked or any(over)):
+            return "refused", str(self._view.refused.error)
+        if restarted:
+            return "stopped", "the controller began a new session"
+        if duration is not None and (status.cycle + 1) * period >= duration:
+            return "completed", "as long as was asked for"
+        if status.state == State.ENDED:
+            return "completed", "the controller ended the session"
+        if failure is not None:
+            return "lost", failure
+        if self._view.lost is not None:
+            return "lost", describe(self._view.lost)
+        if self._stop.requested:
+            return ("completed" if duration is None else "stopped"), "ended by the operator"
+        return None
+
+    def _answer_until_rest(self, why: str) -> None:
+        """Do nothing, for as long as the exchange should go on answering."""
+        stopped, still = self._stop.requested, Standstill(self._link.cell.period)
+        reader, driven, heard = self._link.reader(), time.monotonic(), 1
+        pulse = Pulse(lambda: heard, longest_look=5 * POLL)
+        reader.drain()
+        while not (self._stop.insisted or (self._stop.requested and not stopped)):
+            failure, state, now = self._view.failure(), self._view.state, time.monotonic()
+            if state is not State.DRIVE_OFF:
+                driven = now
+            if failure is not None or state in NOBODY or now - driven > OFF:
+                return
+            self._view.look()
+            records = reader.drain()
+            if len(records):
+                heard += 1
+                self._position = records["position"][-1].copy()
+            if still.take(records) or pulse.quiet() > SILENCE:
+                return
+            self._show(over=why)
+            time.sleep(POLL)
+
+    def _take(self) -> None:
+        records = self._reader.drain()
+        if len(records):
+            self._position = records["position"][-1].copy()
+
+    def _show(self, *, over: str) -> None:
+        status = self._view.status
+        self._watch(
+            Progress(
+                status.cycle,
+                status.missed,
+                State(status.state),
+                self._position,
+                late=status.late,
+                untaken=status.unanswered,
+                foreign=status.foreign,
+                heard=status.answered > 0,
+                not_understood=self._view.not_understood,
+                over=over,
+            )
+        )
+
+
+def write_error(failed: Failed) -> ArchiveWriteError:
+    """What is raised where the archive process cannot write."""
+    error = ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
+    if failed.errno is not None:
+        error.__cause__ = OSError(failed.errno, os.strerror(failed.errno))
+    return error

@@ -22,8 +22,7 @@ from hil.archive.recorder import describe
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
-from .motion_watch import MotionWatch, unwatched_motion
-from .stop import Stop
+from .operator import MotionWatch, Stop, unwatched_motion
 
 BEGIN_TIMEOUT: Final = 60.0
 """s within which a motion that was accepted must have begun."""

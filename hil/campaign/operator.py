@@ -1,16 +1,167 @@
-"""The person at a running campaign: what is shown to them, and what they request."""
+"""The person at a running campaign: what is shown of it and its motions, and what is requested."""
 
 from __future__ import annotations
 
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from types import FrameType
+from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .motion_watch import MotionProgress, OperatorRequest
+from drivers.states import State
+from hil.archive.header import WORDS
+
+if TYPE_CHECKING:
+    from .dry_run import DryRun
 
 Array = NDArray[np.float64]
+
+
+REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, whoever ends programs, and the end of the terminal."""
+
+
+@dataclass
+class Stop:
+    """Set by Ctrl-C; the link then brings the arm to rest on its path.
+
+    Attributes:
+        requested: once.
+        insisted: again, where that is asked for.
+    """
+
+    requested: bool = False
+    insisted: bool = False
+
+
+@contextmanager
+def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop on the path.
+
+    A second one is the ordinary interrupt: it ends the program at once. In virtual time the
+    controller is then on its own; on a real link the exchange process notices, and still brings
+    the arm to rest. With `twice` the second is a request too, `insisted`, and the third ends.
+    A signal that is ignored (SIGHUP under nohup) stays ignored.
+    """
+    stop = Stop()
+
+    def request(signum: int, frame: FrameType | None) -> None:
+        if stop.insisted or (stop.requested and not twice):
+            signal.default_int_handler(signum, frame)
+        stop.insisted = stop.requested
+        stop.requested = True
+
+    with ExitStack() as undo:
+        for signum in REQUESTS:
+            previous = signal.getsignal(signum)
+            if signum is signal.SIGHUP and previous is signal.SIG_IGN:
+                continue
+            signal.signal(signum, request)
+            undo.callback(signal.signal, signum, previous)
+        yield stop
+
+
+@dataclass(frozen=True)
+class OperatorRequest:
+    """What the person wants of the motion, until another request.
+
+    Attributes:
+        override: fraction (0 to 1) of the planned speed.
+        held: whether the arm is to rest on its path.
+
+    Raises:
+        ValueError: an override that is none.
+    """
+
+    override: float = 1.0
+    held: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.override <= 1.0:
+            raise ValueError(f"an override of {self.override!r} is not one of 0..1")
+
+
+@dataclass(frozen=True)
+class Latency:
+    """How long the PC took, from a packet's arrival to the departure of its answer, this motion.
+
+    Attributes:
+        median: s.
+        p99: s, not exceeded by 99 % of the answers.
+        worst: s.
+    """
+
+    median: float
+    p99: float
+    worst: float
+
+
+@dataclass(frozen=True, eq=False)
+class MotionProgress:
+    """A motion at one moment. Joint arrays are (n,); None before the first record.
+
+    Attributes:
+        motion_time: s of the planned motion done; None if the source does not tell.
+        duration: s of the planned motion, at full speed; None if the source does not tell.
+        cycles: answered since this motion was asked for.
+        missed: packets that never arrived, of them.
+        late: answers late, or left out for a newer packet's.
+        untaken: answers that the controller did not take.
+        state: of the session.
+        position: rad, measured.
+        following_error: rad, the controller's target minus position.
+        following_share: magnitude of that as a share of the threshold in force.
+        current: A at the motors, the controller's target (there is no measured one).
+        current_share: magnitude of that as a share of the limit in force.
+        temperature: °C at the motors; None where the controller tells none (C4G Open does not).
+        override: the fraction asked for last.
+        rate: fraction of the planned speed at this moment; None if the source does not tell.
+        held: whether a hold was asked for.
+        latency: None in virtual time, which has none, and before the first answer.
+        events: the last ones of this motion, in words, oldest first.
+    """
+
+    motion_time: float | None
+    duration: float | None
+    cycles: int
+    missed: int
+    late: int
+    untaken: int
+    state: State
+    position: Array | None = None
+    following_error: Array | None = None
+    following_share: Array | None = None
+    current: Array | None = None
+    current_share: Array | None = None
+    temperature: Array | None = None
+    override: float = 1.0
+    rate: float | None = None
+    held: bool = False
+    latency: Latency | None = None
+    events: tuple[str, ...] = ()
+
+
+class MotionWatch(Protocol):
+    """Whoever looks at a motion and may slow, hold and release it.
+
+    Both are called from the loop that supervises the motion and must return at once: no stop and
+    no hold is passed on meanwhile. On a real link the arm is brought to rest on its path when one
+    of them takes longer than a second.
+    """
+
+    def show(self, progress: MotionProgress) -> None:
+        """Look; called about ten times a second."""
+        ...
+
+    def request(self) -> OperatorRequest:
+        """The latest request."""
+        ...
+
 
 Phase = Literal["dry run", "warm-up", "standstill", "repetition", "validation", "move"]
 """What a motion is for, in the words of the screen. A "move" is a way between the others."""
@@ -60,42 +211,6 @@ class RunStatus:
     motions_left: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class DryRunSummary:
-    """What a person accepts or not.
-
-    Attributes:
-        campaign: name of the folder.
-        plan_hash: of exactly this plan.
-        archives: file names of its archives, one for each motion of the plan.
-        override: largest share of full speed it was run at.
-        duration: the motions took [s].
-        simulated: whether nothing but a simulated arm moved.
-        joint_names: of the n joints.
-        current_share: (n,) largest current of each motor, as a share of its limit.
-        following_error: (n,) largest distance of each joint from its command [rad].
-        missed: packets that never arrived.
-        late: packets whose answer was late.
-        against_gravity: joints whose torque runs against the gravity of the nominal model; they
-            are to be accepted by name, not by the way.
-        gravity_not_seen: joints with too little gravity, beside friction, to tell.
-    """
-
-    campaign: str
-    plan_hash: str
-    archives: tuple[str, ...]
-    override: float
-    duration: float
-    simulated: bool
-    joint_names: tuple[str, ...]
-    current_share: Array
-    following_error: Array
-    missed: int
-    late: int
-    against_gravity: tuple[str, ...] = ()
-    gravity_not_seen: tuple[str, ...] = ()
-
-
 class Operator(Protocol):
     """Who watches a run.
 
@@ -117,20 +232,20 @@ class Operator(Protocol):
         """Return what the person requests now: override and hold."""
         ...
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, found: DryRun) -> bool:
         """Ask whether the slow motion looked right; False where nobody can answer."""
         ...
 
 
 class Unattended:
-    """Nobody watches: full speed, no hold, and no dry run is accepted."""
+    """Nobody watches a run, or a motion: full speed, no hold, and no dry run is accepted."""
 
     @property
     def can_answer(self) -> bool:
         """Nobody is there."""
         return False
 
-    def show(self, status: RunStatus) -> None:
+    def show(self, status: object) -> None:
         """Show nothing."""
         del status
 
@@ -138,7 +253,145 @@ class Unattended:
         """Full speed."""
         return OperatorRequest()
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, found: DryRun) -> bool:
         """Nobody has seen it."""
-        del summary
+        del found
         return False
+
+
+unwatched_motion = Unattended()
+"""For motions that nobody watches."""
+
+NOTES = 4
+"""Last notes on quality that are shown."""
+
+
+@dataclass(eq=False)
+class RunWatch:
+    """A `MotionWatch` that tells the operator where the whole run stands.
+
+    What an operator's screen gets wrong must not end a motion: it is reported, and the motion goes
+    on at the speed requested last. Each request is asked for anew, whatever the last one met with.
+    A hold is another matter: one that nobody can release any more becomes a stop.
+
+    Attributes:
+        operator: who looks.
+        stop: brings the arm to rest on its path.
+        time_left: s of motion after the present one, each at the largest override it may have.
+        motions_left: after the present one.
+        drift: of the warm-up so far.
+        began: when the present motion began, or the last one [s since 1970]; later than it was
+            asked for where it was held.
+        blind: what went wrong with showing, None for nothing; nothing is shown from then on.
+        deaf: what went wrong first with asking for a request, None for nothing.
+    """
+
+    operator: Operator
+    stop: Stop
+    time_left: float = 0.0
+    motions_left: int = 0
+    drift: DriftCurve | None = None
+    began: float = 0.0
+    blind: Exception | None = None
+    deaf: Exception | None = None
+    _shown: bool = False
+    _held_deaf: bool = False
+    _phase: Phase = "move"
+    _number: int = 1
+    _total: int = 1
+    _duration: float = 0.0
+    _most: float = 1.0
+    _request: OperatorRequest = field(default_factory=OperatorRequest)
+    _notes: tuple[str, ...] = ()
+
+    def expect(self, seconds: float) -> None:
+        """One more motion is to come, of so many s."""
+        self.time_left += seconds
+        self.motions_left += 1
+
+    def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
+        """The next motion.
+
+        Args:
+            kind: of its archive.
+            number: which of its kind, from 1.
+            total: of how many.
+            duration: at full speed [s].
+            most: largest override.
+        """
+        self.time_left = max(0.0, self.time_left - duration / most)
+        self.motions_left = max(0, self.motions_left - 1)
+        self._phase, self._number, self._total = _phase_of(kind), number, total
+        self._duration, self._most = duration, most
+        self._shown, self.began = False, time.time()
+        self._tell(None)
+
+    def note(self, text: str) -> None:
+        """A line on the quality of a motion."""
+        self._duration = 0.0  # notes are written between motions
+        self._notes = (*self._notes, text)[-NOTES:]
+        self._tell(None)
+
+    def show(self, progress: MotionProgress) -> None:
+        """See `MotionWatch.show`; links do not show a motion before they ask for it."""
+        if not self._shown:
+            self._shown, self.began = True, time.time()
+        self._tell(progress)
+
+    def request(self) -> OperatorRequest:
+        """See `MotionWatch.request`."""
+        try:
+            request: object = self.operator.request()
+            if not isinstance(request, OperatorRequest):
+                raise TypeError(f"{request!r} is no OperatorRequest")
+            self._request = request
+        except Exception as error:  # the arm moves: a screen must not decide how it ends
+            self.deaf = self.deaf or error
+            if self._request.held and not self.stop.requested:
+                self._held_deaf = self.stop.requested = True
+        return self._request
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What went wrong with the operator's screen, in sentences."""
+        sentences = []
+        if self.blind is not None:
+            sentences.append(
+                f"the operator's screen failed ({_words(self.blind)}); nothing was shown"
+            )
+        if self.deaf is not None:
+            became = "the last request stayed in force"
+            if self._held_deaf:
+                became = "the arm was held, which nobody could end any more: the run was stopped"
+            why = _words(self.deaf)
+            sentences.append(f"the operator could not be asked for requests ({why}); {became}")
+        return tuple(sentences)
+
+    def _tell(self, progress: MotionProgress | None) -> None:
+        if self.blind is not None:
+            return
+        done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
+        wished = max(self._request.override, 0.01)
+        left = max(self._duration - done, 0.0) / min(self._most, wished) + self.time_left / wished
+        status = RunStatus(
+            self._phase,
+            self._number,
+            self._total,
+            left,
+            motion=progress,
+            drift=self.drift,
+            notes=self._notes,
+            motions_left=self.motions_left,
+        )
+        try:
+            self.operator.show(status)
+        except Exception as error:  # likewise
+            self.blind = error
+
+
+def _phase_of(kind: str) -> Phase:
+    return cast(Phase, WORDS.get(kind, kind))
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

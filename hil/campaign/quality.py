@@ -8,8 +8,9 @@ slowly; a larger difference means that something touched the arm, slipped, or wa
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -17,51 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionStarted
-from hil.archive import Archive, open_archive
+from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
+from hil.archive.header import REJECTED
+from hil.archive.repair import amend_outcome
 from hil.cell import Cell
+from hil.errors import ArchiveError
 from identification.signals.noise import STANDSTILL_WINDOW
 from identification.signals.recording import stuck
 from planner import FourierSeries, PiecewiseCubic
 
-TARGET_MOVED = 1e-5
-"""rad; a target at rest does not change at all, but its rounding may."""
-ARM_MOVED = 5e-4
-"""rad; more than an encoder's noise, less than any motion makes in a second."""
-REST = 1.0
-"""s of the controller's time without motion after which the arm is at rest."""
-
-
-class Standstill:
-    """Looks at records for the last motion of target or arm. A joint not known counts as moving.
-
-    Args:
-        period: cycle of the controller, s.
-    """
-
-    def __init__(self, period: float) -> None:
-        self._cycles = round(REST / period)
-        self._target: NDArray[np.float64] | None = None
-        self._position: NDArray[np.float64] | None = None
-        self._since = 0
-
-    def take(self, records: NDArray[np.void]) -> bool:
-        """Whether the arm has been at rest for `REST` at the end of the next records (k,)."""
-        if not len(records):
-            return False
-        for record in records:
-            target, position, cycle = record["target_position"], record["position"], record["cycle"]
-            still = (
-                self._target is not None
-                and self._position is not None
-                and cycle > self._since
-                and bool(np.all(np.abs(target - self._target) <= TARGET_MOVED))
-                and bool(np.all(np.abs(position - self._position) <= ARM_MOVED))
-            )
-            if not still:
-                self._target, self._position = target.copy(), position.copy()
-                self._since = int(cycle)
-        return int(records["cycle"][-1]) - self._since >= self._cycles
-
+from .folder import CampaignFolder
+from .intervals import Interval
 
 Array = NDArray[np.float64]
 
@@ -72,6 +39,8 @@ MISSED_SHARE: Final = 0.01
 """Of all cycles: more missed packets than that, and the recording is too torn."""
 OFF_PATH: Final = 1e-4
 """rad between set-point and plan: the motion is made of float32 targets, exact to 2e-6."""
+_ARM_MOVED: Final = 5e-4
+"""rad; more than an encoder's noise, less than any motion makes in a second."""
 SATURATED: Final = 0.98
 """Share of the current limit that counts as reaching it."""
 SATURATED_CYCLES: Final = 3
@@ -226,7 +195,7 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
     speed = np.abs(played.position[rows:] - played.position[:-rows]).max(axis=0) / (
         rows * cell.period
     )
-    allowed = np.maximum(cell.model.friction.standstill, ARM_MOVED / STANDSTILL_WINDOW)
+    allowed = np.maximum(cell.model.friction.standstill, _ARM_MOVED / STANDSTILL_WINDOW)
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
         return None
@@ -367,3 +336,174 @@ def _bounds(past: Array, first: float, least: float, n_joints: int) -> Array:
     scatter = 1.4826 * np.median(np.abs(past - middle), axis=0)
     usual = np.maximum(_WIDE * middle, middle + _OUTLYING * scatter)
     return np.asarray(np.maximum(usual, least))
+
+
+_JUDGED: Final = frozenset({"standstill", "excitation", "validation", "warmup"})
+_FEWEST_ALIKE: Final = 2
+"""Attempts that must agree before they speak against what counts."""
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A motion that ended well and is of no use.
+
+    Attributes:
+        archive: its file name.
+        reason: in words.
+    """
+
+    archive: str
+    reason: str
+
+
+class Entering:
+    """Enters archives in a campaign's manifest.
+
+    Only after an archive says itself that it is rejected does the manifest: whoever finds the file
+    alone, or in a folder whose run was killed, must not pool it either.
+
+    Args:
+        folder: of the campaign.
+        cell: of the campaign.
+        motion: its excitation.
+
+    Attributes:
+        rejected: what was found to be of no use.
+        adopted: what an earlier run completed and did not live to enter.
+        notes: what a reader must know of how repetitions were judged.
+    """
+
+    def __init__(
+        self, folder: CampaignFolder, cell: Cell, motion: PiecewiseCubic | FourierSeries
+    ) -> None:
+        self._folder, self._cell, self._motion = folder, cell, motion
+        self._check = RepetitionCheck(cell, self._motion)
+        self._check.learn(folder.completed("excitation"))
+        self.rejected: list[Rejected] = []
+        self.adopted: list[str] = []
+        self.notes: list[str] = []
+
+    def enter(self, interval: Interval, name: str, known: Problem | None = None) -> Problem | None:
+        """Judge the whole archive of an interval and enter it; why it is of no use, or None.
+
+        Args:
+            interval: what was run.
+            name: of the archive.
+            known: what is wrong with it, where that is known already.
+        """
+        played, problem = None, known
+        if problem is None and interval.kind in _JUDGED:
+            played = self._played(name)
+            if interval.kind == "excitation":
+                problem = self._judged(played)
+            elif interval.kind == "standstill":
+                problem = unrest(played, self._cell)
+            else:
+                # A cold arm may want more current than it has: that is what warming up is for.
+                judge = problem_of if interval.kind == "validation" else torn_or_slowed
+                problem = judge(played, interval.trajectory, self._cell)
+        if problem is not None:
+            amend_outcome(self._folder.archives / name, REJECTED, problem.sentence)
+            self._folder.add(name, REJECTED, problem.sentence)
+            self.rejected.append(Rejected(name, problem.sentence))
+            if problem.against is not None:
+                return replace(problem, against=problem.against.with_one(name))
+            return problem
+        self._folder.add(name, "completed")
+        if played is not None and interval.kind == "excitation":
+            self._check.accept(played)
+        return None
+
+    def _judged(self, played: Played) -> Problem | None:
+        """What is wrong with a repetition.
+
+        One that is unlike those that count may be right all the same. Where enough later attempts
+        agree with each other and not with the only one that counts, that one is rejected: nothing
+        speaks for it. Where two or more that agree count, no vote tells a disturbed beginning from
+        an arm that was changed: a person has to look.
+        """
+        problem = self._check.problem(played)
+        if problem is None or not problem.apart:
+            return problem
+        good = self._folder.completed("excitation")
+        alike, beside = self._alike(played)
+        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)
+        if len(alike) + 1 < max(enough, beside + 2):
+            return problem
+        if len(good) > 1:
+            groups = Groups(tuple(path.name for path in good), alike)
+            return replace(problem, against=groups)
+        reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
+        for path in good:
+            amend_outcome(path, REJECTED, reason)
+            self._folder.reject(path.name, reason)
+            self.rejected.append(Rejected(path.name, reason))
+            self.notes.append(
+                f"{path.name} was the only repetition that counted, and was rejected because "
+                f"{len(alike) + 1} later ones agree with each other and not with it: it was "
+                "disturbed, or the arm was changed after it"
+            )
+        self._check = RepetitionCheck(self._cell, self._motion)
+        return None
+
+    def _alike(self, played: Played) -> tuple[tuple[str, ...], int]:
+        """Attempts that agree with this one and each other, and how many do with the good ones.
+
+        Of those that were rejected since one was good: what was unlike an earlier one that counted
+        says nothing against those that count now.
+        """
+        check, alike, beside = RepetitionCheck(self._cell, self._motion), list[str](), 0
+        check.accept(played)
+        for name, other in self._sound_but_rejected().items():
+            beside += self._check.problem(other) is None
+            if check.problem(other) is None:
+                check.accept(other)
+                alike.append(name)
+        return tuple(alike), beside
+
+    def _sound_but_rejected(self) -> dict[str, Played]:
+        """Repetitions rejected since the last good one, and sound by themselves, in order."""
+        found: dict[str, Played] = {}
+        for entry in self._folder.manifest():
+            name = ArchiveName.parse(entry.name)
+            if name is None or name.kind != "excitation":
+                continue
+            if entry.outcome != REJECTED:
+                found.clear()
+                continue
+            with suppress(ArchiveError):
+                played = self._played(entry.name)
+                if problem_of(played, self._motion, self._cell) is None:
+                    found[entry.name] = played
+        return found
+
+    def _played(self, name: str) -> Played:
+        return Played.of(open_archive(self._folder.archives / name, fields=FIELDS))
+
+    def agreement(self) -> str:
+        """How well the last good repetition agrees with those before, in a few words."""
+        return self._check.agreement
+
+    def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
+        """Enter archives that an earlier run completed and was killed before it entered them.
+
+        Args:
+            intervals: what a run may have made.
+            made: whether an archive was made of this plan, by its header.
+        """
+        sought = {(one.kind, one.index): one for one in intervals}
+        entered = {entry.name for entry in self._folder.manifest()}
+        found = sorted(path.name for path in self._folder.archives.glob("*.mcap"))
+        for name in (one for one in found if one not in entered):
+            parsed = ArchiveName.parse(name)
+            interval = None if parsed is None else sought.get((parsed.kind, parsed.index))
+            if interval is None or self._folder.whole(interval.kind, interval.index) is not None:
+                continue
+            try:
+                archive = open_archive(self._folder.archives / name, fields=())
+            except ArchiveError:
+                continue  # torn at its head: done again
+            completed = archive.outcome is not None and archive.outcome.outcome == "completed"
+            if archive.complete and completed and made(archive.header):
+                self.adopted.append(name)
+                self.enter(interval, name)

@@ -1,40 +1,37 @@
-"""Passing on what the person requests of a motion."""
+"""One motion under way: its operator's requests passed on to it, and what is to be seen of it."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.drive_train import TURN, DriveTrain
 from drivers.errors import RequestError
+from drivers.exchange import ExchangeEvent, ExchangeProcess
+from drivers.exchange.control import quantile
+from drivers.guard import Guard
 from drivers.motion_source import MotionSource
+from drivers.packets import InitPacket
+from drivers.session import Session
+from drivers.states import State
+from hil.archive.recorder import describe
+from hil.cell import Cell
 from hil.errors import ControllerFault
 
-from .motion_watch import MotionWatch
-from .stop import Stop
+from .operator import Latency, MotionProgress, MotionWatch, Stop
 
 NOT_BEGUN: Final = "it had not begun"
 """Why a motion ends that was stopped before it was asked for."""
 ASKED_EVERY: Final = 0.02
 """s between two questions for a request where nothing else is to be done."""
-
-
-class Steered(Protocol):
-    """A motion that can be messages to go slower, to rest and to go on: `Session`, the exchange."""
-
-    def override(self, fraction: float) -> None:
-        """Go on at this fraction of the speed."""
-        ...
-
-    def hold(self) -> None:
-        """Rest on the path."""
-        ...
-
-    def resume(self) -> None:
-        """Go on."""
-        ...
 
 
 class Steering:
@@ -97,50 +94,152 @@ class Steering:
         request = self._watch.request()
         return not (stop.requested or request.held or request.override < self.fraction)
 
-    def follow(self, motion: Steered) -> None:
-        """Pass on what is requested now. A motion held before it began begins at rest."""
+    def follow(self, motion: Session | ExchangeProcess, messages: deque[str]) -> None:
+        """Pass on what is requested now. A motion held before it began begins at rest.
+
+        Args:
+            motion: what is steered.
+            messages: takes what it refuses, in words.
+        """
         request = self._watch.request()
         fraction = min(self._most, request.override)
+        commands: list[Callable[[], None]] = []
         if fraction != self.fraction:
             self.fraction = fraction
-            motion.override(fraction)
+            commands.append(partial(motion.override, fraction))
         if request.held is not self.held:
             self.held = request.held
-            if request.held:
-                motion.hold()
-            else:
-                motion.resume()
+            commands.append(motion.hold if request.held else motion.resume)
+        for command in commands:
+            try:
+                command()
+            except RequestError as error:
+                messages.append(str(error))
 
 
-@dataclass
-class Polite:
-    """A `Steered` whose refusals become messages, as in the exchange process.
+SHOWN_EVERY: Final = 0.1
+"""s between two looks of the watch."""
+REMEMBERED: Final = 8
+"""Events that are shown."""
+
+
+@dataclass(frozen=True)
+class PacketCounts:
+    """Fates of packets of one session up to a moment; see `drivers.events.Counters`."""
+
+    answered: int = 0
+    missed: int = 0
+    late: int = 0
+    untaken: int = 0
+    latencies: tuple[int, ...] = ()
+    worst: float = math.inf
+
+
+@dataclass(eq=False)
+class ProgressDisplay:
+    """What is to be seen of one motion.
 
     Attributes:
-        motion: what is steered.
-        messages: takes the refusals in words.
+        drives: in force, for the shares.
+        guard: narrowed to the limits in force.
+        steering: of the motion.
+        duration: s, of the planned motion; None if unknown.
+        before: counts when the motion was asked for.
+        messages: events in words, the last ones.
     """
 
-    motion: Steered
-    messages: deque[str]
+    drives: DriveTrain
+    guard: Guard
+    steering: Steering
+    duration: float | None
+    before: PacketCounts
+    messages: deque[str] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _last: NDArray[np.void] | None = None
+    _due: float = -math.inf
 
-    def override(self, fraction: float) -> None:
-        """Go on at this fraction of the speed."""
-        try:
-            self.motion.override(fraction)
-        except RequestError as error:
-            self.messages.append(str(error))
+    @property
+    def due(self) -> bool:
+        """Whether the watch is to look again."""
+        return time.monotonic() >= self._due
 
-    def hold(self) -> None:
-        """Rest on the path."""
-        try:
-            self.motion.hold()
-        except RequestError as error:
-            self.messages.append(str(error))
+    def note(self, events: Iterable[ExchangeEvent]) -> None:
+        """Take events in."""
+        for event in events:
+            self.messages.append(describe(event))
 
-    def resume(self) -> None:
-        """Go on."""
-        try:
-            self.motion.resume()
-        except RequestError as error:
-            self.messages.append(str(error))
+    def take(self, records: NDArray[np.void]) -> None:
+        """Take cycle records in; the last one counts."""
+        if len(records):
+            self._last = records[-1:].copy()
+
+    def show(
+        self,
+        watch: MotionWatch,
+        state: State,
+        counts: PacketCounts,
+        motion_time: float,
+        rate: float,
+    ) -> None:
+        """Let the watch look."""
+        self._due = time.monotonic() + SHOWN_EVERY
+        before, position = self.before, None
+        error = error_share = current = current_share = None
+        if self._last is not None:
+            position = self._last["position"][0].copy()
+            error = self._last["target_position"][0] - position
+            turns = np.abs(error @ self.drives.motor_from_joint.T) / TURN
+            error_share = turns / self.guard.following_error
+            current = self._last["target_current"][0].copy()
+            current_share = np.abs(current) / self.guard.current
+        watch.show(
+            MotionProgress(
+                motion_time=_number(motion_time),
+                duration=self.duration,
+                cycles=counts.answered - before.answered,
+                missed=counts.missed - before.missed,
+                late=counts.late - before.late,
+                untaken=counts.untaken - before.untaken,
+                state=state,
+                position=position,
+                following_error=error,
+                following_share=error_share,
+                current=current,
+                current_share=current_share,
+                override=self.steering.fraction,
+                rate=_number(rate),
+                held=self.steering.held,
+                latency=_latency(counts, before),
+                events=tuple(self.messages),
+            )
+        )
+
+
+def guard_in_force(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> Guard:
+    """A guard with the limits in force: the narrower of the cell's and the controller's."""
+    guard = Guard(cell.guard_limits, cell.period)
+    if init is not None:
+        row, axes = cell.controller.arm - 1, slice(0, len(cell.joint_names))
+        current = np.fmin(init.current_limit[row, axes], drives.current_limit)
+        guard.narrow(init.following_error[row, axes].astype(np.float64), current)
+    return guard
+
+
+def duration_of(source: object) -> float | None:
+    """Duration of a motion [s], if it says so."""
+    duration = getattr(source, "duration", None)
+    return float(duration) if isinstance(duration, int | float) else None
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _latency(latest: PacketCounts, before: PacketCounts) -> Latency | None:
+    counts: Sequence[int] = latest.latencies
+    if before.latencies:
+        counts = [now - then for now, then in zip(counts, before.latencies, strict=True)]
+    shares = [quantile(counts, share) for share in (0.5, 0.99, 1.0)]
+    median, p99, worst = (None if value is None else min(value, latest.worst) for value in shares)
+    if median is None or p99 is None or worst is None:
+        return None
+    return Latency(median, p99, worst)

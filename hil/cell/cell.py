@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from drivers.drive_train import DriveTrain
+from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from hil.reading import text_of, toml_of
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
-from planner.toml_text import toml_value
 
-from . import link
 from .checks import check_assumed, check_built, check_lengths, check_locked, check_turning
-from .errors import CellError, first_error
+from .errors import CellError, first_error, require_known
 from .robot import robot_model
 from .schema import (
     BoundsTable,
@@ -37,14 +38,16 @@ from .schema import (
     SimulationTable,
     WorkspaceTable,
 )
-from .text import replaced_value
-from .unknown import require_known
+from .text import with_values
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+
+_WITHIN_THIS_COMPUTER: Final = frozenset(("virtual", "udp_multicast"))
+"""Interfaces of python-can that need no adapter."""
 
 
 class CellFile(BaseModel):
@@ -252,18 +255,58 @@ class Cell:
         Raises:
             CellError: the cell is a simulated one, or its CAN bus cannot carry the arm.
         """
-        return link.transport_spec(self)
+        table = self.controller
+        if table.transport == "udp":
+            from drivers.transports.udp import UdpSpec
+
+            return UdpSpec(peer_host=table.host, port=table.port, bind=table.bind)
+        if table.transport == "can" and table.can is not None:
+            from drivers.transports.can import CanSpec
+
+            bus, axes = table.can.model_dump(), len(self.joint_names)
+            spec = CanSpec(**bus, period=self.period, n_axes=axes)
+            try:
+                spec.check(table.mode)
+            except (DriverError, ValueError) as error:
+                raise CellError(
+                    self.path, "controller.can", None, str(error), "name what the bus can carry"
+                ) from error
+            return spec
+        raise CellError(
+            self.path,
+            "controller.transport",
+            table.transport,
+            "a simulated controller in virtual time has no link to open",
+            'write "udp" or "can"',
+        )
 
     @property
     def only_simulated(self) -> bool:
         """Whether nothing but a simulated controller on this computer can be at the far end."""
-        return link.only_simulated(self)
+        table = self.controller
+        if table.transport == "udp":
+            return _is_loopback(table.host)
+        if table.transport == "can":
+            return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
+        return True
 
     def session_settings(
         self, *, accept_init: bool = False, only_axis: int | None = None
     ) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
-        return link.session_settings(self, accept_init=accept_init, only_axis=only_axis)
+        table, campaign = self.controller, self.file.campaign
+        settings: dict[str, Any] = {
+            "mode": table.mode,
+            "arm": table.arm,
+            "max_gap": table.max_gap,
+            "accept_init": accept_init,
+            "other_axes": frozenset(table.other_axes),
+        }
+        if only_axis is not None:
+            settings["only_axis"] = only_axis
+        if campaign is not None:
+            settings["settle_cycles"] = max(1, round(campaign.settle_s / self.period))
+        return settings
 
     @property
     def workspace(self) -> Workspace:
@@ -285,6 +328,17 @@ class Cell:
         """Where the simulated arm stands at first (n,), URDF angles, rad."""
         return self._posture(self.simulation.initial_deg)
 
+    def with_values(self, values: Mapping[str, Any]) -> Cell:
+        """This cell with other values in its file, by dotted name, such as "campaign.n_via".
+
+        None keeps what stands there; a table that is not there is added.
+
+        Raises:
+            CellError: a value cannot be used.
+            NoTableError: a table is not written as one, with its name in a line of its own.
+        """
+        return Cell.from_texts(with_values(self.text, values), self.urdf, self.path)
+
     def with_campaign(
         self,
         *,
@@ -293,50 +347,35 @@ class Cell:
         simulation_seed: int | None = None,
     ) -> Cell:
         """This cell with some campaign settings replaced, in its text too; None keeps a setting."""
-        wanted = {
-            ("campaign", "repetitions"): repetitions,
-            ("campaign", "validation_runs"): validation_runs,
-            ("simulation", "seed"): simulation_seed,
-        }
-        text = self.text
-        for (table, key), value in wanted.items():
-            if value is not None:
-                text = replaced_value(text, table, key, value)
-        return Cell.from_texts(text, self.urdf, self.path)
-
-    def with_link(
-        self,
-        *,
-        transport: str | None = None,
-        host: str | None = None,
-        port: int | None = None,
-        bind: str | None = None,
-        cycle_ms: int | None = None,
-        can: CanTable | None = None,
-    ) -> Cell:
-        """This cell on another link, in its text too; None keeps what stands there."""
-        text = link.with_link(
-            self.text,
-            transport=transport,
-            host=host,
-            port=port,
-            bind=bind,
-            cycle_ms=cycle_ms,
-            can=can,
+        return self.with_values(
+            {
+                "campaign.repetitions": repetitions,
+                "campaign.validation_runs": validation_runs,
+                "simulation.seed": simulation_seed,
+            }
         )
-        return Cell.from_texts(text, self.urdf, self.path)
+
+    def with_link(self, *, can: CanTable | None = None, **controller: Any) -> Cell:
+        """This cell on another link, in its text too; None keeps what stands there.
+
+        Args:
+            can: in place of `[controller.can]`.
+            controller: entries of `[controller]`, such as `transport`, `host`, `port` and `bind`.
+        """
+        bus = {} if can is None else can.model_dump(exclude_none=True)
+        return self.with_values(
+            {f"controller.{key}": value for key, value in controller.items()}
+            | {f"controller.can.{key}": value for key, value in bus.items()}
+        )
 
     def with_urdf(self, path: Path, name: str) -> Cell:
         """This cell as a file `path` whose URDF is called `name`; meshes stay where they are."""
-        text = replaced_value(self.text, "cell", "urdf", toml_value(name))
-        named = self.file.cell.mesh_folders
-        if named:
-            moved = [
-                folder if Path(folder).is_absolute() else os.path.relpath(place, path.parent)
-                for folder, place in zip(named, self.mesh_folders, strict=True)
-            ]
-            text = replaced_value(text, "cell", "mesh_folders", toml_value(moved))
-        return Cell.from_texts(text, self.urdf, path)
+        moved = [
+            folder if Path(folder).is_absolute() else os.path.relpath(place, path.parent)
+            for folder, place in zip(self.file.cell.mesh_folders, self.mesh_folders, strict=True)
+        ]
+        values = {"cell.urdf": name, "cell.mesh_folders": moved or None}
+        return Cell.from_texts(with_values(self.text, values), self.urdf, path)
 
     @property
     def nominal(self) -> NominalTable:
@@ -419,3 +458,20 @@ def _required(cell: Cell, table: T | None, name: str) -> T:
     if table is None:
         raise CellError(cell.path, name, None, "is missing", f"add a table [{name}]")
     return table
+
+
+def stays_here(spec: TransportSpec) -> bool:
+    """Whether a link ends on this computer; of a kind that is not known here it is not assumed."""
+    from drivers.transports.can import CanSpec
+    from drivers.transports.udp import UdpSpec
+
+    if isinstance(spec, UdpSpec):
+        return _is_loopback(spec.peer_host)
+    return isinstance(spec, CanSpec) and spec.interface in _WITHIN_THIS_COMPUTER
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

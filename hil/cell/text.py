@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import InputError
+from hil.reading import toml_of
 from identification.model.urdf_text import urdf_tree
+from planner.toml_text import toml_value
 
 
 class NoTableError(InputError, ValueError):
@@ -31,10 +33,10 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
     Raises:
         NoTableError: there is no such table.
     """
-    header = rf"^[ \t]*\[[ \t]*{table}[ \t]*\][ \t]*(?:#[^\n]*)?$"
+    header = rf"^[ \t]*\[[ \t]*{re.escape(table)}[ \t]*\][ \t]*(?:#[^\n]*)?$"
     found = re.search(header, text, re.MULTILINE)
     if found is None:
-        raise NoTableError(table.replace("\\.", "."))
+        raise NoTableError(table)
     start = found.end()
     following = re.search(r"^[ \t]*\[", text[start:], re.MULTILINE)
     end = start + following.start() if following else len(text)
@@ -45,6 +47,29 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
     if not count:
         body = f"\n{key} = {value}{text[start:end]}"
     return text[:start] + body + text[end:]
+
+
+def with_values(text: str, values: Mapping[str, Any]) -> str:
+    """The TOML `text` with other values, by dotted name; a table that is not there is added.
+
+    Args:
+        text: of a cell file; its comments and order stay.
+        values: such as ``{"campaign.repetitions": 3}``; None keeps what stands there.
+
+    Raises:
+        NoTableError: a table is there, and not written as one.
+    """
+    for name, value in values.items():
+        table, _, key = name.rpartition(".")
+        if value is None:
+            continue
+        there: Any = toml_of(text)
+        for part in table.split("."):
+            there = there.get(part, {})
+        if not there and f"[{table}]" not in text:
+            text += f"\n[{table}]\n"
+        text = replaced_value(text, table, key, toml_value(value))
+    return text
 
 
 Array = NDArray[np.float64]

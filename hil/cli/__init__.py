@@ -3,13 +3,19 @@
 Exit status: 0 done, 1 internal error or a disk that is full or refuses to be written, 2 bad input,
 3 refused as unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for
 the cycle, archives of a batch that could not be used), 130 stopped by the operator. With `--json`
-stdout is one JSON object, also where the command fails (`hil.cli.failing`).
+stdout is one JSON object, also where the command fails: the sentence for a person goes to stderr
+all the same, and the exit status is the same.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+from collections import UserDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -17,14 +23,134 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from hil.errors import DISK_REFUSES, HilError, OperatorStopError
+from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
+from hil.importing import leave_if_interrupted
 from hil.terminal_text import printable
 from hil.version import software
 from identification import IdentificationError
 from planner import PlannerError
 
-from .failing import INTERNAL, asks_for_json, errors_as_json, exit_code_of
-from .lazy import LazyCommands, without_flag_types
+INTERNAL = 1
+"""Exit status of an internal error, and where a disk is full or refuses to be written."""
+USAGE = 2
+"""Exit status where something that was typed or given cannot be used."""
+
+
+def asks_for_json(arguments: Sequence[str]) -> bool:
+    """Whether a command was typed with `--json`; what follows `--` is no option."""
+    options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    return "--json" in options
+
+
+def exit_code_of(error: BaseException) -> int:
+    """The exit status that an error ends the command line with."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in DISK_REFUSES:
+            return INTERNAL
+        cause = cause.__cause__
+    if isinstance(error, PlannerError | IdentificationError):
+        return USAGE
+    code = getattr(error, "exit_code", 1)  # HilError, and what typer says of a wrong command line
+    return code if isinstance(code, int) else 1
+
+
+def as_json(error: BaseException) -> dict[str, Any]:
+    """What a script receives of an error.
+
+    Returns:
+        `error`: the sentence; `kind`: name of its class; `exit_code`; of an `InputError` also
+        `path`, `field`, `problem` and `remedy`, null or "" where there is none; and the figures of
+        what was done before.
+    """
+    sentence = error.format_message() if hasattr(error, "format_message") else str(error)
+    figures = error.figures if isinstance(error, HilError) else {}
+    document: dict[str, Any] = {
+        **figures,
+        "error": sentence or type(error).__name__,
+        "kind": type(error).__name__,
+        "exit_code": exit_code_of(error),
+    }
+    if isinstance(error, InputError):
+        document |= {
+            "path": None if error.path is None else str(error.path),
+            "field": error.field,
+            "problem": error.problem,
+            "remedy": error.remedy,
+        }
+    return document
+
+
+@contextmanager
+def errors_as_json(asked: bool) -> Iterator[None]:
+    """Print what ends the block as JSON, if that was asked for; it goes on as it is.
+
+    Ctrl-C becomes an `OperatorStopError`.
+    """
+    try:
+        yield
+    except typer.Exit:  # a command that has said what there is to say
+        raise
+    except KeyboardInterrupt as interrupt:
+        stopped = OperatorStopError("interrupted")
+        _print(stopped, asked)
+        raise stopped from interrupt
+    except Exception as error:
+        _print(error, asked)
+        raise
+
+
+def _print(error: Exception, asked: bool) -> None:
+    if asked:
+        with suppress(OSError):  # nobody reads any more; the status still counts
+            typer.echo(json.dumps(as_json(error)))
+
+
+class LazyCommands(UserDict[str, Any]):
+    """Commands by name, each from the module of this package that has its name or the one given.
+
+    A module has either a function of the command's name, or an `app` of several commands.
+
+    Args:
+        names: of the commands, in the order of the help.
+        modules: of those whose module is called otherwise.
+    """
+
+    def __init__(self, names: Sequence[str], **modules: str) -> None:
+        super().__init__({name: modules.get(name, name) for name in names})
+
+    def __getitem__(self, name: str) -> Any:
+        """The command, imported if it was not yet."""
+        known = super().__getitem__(name)
+        if isinstance(known, str):
+            known = self[name] = _command(name, known)
+        return known
+
+
+def _command(name: str, module: str) -> Any:
+    with leave_if_interrupted():
+        found = import_module(f"{__name__}.{module}")
+    alone = typer.Typer(callback=lambda: None, rich_markup_mode="markdown", add_completion=False)
+    if hasattr(found, "app"):
+        alone.add_typer(found.app, name=name)
+    else:
+        alone.command(name)(getattr(found, name))
+    group = typer.main.get_command(alone)
+    assert isinstance(group, TyperGroup)
+    return without_flag_types(group.commands[name])
+
+
+def without_flag_types(command: Any) -> Any:
+    """The command, in whose help nothing stands behind a flag: nothing is typed there."""
+    help_option = command.get_help_option(typer.Context(command))
+    for option in (*command.params, help_option):
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
+    if not isinstance(commands := getattr(command, "commands", {}), LazyCommands):
+        for one in commands.values():
+            without_flag_types(one)
+    return command
+
 
 COMMANDS = LazyCommands(
     (

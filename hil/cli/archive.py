@@ -13,8 +13,8 @@ from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
+from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption
-from hil.cli.failing import exit_code_of
 from hil.errors import ArchiveError, InputError
 from hil.terminal_text import printable
 

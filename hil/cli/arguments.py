@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from hil.errors import InputError
 
 CampaignArgument = Annotated[
     Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
@@ -20,3 +23,55 @@ ArchivesArgument = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")]
+AcceptInitOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-init",
+        help="Use the controller's gear ratios, calibration and coupling where they differ from "
+        "the cell's; the archive says so.",
+    ),
+]
+DhOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="TABLE",
+        help="In place of --urdf, a CSV table of DH parameters, where nothing else is known of the "
+        "robot: joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
+        "joint. Needs --convention.",
+        show_default=False,
+    ),
+]
+ConventionOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or modified "
+        "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+        show_default=False,
+    ),
+]
+
+
+def figures(
+    texts: Sequence[str], option: str, example: str, *, bare: bool = True
+) -> dict[str, float]:
+    """Numbers by name, from texts NAME=NUMBER.
+
+    Args:
+        texts: as typed.
+        option: that they were typed behind.
+        example: of one that can be used.
+        bare: whether a NAME alone stands for NAME=0.
+
+    Raises:
+        InputError: what stands behind the = is no number.
+    """
+    found = {}
+    for text in texts:
+        name, equals, number = text.partition("=")
+        try:
+            found[name] = float(number) if equals or not bare else 0.0
+        except ValueError as error:
+            raise InputError(
+                None, f"{text!r} is no NAME=NUMBER", field=option, remedy=f"write {example}"
+            ) from error
+    return found

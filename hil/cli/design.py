@@ -15,10 +15,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from hil import lines
 from hil.campaign.campaign import campaign_of_design, require_replaceable
+from hil.campaign.operator import Stop, stop_on_interrupt
 from hil.campaign.quick_design import quick_settings
-from hil.campaign.stop import Stop, stop_on_interrupt
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
@@ -31,7 +30,7 @@ from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.plots import save
-from hil.progress import Reporter
+from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
 
@@ -60,7 +59,7 @@ def warn_of_unchecked(done: Designed, cell: Cell) -> None:
     """Say on stderr, however quiet it is to be, what was not looked at."""
     unchecked = done.result.settings.unchecked
     if unchecked:
-        lines.say(
+        say(
             f"warning: not looked at: {', '.join(unchecked)}; {cell.name} may refuse this motion",
             err=True,
         )
@@ -149,7 +148,7 @@ def draw_pictures(
     try:
         save(figure, folder.picture)
     except InputError as error:
-        lines.say(f"warning: {error}; repeat with --resume to draw it again", err=True)
+        say(f"warning: {error}; repeat with --resume to draw it again", err=True)
 
 
 def _say_condition(reporter: Reporter, done: Designed) -> None:

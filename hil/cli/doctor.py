@@ -11,9 +11,8 @@ from rich.console import Console
 
 from hil.cli.arguments import JsonOption
 from hil.cli.verdict import NOT_GOOD
+from hil.doctor.diagnosis import as_json, examine, show
 from hil.doctor.link import controller_in, link_of
-from hil.doctor.report import as_json, show
-from hil.doctor.run import examine
 from hil.progress import reporter
 
 QUICK_SECONDS = 5.0

@@ -13,8 +13,8 @@ from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOptio
 from hil.cli.verdict import NOT_GOOD
 from hil.exporting import FormatName, default_output, export_model
 from hil.identify import identify_sources
-from hil.lines import say
 from hil.progress import reporter as make_reporter
+from hil.progress import say
 
 
 def export(

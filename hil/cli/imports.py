@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hil.archive import open_archive
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures
 from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
@@ -24,7 +24,7 @@ from hil.importers import (
     import_rosbag2,
     recorded_joints,
 )
-from hil.lines import say
+from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
 
@@ -43,24 +43,6 @@ Urdf = Annotated[Path | None, typer.Option(help="URDF of the robot.", show_defau
 CellFile = Annotated[
     Path | None,
     typer.Option(help="A cell file instead of --urdf and --friction.", show_default=False),
-]
-Dh = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="TABLE",
-        help="In place of --urdf, a CSV table of DH parameters, where nothing else is known of the "
-        "robot: joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
-        "joint. Needs --convention.",
-        show_default=False,
-    ),
-]
-DhConvention = Annotated[
-    str | None,
-    typer.Option(
-        help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or modified "
-        "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
-        show_default=False,
-    ),
 ]
 Gravity = Annotated[
     tuple[float, float, float] | None,
@@ -119,8 +101,8 @@ def rosbag2(
     output: Output,
     urdf: Urdf = None,
     cell: CellFile = None,
-    dh: Dh = None,
-    convention: DhConvention = None,
+    dh: DhOption = None,
+    convention: ConventionOption = None,
     gravity: Gravity = None,
     friction: Friction = FRICTION,
     standstill: Standstill = 0.01,
@@ -167,7 +149,7 @@ def rosbag2(
             convention,
             gravity,
             _law(friction, standstill),
-            _positions(locked or []),
+            figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)"),
             recorded_joints(source, topic, names) if lock_others else None,
         ),
         topic=topic,
@@ -192,8 +174,8 @@ def log(
     ],
     urdf: Urdf = None,
     cell: CellFile = None,
-    dh: Dh = None,
-    convention: DhConvention = None,
+    dh: DhOption = None,
+    convention: ConventionOption = None,
     gravity: Gravity = None,
     friction: Friction = FRICTION,
     standstill: Standstill = 0.01,
@@ -239,7 +221,7 @@ def log(
             convention,
             gravity,
             _law(friction, standstill),
-            _positions(locked or []),
+            figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)"),
             found.joints if lock_others else None,
         ),
         columns=found,
@@ -307,23 +289,6 @@ def _robot(
     return Robot.from_urdf(
         path, convention=table, friction=law, gravity=down, locked=locked, recorded=recorded
     )
-
-
-def _positions(locked: list[str]) -> dict[str, float]:
-    """Positions of locked joints from NAME or NAME=POSITION."""
-    positions = {}
-    for text in locked:
-        name, _, position = text.partition("=")
-        try:
-            positions[name] = float(position) if position else 0.0
-        except ValueError as error:
-            raise InputError(
-                None,
-                f"{position!r} is no position",
-                field=f"--locked {text}",
-                remedy="give rad or m, as in --locked joint_7=0.3",
-            ) from error
-    return positions
 
 
 def _names(renamed: list[str]) -> dict[str, str]:

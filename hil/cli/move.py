@@ -16,15 +16,14 @@ import typer
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
 from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
+from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import AcceptInitOption, JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
-from hil.lines import say
 from hil.move import THERE, Way, axis_alone, posture, send, straight_way, turned
-from hil.progress import Task
+from hil.progress import Task, say
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
 from hil.terminal_text import printable
@@ -81,14 +80,7 @@ def move(
             "goes no faster than the cell's approach_speed.",
         ),
     ] = False,
-    accept_init: Annotated[
-        bool,
-        typer.Option(
-            "--accept-init",
-            help="Use the controller's gear ratios, calibration and coupling where they differ "
-            "from the cell's; the archive says so.",
-        ),
-    ] = False,
+    accept_init: AcceptInitOption = False,
     only_axis: Annotated[
         bool,
         typer.Option(

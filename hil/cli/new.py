@@ -9,11 +9,10 @@ from typing import Annotated
 import typer
 
 from hil.campaign import stop_on_interrupt
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.importers import convention_of
-from hil.lines import say
 from hil.new import (
     Known,
     NewCell,
@@ -24,6 +23,7 @@ from hil.new import (
     read_init,
     with_clear_home,
 )
+from hil.progress import say
 from hil.reading import port_number
 
 PORT = 1000
@@ -32,24 +32,8 @@ PORT = 1000
 
 def new(
     urdf: Annotated[Path | None, typer.Option(help="The arm's URDF.", show_default=False)] = None,
-    dh: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TABLE",
-            help="In place of --urdf, a CSV table of DH parameters: "
-            "joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
-            "joint. A URDF of this geometry is written beside the cell file. Needs --convention.",
-            show_default=False,
-        ),
-    ] = None,
-    convention: Annotated[
-        str | None,
-        typer.Option(
-            help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
-            "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
-            show_default=False,
-        ),
-    ] = None,
+    dh: DhOption = None,
+    convention: ConventionOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The cell file to write.")] = Path(
         "cell.toml"
     ),
@@ -123,7 +107,9 @@ def new(
             remedy="leave out one of them",
         )
     _require_free(output, force=force)
-    made = _described(urdf, dh, convention, _positions(fix or []))
+    made = _described(
+        urdf, dh, convention, figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
+    )
     if made.urdf is not None:
         _require_free(made.urdf_beside(output), force=force, own=made.urdf_path)
     known = made.known
@@ -201,19 +187,6 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     if bind != "0.0.0.0":
         link["controller.bind"] = bind
     return from_init(init, n_joints, arm) | Known.said_by("as given to hil new", link)
-
-
-def _positions(fixed: list[str]) -> dict[str, float]:
-    positions = {}
-    for text in fixed:
-        name, equals, value = text.partition("=")
-        try:
-            positions[name] = float(value) if equals else 0.0
-        except ValueError:
-            raise InputError(
-                None, f"{text!r} is no JOINT=POSITION", field="--fix", remedy="e.g. finger=0.02"
-            ) from None
-    return positions
 
 
 def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import JsonOption, QuietOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
@@ -77,7 +77,7 @@ def payload(
     as they are typed into a COMAU, UR and Franka controller. Exit status 5 if a figure of --check
     lies outside its interval, or no possible body fits the recordings.
     """
-    box, wanted = _box(shape), _wanted(check or [])
+    box, wanted = _box(shape), figures(check or [], "--check", "mass=4.0", bare=False)
     reporter = make_reporter(quiet=quiet or json)
     options = Options(estimator="wls", delay=delay_from(delay))
     found = find_payload(bare, loaded or [], reporter, frame=frame, box=box, options=options)
@@ -123,16 +123,3 @@ def _box(shape: tuple[str, float, float, float] | None) -> tuple[float, float, f
             remedy="give box and three edges above 0 m, such as box 0.2 0.1 0.1",
         )
     return x, y, z
-
-
-def _wanted(checks: list[str]) -> dict[str, float]:
-    wanted = {}
-    for text in checks:
-        name, _, figure = text.partition("=")
-        try:
-            wanted[name] = float(figure)
-        except ValueError:
-            raise InputError(
-                None, f"{text!r} is no figure", field="--check", remedy="write mass=4.0"
-            ) from None
-    return wanted

@@ -18,9 +18,9 @@ from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption
 from hil.errors import ControllerFault, HilError, OperatorStopError
-from hil.lines import say
+from hil.progress import say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 from hil.terminal_text import printable
@@ -53,14 +53,7 @@ def record(
         Literal["excitation", "validation", "standstill"],
         typer.Option(help="What it is for: to be fitted, to be predicted, or for the noise."),
     ] = "excitation",
-    accept_init: Annotated[
-        bool,
-        typer.Option(
-            "--accept-init",
-            help="Use the controller's gear ratios, calibration and coupling where they differ "
-            "from the cell's; the archive says so.",
-        ),
-    ] = False,
+    accept_init: AcceptInitOption = False,
     live: Annotated[
         str | None,
         typer.Option(

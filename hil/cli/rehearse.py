@@ -9,8 +9,8 @@ import typer
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
-from hil.lines import say
 from hil.progress import reporter as make_reporter
+from hil.progress import say
 
 from .verdict import NOT_GOOD
 

@@ -13,10 +13,10 @@ from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOptio
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
 from hil.identify import identify_sources
-from hil.lines import say
 from hil.outcome import RESULTS, report_replay
 from hil.plots import check_format, save
 from hil.progress import reporter as make_reporter
+from hil.progress import say
 from hil.replaying import ENSEMBLE, replay_motions
 
 

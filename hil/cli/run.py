@@ -13,14 +13,14 @@ from rich.console import Console
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.campaign import Campaign, Link, stop_on_interrupt
-from hil.campaign.execution_result import RunResult
+from hil.campaign.run import RunResult
 from hil.cell_link import require_watchable
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
 from hil.cli.payload import payload_lines
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
-from hil.lines import say
 from hil.progress import reporter as make_reporter
+from hil.progress import say
 from hil.screen import Screen
 from hil.screen.keys import can_read
 from hil.screen.screen import confirmed

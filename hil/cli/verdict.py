@@ -9,7 +9,7 @@ from typing import Final
 
 import typer
 
-from hil.lines import say
+from hil.progress import say
 from hil.results import JointJudgement, Results
 
 NOT_GOOD = 5

@@ -1,9 +1,13 @@
-"""One thing looked at, and what follows from it."""
+"""One thing looked at and what follows from it; the machine as text, or a test's own."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 
 class Status(StrEnum):
@@ -35,3 +39,80 @@ class Check:
     found: str
     why: str
     remedy: tuple[str, ...] = ()
+
+
+COMMAND_TIMEOUT = 3.0
+"""s that a command may take before its answer counts as not given."""
+_LARGEST = 4_000_000
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command said: exit status and both streams."""
+
+    status: int
+    output: str
+    errors: str = ""
+
+
+Runner = Callable[[Sequence[str]], Answer | None]
+
+
+def run_command(command: Sequence[str]) -> Answer | None:
+    """Run a command without input; None if it is not installed or does not end in time."""
+    path = shutil.which(command[0], path="/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/bin")
+    if path is None:
+        return None
+    try:
+        done = subprocess.run(
+            [path, *command[1:]],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=COMMAND_TIMEOUT,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return Answer(done.returncode, done.stdout, done.stderr)
+
+
+@dataclass(frozen=True)
+class System:
+    """Where facts are read from.
+
+    Attributes:
+        root: prefix of every path.
+        run: runs a command, see `run_command`.
+    """
+
+    root: Path = Path("/")
+    run: Runner = run_command
+
+    def path(self, name: str) -> Path:
+        """The file called `name` (absolute) on this system."""
+        return self.root / name.lstrip("/")
+
+    def text(self, name: str) -> str | None:
+        """The stripped text of a file; None if it is not there or may not be read."""
+        try:
+            with self.path(name).open("rb") as file:
+                return file.read(_LARGEST).decode("utf-8", errors="replace").strip()
+        except OSError:
+            return None
+
+    def number(self, name: str) -> int | None:
+        """The integer in a file; None if there is none."""
+        text = self.text(name)
+        try:
+            return None if text is None else int(text)
+        except ValueError:
+            return None
+
+    def names(self, folder: str) -> list[str]:
+        """Names in a folder, sorted; none if it cannot be listed."""
+        try:
+            return sorted(path.name for path in self.path(folder).iterdir())
+        except OSError:
+            return []

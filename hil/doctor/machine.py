@@ -11,48 +11,17 @@ import resource
 import sys
 import sysconfig
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from drivers.exchange.realtime import LIMITS_FILE, RealTimeSettings
+from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
 from hil.archive.process import STALL_LIMIT
 
-from .check import Check, Status
-from .system import System
+from .check import Check, Status, System
 
 GROUP = "realtime"
 RULE_FILE = "/etc/udev/rules.d/90-hil.rules"
 _LOG_IN_AGAIN = "# log out and in again, then: ulimit -r; ulimit -l"
-
-
-@dataclass(frozen=True)
-class Obtained:
-    """What a process like the exchange was really given (see `drivers.exchange.realtime`).
-
-    Attributes:
-        scheduling: scheduling class it runs in.
-        memory_locked: its memory stays in RAM.
-        cpu_awake: processors may not sleep while it runs.
-        refused: what was not given, one sentence each.
-    """
-
-    scheduling: str
-    memory_locked: bool
-    cpu_awake: bool
-    refused: tuple[str, ...] = ()
-
-    @classmethod
-    def from_mapping(cls, given: Mapping[str, object]) -> Obtained:
-        """From the probe's answer."""
-        refused = given.get("refused", ())
-        return cls(
-            scheduling=str(given.get("scheduling", "")),
-            memory_locked=given.get("memory_locked") is True,
-            cpu_awake=given.get("cpu_awake") is True,
-            refused=tuple(map(str, refused)) if isinstance(refused, list | tuple) else (),
-        )
 
 
 def user(uid: int | None = None) -> Check:
@@ -66,7 +35,7 @@ def user(uid: int | None = None) -> Check:
     )
 
 
-def scheduling(obtained: Obtained | None, limit: int | None = None) -> Check:
+def scheduling(obtained: RealTimeReport | None, limit: int | None = None) -> Check:
     """Whether real-time priority was given to a process that asked for it."""
     allowed = _limit(resource.RLIMIT_RTPRIO) if limit is None else limit
     limited = "no limit" if allowed < 0 else f"rtprio limit {allowed}"
@@ -84,7 +53,7 @@ def scheduling(obtained: Obtained | None, limit: int | None = None) -> Check:
     return Check(name, Status.BAD, found, why, (*remedy, throttled))
 
 
-def memory_lock(obtained: Obtained | None, limit: int | None = None) -> Check:
+def memory_lock(obtained: RealTimeReport | None, limit: int | None = None) -> Check:
     """Whether memory may be locked in RAM."""
     allowed = _limit(resource.RLIMIT_MEMLOCK) if limit is None else limit
     limited = "no limit" if allowed < 0 else f"memlock limit {allowed // 1024} KiB"
@@ -100,7 +69,7 @@ def memory_lock(obtained: Obtained | None, limit: int | None = None) -> Check:
     return Check(name, status, found, why, _limit_lines("memlock", "unlimited"))
 
 
-def processor_awake(obtained: Obtained | None, system: System) -> Check:
+def processor_awake(obtained: RealTimeReport | None, system: System) -> Check:
     """Whether /dev/cpu_dma_latency may be held at 0."""
     why = "halves the usual wake-up time; matters more than the programming language"
     name = "processor idle latency"
@@ -168,16 +137,6 @@ class DiskTrial:
     free: int
     seconds: tuple[float, ...] = ()
     error: str = ""
-
-    @classmethod
-    def from_mapping(cls, given: Mapping[str, Any]) -> DiskTrial:
-        """From the probe's answer."""
-        return cls(
-            folder=str(given.get("folder", "")),
-            free=int(given.get("free", 0)),
-            seconds=tuple(float(each) for each in given.get("seconds", ())),
-            error=str(given.get("error", "")),
-        )
 
 
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:

@@ -17,9 +17,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 
-from .machine import DiskTrial, Obtained
+from .machine import DiskTrial
 
 RESERVE: Final = 100e-6
 """s of a cycle reserved for what a bare measurement leaves out: session and guard (20 µs, at most
@@ -86,16 +87,16 @@ _GRACE = 15.0
 """s that a probe may take beyond its measurement (start-up on a slow disk)."""
 
 
-def obtained() -> Obtained | None:
+def obtained() -> RealTimeReport | None:
     """What a real-time process is given here; None if the probe failed."""
     answer = run_probe(["permissions"], 0.0)
-    return None if answer is None else Obtained.from_mapping(answer)
+    return None if answer is None else RealTimeReport(**answer)
 
 
 def disk_trial(place: Path) -> DiskTrial | None:
     """Room and write times at `place`; None if the disk did not answer."""
     answer = run_probe(["disk", str(place)], 0.0)
-    return None if answer is None else DiskTrial.from_mapping(answer)
+    return None if answer is None else DiskTrial(**answer)
 
 
 def measure(

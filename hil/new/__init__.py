@@ -1,8 +1,7 @@
 """A commented cell file for a new arm, from its URDF and what its controller or an archive says."""
 
 from .cell_text import NewCell, cell_of_dh, cell_of_urdf, with_clear_home
-from .controller import read_init
-from .known import Known, from_archive, from_init
+from .known import Known, from_archive, from_init, read_init
 
 __all__ = [
     "Known",

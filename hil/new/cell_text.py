@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell import Cell, CellError
-from hil.cell.text import replaced_value, urdf_limits
-from hil.cell.unknown import UNKNOWN, WHERE
+from hil.cell.errors import UNKNOWN, WHERE
+from hil.cell.text import urdf_limits, with_values
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.motion_checks import collision_checker
@@ -425,7 +425,7 @@ def with_clear_home(text: str, new: NewCell, path: Path) -> str:
         inside = (posture > limits.lower) & (posture < limits.upper)
         if inside.all() and clearance(checker, posture[None]) is None:
             shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
-            return replaced_value(text, "campaign", "home_deg", toml_value(shown))
+            return with_values(text, {"campaign.home_deg": shown})
     return text
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Final, Literal, TextIO
 
-from hil.campaign.motion_watch import OperatorRequest
+from hil.campaign.operator import OperatorRequest
 
 STEP: Final = 0.1
 """Of override, per key."""

@@ -6,6 +6,7 @@ shorter, then go; the last events go before the drift curve, that before the joi
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,11 +15,9 @@ from typing import Final
 import numpy as np
 from rich.text import Text
 
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
-from hil.campaign.operator import DriftCurve, RunStatus
+from hil.campaign.operator import DriftCurve, MotionProgress, OperatorRequest, RunStatus
 from hil.terminal_text import printable
 
-from . import marks
 from .keys import HELP, SHORT_HELP
 
 
@@ -37,7 +36,7 @@ def status_line(status: RunStatus, left: str = "") -> str:
         if motion.untaken:
             parts.append(f"{motion.untaken} not accepted")
         if motion.latency is not None:
-            parts.append(f"latency {marks.duration(motion.latency.p99)} (99 %)")
+            parts.append(f"latency {duration(motion.latency.p99)} (99 %)")
         for what, share in (
             ("following error", motion.following_share), ("current", motion.current_share)
         ):  # fmt: skip
@@ -49,7 +48,7 @@ def status_line(status: RunStatus, left: str = "") -> str:
             f"friction changed by {100.0 * drift.change[-1]:.1f} % "
             f"(warm below {100.0 * drift.threshold:g} %)"
         )
-    parts.append(left or f"{marks.clock(status.time_left)} left")
+    parts.append(left or f"{clock(status.time_left)} left")
     return ", ".join(parts)
 
 
@@ -136,7 +135,7 @@ def _heading(shown: Shown, width: int) -> Text:
     left = ""
     if status is not None:
         where.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
-        left = shown.left or f"{marks.clock(status.time_left)} left"
+        left = shown.left or f"{clock(status.time_left)} left"
     room = max(0, width - len(left) - 2)
     text = Text(
         printable(shown.title), style="bold"
@@ -200,7 +199,7 @@ def _health(shown: Shown, width: int) -> Text:
             text.append(f"  {count} {what}", style="bold yellow" if count else "green")
     latency = motion.latency
     if latency is not None:
-        times = [marks.duration(value) for value in (latency.median, latency.p99, latency.worst)]
+        times = [duration(value) for value in (latency.median, latency.p99, latency.worst)]
         if width >= WIDE:
             text.append(f"  {times[0]}, 99 % {times[1]}, worst {times[2]}")
         else:
@@ -237,8 +236,8 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
         ):
             line.append(value).append(" ")
             if bars:
-                line.append(marks.bar(share, bars - 1)).append(" ")
-            line.append(marks.percent(share), style=marks.colour(share))
+                line.append(bar(share, bars - 1)).append(" ")
+            line.append(percent(share), style=colour(share))
         if hot is not None:
             line.append(f" {hot[index]:3.0f}°C")
         rows.append(line)
@@ -258,7 +257,7 @@ def _drift(drift: DriftCurve, width: int) -> list[Text]:
         f"{100.0 * known[-1]:.1f} %", style="green" if known[-1] < drift.threshold else "yellow"
     )
     text.append(f", warm below {100.0 * drift.threshold:g} %  ")
-    return [text.append(marks.curve(known, max(0, width - text.cell_len)), style="cyan")]
+    return [text.append(curve(known, max(0, width - text.cell_len)), style="cyan")]
 
 
 def _news(shown: Shown) -> list[str]:
@@ -278,3 +277,66 @@ def _help(shown: Shown, width: int) -> Text:
         return Text("Ctrl-C stops on the path".ljust(width), style="reverse")
     text = next((text for text in (HELP, SHORT_HELP) if len(text) <= width), "h ␣ s + - 1…0")
     return Text(text.ljust(width), style="reverse")
+
+
+_EIGHTHS: Final = " ▏▎▍▌▋▊▉█"
+_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
+WARNING: Final = 0.8
+"""Share of a limit from which on it is coloured."""
+
+
+def bar(share: float, width: int) -> Text:
+    """A share of a limit; above `WARNING` it is marked by colour, above 1 by the last character."""
+    if not math.isfinite(share):
+        return Text("?".ljust(width), style="bold red")
+    filled = round(8 * width * min(max(share, 0.0), 1.0))
+    whole, rest = divmod(filled, 8)
+    filled_blocks = "█" * whole + (_EIGHTHS[rest] if rest else "")
+    text = Text(filled_blocks, style=colour(share))
+    text.append("·" * (width - len(filled_blocks)), style="dim")
+    if share > 1.0:
+        text = Text("█" * (width - 1) + "▶", style=colour(share))
+    return text
+
+
+def colour(share: float) -> str:
+    """Style of a share of a limit; the number beside it says the same without colours."""
+    if share > 1.0:
+        return "bold red"
+    return "yellow" if share > WARNING else "green"
+
+
+def percent(share: float) -> str:
+    """A share in four characters."""
+    if not math.isfinite(share):
+        return "  ?%"
+    value = min(100.0 * share, 999.0)
+    return f"{value:3.1f}%" if value < 9.95 else f"{value:3.0f}%"
+
+
+def curve(values: Sequence[float], width: int) -> str:
+    """The last `width` values as a row of blocks, from 0 to the largest of them."""
+    shown = [value for value in values if math.isfinite(value)][-width:]
+    top = max(shown, default=0.0)
+    if top <= 0.0:
+        return _HEIGHTS[0] * len(shown)
+    return "".join(
+        _HEIGHTS[min(len(_HEIGHTS) - 1, int(len(_HEIGHTS) * max(value, 0.0) / top))]
+        for value in shown
+    )
+
+
+def clock(seconds: float | None) -> str:
+    """A time as h:mm:ss or m:ss."""
+    if seconds is None or not math.isfinite(seconds):
+        return "?"
+    minutes, rest = divmod(max(0, round(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def duration(seconds: float) -> str:
+    """A latency."""
+    if not math.isfinite(seconds):
+        return "> 5 ms"
+    return f"{1e3 * seconds:.1f} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} µs"

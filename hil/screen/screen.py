@@ -24,16 +24,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hil.campaign.gravity_check import AGAINST
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
-from hil.campaign.stop import Stop
+from hil.campaign.dry_run import DryRun
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
-from hil.lines import put
-from hil.progress import Silent, Task
+from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
 
-from . import layout, marks
+from . import layout
 from .keys import Keyboard, after, can_read, stops
 from .layout import SIMULATED, Shown, lines
 
@@ -92,7 +89,7 @@ class Pace:
 _LOOK: Final = 0.2
 
 
-def ask(console: Console, summary: DryRunSummary, stop: Stop) -> bool:
+def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
     """Show what was measured and wait for an answer; only "yes" accepts.
 
     Where torques contradict the model, only the names of the joints concerned do.
@@ -100,15 +97,15 @@ def ask(console: Console, summary: DryRunSummary, stop: Stop) -> bool:
     A stop asked for meanwhile is a refusal. It is looked for while nothing is typed, so that the
     heartbeat of a real link goes on and Ctrl-C needs no answer.
     """
-    console.print(_table(summary))
-    what = "the simulated arm" if summary.simulated else "the arm"
-    word = " ".join(summary.against_gravity) or "yes"
-    for joint in summary.against_gravity:
-        console.print(f"{joint}: {AGAINST}", style="bold red", markup=False, highlight=False)
-    known = f"If you know why, type {word}" if summary.against_gravity else "Type yes"
+    console.print(_table(title, found))
+    what = "the simulated arm" if found.simulated else "the arm"
+    word = " ".join(found.against_gravity) or "yes"
+    for warning in found.warnings:
+        console.print(warning, style="bold red", markup=False, highlight=False)
+    known = f"If you know why, type {word}" if found.against_gravity else "Type yes"
     return confirmed(
         console,
-        f"Did {what} move as it should, with nothing in its way at {summary.override:.0%} of full "
+        f"Did {what} move as it should, with nothing in its way at {found.override:.0%} of full "
         f"speed? {known} to accept; anything else ends the run: ",
         word,
         stop,
@@ -129,25 +126,25 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
     return False
 
 
-def _table(summary: DryRunSummary) -> Table:
-    title = f"Dry run of {summary.campaign}, {marks.clock(summary.duration)} long"
-    table = Table(title=Text(printable(title)))
+def _table(title: str, found: DryRun) -> Table:
+    heading = f"Dry run of {title}, {layout.clock(found.duration)} long"
+    table = Table(title=Text(printable(heading)))
     table.add_column("joint")
     table.add_column("largest following error", justify="right")
     table.add_column("largest current", justify="right")
     table.add_column("torque and weight")
     for name, error, share in zip(
-        summary.joint_names, summary.following_error, summary.current_share, strict=True
+        found.joint_names, found.following_error, found.current_share, strict=True
     ):
         degrees = f"{math.degrees(error):.3f}°"
         agree = Text("agree")
-        if name in summary.against_gravity:
+        if name in found.against_gravity:
             agree = Text("contradict", style="bold red")
-        elif name in summary.gravity_not_seen:
+        elif name in found.gravity_not_seen:
             agree = Text("not seen")
         table.add_row(Text(printable(name)), degrees, f"{100.0 * share:.0f} % of its limit", agree)
-    archives = ", ".join(summary.archives)
-    link = f"{plural(summary.missed, 'packet')} missed, {plural(summary.late, 'answer')} late"
+    archives = ", ".join(found.archives)
+    link = f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late"
     table.caption = Text(printable(f"{link}; {archives}"))
     return table
 
@@ -355,7 +352,7 @@ class Screen:
         """Whether somebody sits at the terminal."""
         return self._full and can_read(sys.stdin)
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, found: DryRun) -> bool:
         """Ask on the terminal, on the shell's own page; False where nobody can answer."""
         if not self.can_answer:
             return False
@@ -363,7 +360,7 @@ class Screen:
         self._pace.pause()
         try:
             self._leave_what_was_said()
-            return not self._stuck and ask(self._console, summary, self._stop)
+            return not self._stuck and ask(self._console, self._shown.title, found, self._stop)
         finally:
             try:
                 self._open()
@@ -396,8 +393,8 @@ class Screen:
     def _left(self, status: RunStatus) -> str:
         waiting = self._pace.left(status)
         if waiting is None:
-            return f"{marks.clock(status.time_left)} of motion left"
-        return f"{marks.clock(waiting)} left"
+            return f"{layout.clock(status.time_left)} of motion left"
+        return f"{layout.clock(waiting)} left"
 
     def _open(self) -> None:
         self._undo = contextlib.ExitStack()

@@ -15,7 +15,6 @@ from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, 
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.quick_design import plan_around
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.design import DesignSettings, problem_of
 from hil.design.advice import NoExcitationError
 from hil.errors import ControllerFault, HilError
@@ -140,14 +139,6 @@ def noise_key(method: str, factor: float) -> str:
     return f"{method}-noise-{factor:g}"
 
 
-def _with(cell: Cell, table: str, **values: Any) -> Cell:
-    """The cell with other values in a table of its file."""
-    text = cell.text
-    for name, value in values.items():
-        text = replaced_value(text, table, name, str(value))
-    return Cell.from_texts(text, cell.urdf, cell.path)
-
-
 def plan_study(
     folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Found]
 ) -> Plans:
@@ -194,7 +185,9 @@ def plan_study(
     for key, one in varied.items():
         add(ABLATION, key, few, one)
     for factor in settings.noise:
-        noisy = _with(few, "simulation", current_noise=factor * cell.simulation.current_noise)
+        noisy = few.with_values(
+            {"simulation.current_noise": factor * cell.simulation.current_noise}
+        )
         for key in (A, B):
             add(ABLATION, noise_key(key, factor), noisy, excitations[key])
     return Plans(sines, printed, excitations, executions, missing)
@@ -249,7 +242,9 @@ def via_point_motions(
     Raises:
         NoExcitationError: none satisfies the constraints.
     """
-    own = _with(cell, "campaign", fly=fly, seed=seed, validation_runs=count)
+    own = cell.with_values(
+        {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
+    )
     return plan_around(own, excitation, checks).validation
 
 

@@ -10,21 +10,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .faulty import faulty_controller, faulty_link, run_campaign, shortened
-    from .udp import UdpController
-
-_HOME = {
-    "UdpController": "udp",
-    "faulty_controller": "faulty",
-    "faulty_link": "faulty",
-    "run_campaign": "faulty",
-    "shortened": "faulty",
-}
+    from .faulty import UdpController, faulty_controller, faulty_link, run_campaign, shortened
 
 __all__ = ["UdpController", "faulty_controller", "faulty_link", "run_campaign", "shortened"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    if name in __all__:
+        return getattr(import_module(f"{__name__}.faulty"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,7 +15,7 @@ import pytest
 if TYPE_CHECKING:
     from hil.campaign import Campaign, Link
     from hil.cell import Cell
-    from hil.testing.udp import UdpController
+    from hil.testing.faulty import UdpController
     from sim_fixtures import SimulatedController
 
 MARKER = "controller_faults"
@@ -101,7 +101,7 @@ def udp_controller(
     tmp_path: Path, simulated_cell: Cell, controller_faults: tuple[str, ...]
 ) -> Iterator[UdpController]:
     """A simulated controller in a process of its own, over loopback UDP, in real time."""
-    from hil.testing.udp import UdpController
+    from hil.testing.faulty import UdpController
 
     with UdpController.started(simulated_cell, tmp_path, faults=controller_faults) as controller:
         yield controller

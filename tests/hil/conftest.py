@@ -9,7 +9,6 @@ import pytest
 
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.progress import Silent
 from hil.simulation import simulated_link, simulated_provenance
 from sim_fixtures import SimulatedDrive
@@ -28,11 +27,8 @@ SETTINGS = {
 
 def small(**changes: float) -> Cell:
     """The NS 16 cell with a short campaign."""
-    cell = Cell.load(CELL_PATH)
-    text = cell.text
-    for key, value in (SETTINGS | changes).items():
-        text = replaced_value(text, "campaign", key, value)
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    settings = (SETTINGS | changes).items()
+    return Cell.load(CELL_PATH).with_values({f"campaign.{key}": value for key, value in settings})
 
 
 def run_campaign(

@@ -9,7 +9,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.quick_design import design
 from hil.campaign.rehearsal import CRITERIA, Criterion, Rehearsal
 from hil.cell import Cell
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from hil.progress import Silent
 
 URDF = """<robot name="fast">
@@ -93,11 +93,7 @@ friction_drift = 0.9
 def fast_cell(folder: Path, **campaign: float) -> Cell:
     """The cell as a file in a folder, with some of its `[campaign]` replaced."""
     (folder / "fast.urdf").write_text(URDF)
-    text = CELL
-    for key, value in campaign.items():
-        if f"\n{key} =" not in text.split("[campaign]")[1].split("[simulation]")[0]:
-            text = text.replace("[campaign]\n", f"[campaign]\n{key} = 0\n")
-        text = replaced_value(text, "campaign", key, value)
+    text = with_values(CELL, {f"campaign.{key}": value for key, value in campaign.items()})
     path = folder / "cell.toml"
     path.write_text(text)
     return Cell.load(path)

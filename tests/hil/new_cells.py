@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from planner.toml_text import toml_value
 
 TWO_JOINTS = """<?xml version="1.0"?>
@@ -78,11 +78,11 @@ def filled_in(path: Path, n: int, **said: object) -> str:
     }
     figures |= {name.replace("__", "."): value for name, value in said.items()}
     for name, value in figures.items():
-        table, key = name.split(".")
+        key = name.partition(".")[2]
         there = re.search(rf"(?m)^{key} = .*\"\?\"", text)
         if there or name in {entry.replace("__", ".") for entry in said}:
-            text = replaced_value(text, table, key, toml_value(value))
-    text = replaced_value(text, "controller", "transport", toml_value("simulated"))
+            text = with_values(text, {name: value})
+    text = with_values(text, {"controller.transport": "simulated"})
     planted = {"seed": 1, "initial_deg": figures["campaign.home_deg"], "third": [0.0] * n}
     planted |= {key: figures[f"nominal.{key}"] for key in ("rotor_inertia", "coulomb", "viscous")}
     planted |= {"current_noise": 0.02, "current_resolution": 0.005}

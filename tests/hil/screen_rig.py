@@ -15,8 +15,8 @@ import numpy as np
 
 from drivers.states import State
 from hil.campaign import stop_on_interrupt
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.dry_run import DryRun
+from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus
 from hil.screen import Screen
 
 LONGEST = 60.0
@@ -42,13 +42,13 @@ def main() -> int:
             last: OperatorRequest | None = None
             until = time.monotonic() + LONGEST
             if ending in ("question", "contradiction"):
-                summary = DryRunSummary(
-                    "rig", "0" * 64, ("dryrun_000_a1.mcap",), 0.2, 12.0, True, NAMES,
-                    np.array([0.2, 0.4]), np.array([0.001, 0.002]), 0, 0,
+                found = DryRun(
+                    "0" * 64, 0.2, ("dryrun_000_a1.mcap",), 12.0, True, NAMES,
+                    (0.2, 0.4), (0.001, 0.002), 0, 0,
                     against_gravity=NAMES[1:] if ending == "contradiction" else (),
                 )  # fmt: skip
                 for _ in range(3):
-                    told.write(json.dumps({"accepted": screen.accept_dry_run(summary)}) + "\n")
+                    told.write(json.dumps({"accepted": screen.accept_dry_run(found)}) + "\n")
             while not stop.requested and time.monotonic() < until:
                 wish = screen.request()
                 screen.show(status(wish))

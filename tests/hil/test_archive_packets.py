@@ -18,7 +18,6 @@ from hil.archive.repair import repair
 from hil.archive.schema import CYCLE, PACKETS
 from hil.campaign import Link, Stop
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.demo_link import loopback_link
 from hil.errors import ArchiveError
 from hil.recording import record
@@ -28,8 +27,7 @@ NAME = "excitation_000_a1.mcap"
 
 
 def keeping_packets(cell: Cell) -> Cell:
-    text = replaced_value(cell.text, "controller", "packets", "true")
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    return cell.with_link(packets=True)
 
 
 def recorded(folder: Path, cell: Cell, *faults: Lose, duration: float = 1.0) -> Path:

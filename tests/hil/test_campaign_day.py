@@ -1,12 +1,15 @@
-"""The operator's day as docs/campaign.md tells it, typed on a small simulated cell."""
+"""A day with a campaign."""
 
 from __future__ import annotations
 
 import ast
+import gc
 import inspect
 import json
 import re
 import shlex
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,11 +18,14 @@ from typer.testing import CliRunner
 import hil.cli.rehearse
 import hil.cli.report
 import hil.cli.status
-from hil.campaign import Campaign, CampaignFolderError
+from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, Stop
 from hil.campaign.campaign import campaign_of_design
+from hil.campaign.operator import RunStatus, Unattended
+from hil.cell import Cell
 from hil.cli import app
 from hil.design import DesignResult
-from tests.hil.fast_cell import fast_cell
+from hil.version import software
+from tests.hil.fast_cell import fast_campaign, fast_cell
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "campaign.md"
 QUICK = """\
@@ -162,3 +168,47 @@ def test_a_command_is_a_thin_shell_over_the_campaign(module: object) -> None:
     }
     assert imported <= {"Campaign", "CampaignStatus", "Rehearsal", "stop_on_interrupt"}
     assert "Campaign" in imported
+
+
+# --- What the process that supervised a run still holds afterwards: it may supervise for days
+
+
+class Impatient(Unattended):
+    """Stops the arm in the first repetition."""
+
+    def __init__(self, stop: Stop) -> None:
+        self._stop = stop
+
+    def show(self, status: RunStatus) -> None:
+        self._stop.requested = status.phase == "repetition" and status.motion is not None
+
+
+def left_in_cycles(work: Callable[[], object]) -> Counter[str]:
+    """What `work` leaves to the cycle collector, by type."""
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        work()
+        gc.collect()
+        return Counter(type(one).__qualname__ for one in gc.garbage)
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+
+
+def test_a_campaign_leaves_nothing_to_the_cycle_collector(tmp_path: Path) -> None:
+    """Made of a cell file, run, stopped on the way, opened and run again."""
+    plan = fast_campaign(tmp_path / "first", fast_cell(tmp_path, repetitions=1)).plan
+    folder = tmp_path / "second"
+    software()  # what is installed is read once in a process
+
+    def work() -> None:
+        stop = Stop()
+        campaign = Campaign.create(folder, Cell.load(tmp_path / "cell.toml"), plan)
+        with pytest.raises(MotionFailedError):
+            campaign.run(stop=stop, operator=Impatient(stop), unrehearsed=True)
+        assert Campaign.open(folder).run(unrehearsed=True).complete
+
+    assert not left_in_cycles(work)

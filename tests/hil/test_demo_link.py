@@ -1,17 +1,26 @@
-"""`hil demo --link`: the same demonstration over real sockets, in real time."""
+"""The demo's own link and its excitation."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hil.archive import open_archive
-from hil.campaign import Campaign
+from hil.campaign import Campaign, MotionRefusedError
+from hil.cell import Cell
+from hil.cli import demo as demo_module
 from hil.demo_link import SimulatorProcess
+from hil.design import preset
+from hil.identify.exports import FILES
+from identification.excitation import Criteria, Excitation
+from planner import FourierSeries
 from sim_fixtures.ns16 import CELL_PATH
 
 
@@ -52,3 +61,63 @@ def test_a_simulated_controller_that_fails_says_why() -> None:
         simulator.finish()  # nothing is left to be asked
     finally:
         simulator.end()
+
+
+# --- `hil demo --excitation`: what may not run removes nothing, and what a design lacks is said
+
+UNKNOWN = Criteria(log10_det=0.0, coupling_index=0.0, fitness=0.0, n_samples=1)
+
+
+@pytest.fixture
+def wild(cell: Cell) -> Excitation:
+    series = FourierSeries(cell.home, np.full((6, 1), 2.0), np.full((6, 1), 3.0), 5.0, 1.0)
+    return Excitation(series, UNKNOWN, method="a", seed=7, tried=1, rejected={})
+
+
+def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
+    tmp_path: Path, wild: Excitation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever an earlier one left: what identification writes for other tools is no stranger."""
+    earlier = tmp_path / "manifest.json"
+    for name in ("manifest.json", "results.json", "report.html", *FILES):
+        (tmp_path / name).write_text("{}")
+    monkeypatch.setattr(demo_module, "_designed", lambda *arguments: wild)
+    with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):
+        demo_module.demo(output=tmp_path, excitation=tmp_path / "x.toml", force=True, quiet=True)
+    assert earlier.read_text() == "{}"
+
+
+@pytest.mark.parametrize(
+    ("constraints", "complete", "words"),
+    [
+        ({}, True, ()),
+        ({"collision": False}, True, ("contacts were not looked at",)),
+        ({"current": False}, False, ("currents were not looked at", "stopped before its end")),
+    ],
+)
+def test_what_a_design_was_searched_without_is_said(
+    cell: Cell,
+    wild: Excitation,
+    monkeypatch: pytest.MonkeyPatch,
+    constraints: dict[str, bool],
+    complete: bool,
+    words: tuple[str, ...],
+) -> None:
+    result = SimpleNamespace(
+        require_cell=lambda cell, path: None,
+        settings=preset("a").replaced(constraints=constraints),
+        complete=complete,
+        excitation=replace(wild),
+    )
+    if not constraints:  # whatever the preset leaves out
+        everything = {"collision": True, "current": True}
+        result.settings = preset("a").replaced(constraints=everything)
+    monkeypatch.setattr(
+        demo_module, "DesignResult", SimpleNamespace(load=lambda path: result), raising=True
+    )
+    said: list[str] = []
+    reporter = SimpleNamespace(say=said.append)
+    demo_module._designed(Path("x"), cell, reporter)
+    assert len(said) == bool(words)
+    for word in words:
+        assert word in said[0]

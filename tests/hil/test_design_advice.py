@@ -7,7 +7,6 @@ import re
 import pytest
 
 from hil.cell import AngleFrame, Cell
-from hil.cell.text import replaced_value
 from hil.design import DesignSettings, preset, problem_of
 from hil.design.advice import NoExcitationError, no_excitation
 from identification.excitation import NoFeasibleMotionError, Violation
@@ -101,9 +100,7 @@ def test_the_closest_motion_is_told_with_one_violation_of_each_kind(cell):
 def test_currents_that_home_itself_needs_are_told_before_any_motion_is_tried(cell):
     limits = cell.drive_train.current_limit.tolist()
     limits[1] = 0.1
-    weak = Cell.from_texts(
-        replaced_value(cell.text, "drive_train", "current_limit", limits), cell.urdf, cell.path
-    )
+    weak = cell.with_values({"drive_train.current_limit": limits})
     words = r"begin at home: at rest there, current of motor of joint_2: [\d.]+ A, at most 0\.08 A"
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)

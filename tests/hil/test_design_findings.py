@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
 from hil.design.advice import margins, weakest
 from hil.motion_checks import MotionChecks
@@ -52,9 +51,7 @@ def test_margins_name_the_motor_and_the_pair(cell):
 
 
 def test_the_nearest_pair_is_no_contact_even_where_the_margin_is_narrow(cell):
-    narrow = Cell.from_texts(
-        replaced_value(cell.text, "workspace", "margin", 0.01), cell.urdf, cell.path
-    )
+    narrow = cell.with_values({"workspace.margin": 0.01})
     motion = swinging(cell, [0, 1, 2])
     wide, found = (
         margins(each, problem_of(each, preset("b")), motion).partition("nearest ")[2]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.design import DesignResult, load_design, preset, problem_of
 from hil.design.folder import DesignFolder
 from hil.design.result import _seal, fingerprint
@@ -202,12 +201,8 @@ def test_another_planner_may_differ_in_the_last_digits_and_no_more(made, text, t
 
 
 def test_a_cell_with_other_limits_is_refused_by_name(made, cell):
-    slower = replaced_value(
-        cell.text, "limits", "velocity_deg", "[100.0, 155.0, 170.0, 360.0, 350.0, 550.0]"
-    )
-    other = Cell.from_texts(
-        replaced_value(slower, "cell", "name", '"the slow one"'), cell.urdf, cell.path
-    )
+    slow = [100.0, 155.0, 170.0, 360.0, 350.0, 550.0]
+    other = cell.with_values({"limits.velocity_deg": slow, "cell.name": "the slow one"})
     with pytest.raises(InputError) as caught:
         load_design(made[0].result, other)
     for word in ("'NS 16 (simulated)'", "'the slow one'", "limits"):
@@ -217,10 +212,8 @@ def test_a_cell_with_other_limits_is_refused_by_name(made, cell):
 def test_a_cell_with_another_campaign_link_or_wall_is_the_same_robot(made, cell):
     other = cell.with_campaign(repetitions=3).with_link(transport="udp", host="127.0.0.1")
     assert fingerprint(other) == fingerprint(cell)
-    wall = "[{lower = [2.0, 2.0, 0.0], upper = [2.1, 2.1, 1.0]}]"
-    walled = Cell.from_texts(
-        replaced_value(cell.text, "workspace", "walls", wall), cell.urdf, cell.path
-    )
+    wall = {"lower": [2.0, 2.0, 0.0], "upper": [2.1, 2.1, 1.0]}
+    walled = cell.with_values({"workspace.walls": [wall]})
     assert fingerprint(walled) != fingerprint(cell)
     for each in (other, walled):
         load_design(made[0].result, each)

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.problem import Knowledge
 from hil.design.settings import SettingsError, preset_text, settings_of
@@ -304,9 +303,7 @@ def test_an_angle_that_is_no_number_is_refused():
 
 
 def test_seeds_and_repetitions_of_the_cell_play_no_part_in_the_problem(cell):
-    other = Cell.from_texts(
-        replaced_value(cell.text, "campaign", "repetitions", 3), cell.urdf, cell.path
-    )
+    other = cell.with_campaign(repetitions=3)
     assert problem_of(other, preset("b").kinematic()).objective.repetitions == 1
 
 

@@ -14,8 +14,8 @@ import pytest
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.cell.link import with_link
-from hil.cell.unknown import UnknownFieldsError
+from hil.cell.errors import UnknownFieldsError
+from hil.cell.text import with_values
 from hil.demo_link import free_port
 from tests.docs import typed
 
@@ -31,7 +31,8 @@ def commands() -> list[list[str]]:
 def edit(path: Path, **instead: int) -> None:
     """What the page says is to be written into `[controller]` of the copy."""
     (block,) = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
-    path.write_text(with_link(path.read_text("utf-8"), **{**tomllib.loads(block), **instead}))
+    link = {f"controller.{key}": value for key, value in (tomllib.loads(block) | instead).items()}
+    path.write_text(with_values(path.read_text("utf-8"), link))
 
 
 def hil(arguments: list[str], folder: Path) -> subprocess.Popen[str]:
@@ -96,7 +97,7 @@ def test_the_copy_of_the_simulated_arms_cell_is_whole_and_reaches_the_controller
 
 
 def test_the_list_names_every_field_that_hil_new_leaves_open() -> None:
-    from hil.cell.unknown import WHERE
+    from hil.cell.errors import WHERE
 
     items = re.findall(r"(?m)^- (`.*?):", DOCUMENT.read_text("utf-8"))
     said = {field for item in items for field in re.findall(r"`(\w+)`", item)}

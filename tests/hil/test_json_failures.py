@@ -15,9 +15,8 @@ from typer.testing import CliRunner, Result
 from hil.archive import Samples, write_samples
 from hil.archive.supervised import Failed
 from hil.campaign import Campaign
-from hil.campaign.errors import write_error
-from hil.cli import COMMANDS, app, main
-from hil.cli.failing import as_json, exit_code_of
+from hil.campaign.live_link import write_error
+from hil.cli import COMMANDS, app, as_json, exit_code_of, main
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError
 from hil.files import make_folder, writing_to
 from planner import PlannerError

@@ -16,7 +16,7 @@ from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.link import Link
-from hil.campaign.motion_watch import MotionProgress, OperatorRequest
+from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_link

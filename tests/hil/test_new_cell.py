@@ -21,15 +21,15 @@ from drivers.transports.udp import UdpSpec
 from hil.archive import Samples, write_samples
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import urdf_limits
-from hil.cell.unknown import UnknownFieldsError
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
-from hil.new.controller import _nothing_moves
+from hil.new.known import _nothing_moves
 from hil.progress import Silent
 from hil.simulation import simulated_link
 from hil.testing import shortened
@@ -262,7 +262,7 @@ def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
     ("options", "sentence"),
     [
         (["--fix", "elbow"], "has no moving joint elbow; it has hip, knee"),
-        (["--fix", "hip=high"], "'hip=high' is no JOINT=POSITION"),
+        (["--fix", "hip=high"], "'hip=high' is no NAME=NUMBER"),
         (["--from-controller", "a:b"], "is no HOST or HOST:PORT"),
         (["--from-controller", "a:70000"], "is no HOST or HOST:PORT"),
         (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is no HOST or HOST:PORT"),

@@ -16,7 +16,6 @@ import pytest
 import hil.identify.sources
 from hil.campaign import Campaign, CampaignPlan
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.identify import identify_campaign
 from hil.progress import Silent
 from hil.recordings import recording_of
@@ -31,9 +30,7 @@ Run = Callable[..., Campaign]
 @pytest.fixture(scope="module")
 def short(cell: Cell) -> Cell:
     """No more motion, and no more cycles of it, than a verdict needs."""
-    text = replaced_value(cell.text, "controller", "cycle_ms", 2)
-    slower = Cell.from_texts(text, cell.urdf, cell.path)
-    return slower.with_campaign(repetitions=2, validation_runs=1)
+    return cell.with_link(cycle_ms=2).with_campaign(repetitions=2, validation_runs=1)
 
 
 @pytest.fixture(scope="module")

@@ -180,7 +180,10 @@ class TestRefusals:
         ("arguments", "sentence"),
         [
             (("empty.mcap",), "name both: hil payload BARE"),
-            (("empty.mcap", "--loaded", "full.mcap", "--check", "mass"), "'mass' is no figure"),
+            (
+                ("empty.mcap", "--loaded", "full.mcap", "--check", "mass"),
+                "'mass' is no NAME=NUMBER",
+            ),
             (("empty.mcap", "--shape", "ball", "1", "1", "1"), "ball 1 1 1 is no shape"),
         ],
     )

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hil.cell import Cell, CellError
-from hil.cell.text import replaced_value
 from hil.simulation import planted_truth, planted_values, simulated_controller
 from sim_fixtures.ns16 import CELL_PATH, base_from_standard, standard_parameters
 
@@ -44,11 +43,9 @@ def test_two_laws_in_one_simulated_arm_are_refused() -> None:
         planted_truth(cell)
 
 
-def cell_scaled(scale: str) -> Cell:
+def cell_scaled(scale: list[float]) -> Cell:
     """The NS 16 whose links are so many times those of its URDF."""
-    cell = Cell.load(CELL_PATH)
-    text = replaced_value(cell.text, "simulation", "inertia_scale", scale)
-    return Cell.from_texts(text, cell.urdf, cell.path)
+    return Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": scale})
 
 
 class TestInertiaScale:
@@ -73,7 +70,7 @@ class TestInertiaScale:
             assert moved[name] == pytest.approx(value, rel=1e-11, abs=1e-11), name
 
     def test_without_it_the_urdf_is_right(self) -> None:
-        cell = cell_scaled("[]")
+        cell = cell_scaled([])
         b = cell.model.base.rank
         np.testing.assert_array_equal(planted_truth(cell).inertia_scale, np.ones(6))
         rotors = np.array(cell.simulation.rotor_inertia)
@@ -81,7 +78,7 @@ class TestInertiaScale:
         standard[cell.model.layout.rotors] = rotors
         np.testing.assert_allclose(planted_values(cell)[:b], cell.model.base.grouping @ standard)
 
-    @pytest.mark.parametrize("scale", ["[1.1]", "[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]"])
-    def test_one_positive_factor_per_joint_is_needed(self, scale: str) -> None:
+    @pytest.mark.parametrize("scale", [[1.1], [1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
+    def test_one_positive_factor_per_joint_is_needed(self, scale: list[float]) -> None:
         with pytest.raises(CellError, match=r"simulation\.inertia_scale"):
             cell_scaled(scale)

@@ -15,7 +15,6 @@ from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan, design, plan_around
 from hil.campaign.quick_design import LEAST, quick_settings
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.design import load_design, preset
 from hil.design.folder import DesignFolder
 from hil.design.run import run_design
@@ -24,7 +23,6 @@ from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.progress import Silent
 from identification.excitation import sampled
 from planner import FourierSeries, PiecewiseCubic
-from planner.toml_text import toml_value
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 
@@ -64,8 +62,7 @@ def test_motions_are_planned_with_the_share_of_the_currents_that_a_rehearsal_all
     strong = design(cell, Silent())
     worst = max(_largest_shares(cell, strong))
     limits = [float(limit * worst / 0.9) for limit in cell.drive_train.current_limit]
-    text = replaced_value(cell.text, "drive_train", "current_limit", toml_value(limits))
-    weak = Cell.from_texts(text, cell.urdf, cell.path)
+    weak = cell.with_values({"drive_train.current_limit": limits})
     found = design(weak, Silent())
     assert max(_largest_shares(weak, found)) <= PLANNED_CURRENT
     # What was designed elsewhere is judged by the whole limit before it is sent.

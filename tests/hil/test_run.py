@@ -19,19 +19,16 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
 from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
-from hil.campaign.dry_run import OVERRIDE, DryRun
+from hil.campaign.dry_run import OVERRIDE, DryRun, agreement
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
     MotionFailedError,
     RepetitionsRejectedError,
 )
-from hil.campaign.execution_result import RunResult
-from hil.campaign.gravity_check import agreement
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
-from hil.campaign.stop import Stop
+from hil.campaign.run import RunResult
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
 from hil.identify.sources import gather_sources
@@ -67,7 +64,7 @@ class Person:
     ) -> None:
         self.accepts, self.requests = accepts, requests
         self.seen: list[RunStatus] = []
-        self.asked: list[DryRunSummary] = []
+        self.asked: list[DryRun] = []
 
     def show(self, status: RunStatus) -> None:
         self.seen.append(status)
@@ -75,7 +72,7 @@ class Person:
     def request(self) -> OperatorRequest:
         return self.requests(self.seen[-1])
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, summary: DryRun) -> bool:
         self.asked.append(summary)
         return self.accepts
 
@@ -220,7 +217,7 @@ def test_a_person_is_asked_and_a_no_ends_the_run(make: Make) -> None:
     (summary,) = nobody.asked
     assert summary.plan_hash == campaign.folder.plan_hash
     assert summary.simulated
-    assert 0.0 < summary.current_share.max() < 1.0
+    assert 0.0 < max(summary.current_share) < 1.0
     somebody = Person()
     assert "dryrun" not in kinds(campaign.run(operator=somebody)), "what is done is not done again"
     assert len(somebody.asked) == 1

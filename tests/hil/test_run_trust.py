@@ -30,23 +30,19 @@ from hil.campaign import (
     Link,
     MotionRefusedError,
     NotRehearsedError,
-    quality_entry,
+    quality,
 )
 from hil.campaign.conduct import conduct_of
 from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.dry_run import OVERRIDE, DryRun
 from hil.campaign.errors import ArmChangedError, DryRunError, RepetitionsRejectedError
-from hil.campaign.execution_result import RunResult
-from hil.campaign.folder import CampaignFolder
-from hil.campaign.folder_lock import LOCK
+from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.rehearsal import Rehearsal
-from hil.campaign.stop import Stop
+from hil.campaign.run import RunResult
 from hil.campaign.warmup import COLD_AFTER, WarmUp
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.cli import app
 from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
@@ -79,7 +75,7 @@ class Person:
     def request(self) -> OperatorRequest:
         return OperatorRequest() if self.status is None else self.requests(self.status)
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, summary: DryRun) -> bool:
         del summary
         return True
 
@@ -110,8 +106,7 @@ def make(tmp_path: Path, designed: Campaign) -> Make:
     def made(name: str = "campaign", *, real: bool = False, **settings: float) -> Campaign:
         cell = fast_cell(tmp_path, **{"repetitions": 1, **settings})
         if real:
-            text = cell.with_link(transport="udp", host="192.0.2.7").text
-            cell = Cell.from_texts(text, cell.urdf, cell.path)
+            cell = cell.with_link(transport="udp", host="192.0.2.7")
         campaign = Campaign.create(tmp_path / name, cell, designed.plan)
         pass_rehearsal(campaign.folder)
         return campaign
@@ -176,15 +171,10 @@ def test_a_link_to_another_arm_is_refused_and_one_to_the_same_elsewhere_is_not(
     tmp_path: Path, dry: Campaign
 ) -> None:
     campaign = copied(dry, tmp_path / "campaign")
-    text = replaced_value(campaign.cell.text, "limits", "velocity_deg", "[300.0, 300.0]")
-    other = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    other = campaign.cell.with_values({"limits.velocity_deg": [300.0, 300.0]})
     with pytest.raises(CampaignFolderError, match=r"opened with another cell \(\[limits\]"):
         campaign.run(simulated_link(other))
-    there = Cell.from_texts(
-        replaced_value(campaign.cell.text, "controller", "port", 4711),
-        campaign.cell.urdf,
-        campaign.cell.path,
-    )
+    there = campaign.cell.with_link(port=4711)
     assert campaign.run(simulated_link(there)).complete
 
 
@@ -239,7 +229,7 @@ def test_the_link_says_which_kind_of_arm_moved_whatever_the_caller_says(
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
     if said is None:  # as of a version that left it to the caller
-        monkeypatch.setattr("hil.campaign.execution.provenance_of", lambda *_, **__: {})
+        monkeypatch.setattr("hil.campaign.run.provenance_of", lambda *_, **__: {})
     campaign.run(twin, provenance=said, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
@@ -280,8 +270,7 @@ def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
 ) -> None:
     """The arm was jogged elsewhere since; `approach_speed` of this cell is full speed."""
     campaign = copied(dry, tmp_path / "campaign")
-    text = replaced_value(campaign.cell.text, "simulation", "initial_deg", "[70.0, -70.0]")
-    elsewhere = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    elsewhere = campaign.cell.with_values({"simulation.initial_deg": [70.0, -70.0]})
     result = campaign.run(simulated_link(elsewhere))
     ways = [name for name in result.archives if name.startswith("move")]
     assert len(ways) >= 2
@@ -292,8 +281,7 @@ def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
 def test_the_controllers_own_figures_do_not_replace_those_that_were_checked(
     tmp_path: Path, designed: Campaign
 ) -> None:
-    gears = replaced_value(designed.cell.text, "drive_train", "gear_ratio", "[101.0, -80.0]")
-    wrong = Cell.from_texts(gears, designed.cell.urdf, designed.cell.path)
+    wrong = designed.cell.with_values({"drive_train.gear_ratio": [101.0, -80.0]})
     campaign = Campaign.create(tmp_path / "campaign", wrong, designed.plan)
     pass_rehearsal(campaign.folder)
     controller = simulated_controller(designed.cell)
@@ -486,7 +474,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     def dies(*_: object) -> None:
         raise Killed
 
-    monkeypatch.setattr(quality_entry, "amend_outcome", dies)
+    monkeypatch.setattr(quality, "amend_outcome", dies)
     with suppress(Killed):
         campaign.run(operator=Person(slow_second), unrehearsed=True)
     monkeypatch.undo()
@@ -620,8 +608,8 @@ def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(mak
 def test_a_script_that_slows_each_repetition_for_a_moment_does_not_move_the_arm_for_ever(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.campaign.repeating.MOST_BY_HAND", 2)
-    monkeypatch.setattr("hil.campaign.progress.SHOWN_EVERY", 0.0)
+    monkeypatch.setattr("hil.campaign.runner.MOST_BY_HAND", 2)
+    monkeypatch.setattr("hil.campaign.steering.SHOWN_EVERY", 0.0)
     campaign, stop = make(), Stop()
 
     def at_its_begin(status: RunStatus) -> OperatorRequest:
@@ -666,7 +654,7 @@ def test_an_arm_that_rests_for_hours_in_mid_campaign_is_warmed_up_anew(
     """Between two repetitions, or while a person holds the next one before it begins."""
     campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
     passed = [0.0]
-    monkeypatch.setattr("hil.campaign.warmup_stage.time.time", lambda: clock() + passed[0])
+    monkeypatch.setattr("hil.campaign.warmup.time.time", lambda: clock() + passed[0])
 
     class Leaves(Person):
         def show(self, status: RunStatus) -> None:
@@ -723,7 +711,7 @@ def test_a_warm_up_motion_whose_run_was_killed_before_it_was_noted_is_not_made_a
 def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.campaign.folder_lock.LOCK_PATIENCE", 30.0)
+    monkeypatch.setattr("hil.campaign.folder.LOCK_PATIENCE", 30.0)
     folder = CampaignFolder(tmp_path)
     lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_SH)
@@ -763,7 +751,7 @@ def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) ->
     stop = Stop()
 
     class Leaves(Person):
-        def accept_dry_run(self, summary: DryRunSummary) -> bool:
+        def accept_dry_run(self, summary: DryRun) -> bool:
             stop.requested = True
             return False
 

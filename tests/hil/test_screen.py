@@ -26,14 +26,18 @@ import pytest
 from rich.console import Console, Group
 
 from drivers.states import State
-from hil.campaign.motion_watch import Latency, MotionProgress, OperatorRequest
-from hil.campaign.operator import DriftCurve, RunStatus
-from hil.campaign.stop import Stop
+from hil.campaign.operator import (
+    DriftCurve,
+    Latency,
+    MotionProgress,
+    OperatorRequest,
+    RunStatus,
+    Stop,
+)
 from hil.cell import Cell
-from hil.cell.link import with_link
 from hil.cell.schema import CanTable
-from hil.lines import put
-from hil.screen import Screen, layout, marks
+from hil.progress import put
+from hil.screen import Screen, layout
 from hil.screen.keys import Keyboard, after, single_keys, typed
 from hil.screen.layout import Shown, lines
 from hil.screen.screen import Pace, ScreenError, far_end_of
@@ -128,7 +132,7 @@ def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
     cell = Cell.load(CELL_PATH)
 
     def said(**link: Any) -> str:
-        return far_end_of(Cell.from_texts(with_link(cell.text, **link), cell.urdf, CELL_PATH))
+        return far_end_of(cell.with_link(**link))
 
     assert said() == said(transport="udp", host="127.0.0.1") == "SIMULATED"
     assert said(transport="udp") == "10.2.12.150"
@@ -181,15 +185,15 @@ def test_a_temperature_is_shown_if_there_is_one() -> None:
 
 
 def test_a_bar_is_as_long_as_its_share() -> None:
-    assert marks.bar(0.5, 10).plain == "█████·····"
-    assert marks.bar(0.0, 4).plain == "····"
-    assert marks.bar(1.0, 4).plain == "████"
-    assert marks.bar(1.01, 4).plain == "███▶"
-    assert marks.bar(float("nan"), 4).plain == "?   "
-    assert [marks.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
+    assert layout.bar(0.5, 10).plain == "█████·····"
+    assert layout.bar(0.0, 4).plain == "····"
+    assert layout.bar(1.0, 4).plain == "████"
+    assert layout.bar(1.01, 4).plain == "███▶"
+    assert layout.bar(float("nan"), 4).plain == "?   "
+    assert [layout.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
         "0.4%", "9.9%", " 10%", " 50%", "130%",
     ]  # fmt: skip
-    assert marks.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
+    assert layout.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
 
 
 def test_a_plain_line_says_the_same() -> None:

@@ -23,7 +23,6 @@ import typer
 from typer.testing import CliRunner
 
 from hil.cell import Cell, CellError
-from hil.cell.text import replaced_value
 from hil.cli import main
 from hil.cli.simulate import WORDS, Status, simulate
 from hil.demo_link import free_port
@@ -378,9 +377,7 @@ def test_own_postures_are_within_limits_and_clear_on_the_way():
 
 
 def test_a_cell_of_real_hardware_is_simulated_only_where_asked_for():
-    cell = Cell.load(CELL_PATH)
-    text = replaced_value(cell.text, "controller", "transport", '"udp"')
-    real = Cell.from_texts(text, cell.urdf, cell.path)
+    real = Cell.load(CELL_PATH).with_link(transport="udp")
     with pytest.raises(CellError, match="real hardware"):
         simulated_link(real)
     assert simulated_link(real, instead_of_hardware=True).session is not None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import open_archive
-from hil.campaign.quality import Standstill
+from hil.campaign.live_link import Standstill
 from hil.testing import faulty_link
 from tests.hil.fast_cell import fast_campaign, fast_cell
 

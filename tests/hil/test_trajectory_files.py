@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from hil.campaign.trajectory_files import PLAYER, RATE, SCRIPT_RATE, trajectory_files
 from hil.cell import Cell
-from hil.cell.text import replaced_value
+from hil.cell.text import with_values
 from hil.cli import app
 from hil.motion_checks import collision_checker, current_model
 from identification.excitation.constraints import clearance
@@ -181,8 +181,7 @@ class TestCommand:
 
     def test_a_short_search_leaves_the_files(self, tmp_path: Path) -> None:
         path, _ = new_cell(tmp_path, WITH_SPEED)
-        text = replaced_value(path.read_text(), "campaign", "candidates", 8)
-        path.write_text(text)
+        path.write_text(with_values(path.read_text(), {"campaign.candidates": 8}))
         words = [str(path), "--quick", "--repetitions", "3", "-o", str(tmp_path / "out"), "--json"]
         result = CliRunner().invoke(app, ["design", *words], catch_exceptions=False)
         assert result.exit_code == 0, result.output

@@ -21,7 +21,6 @@ from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, Link, Stop
 from hil.campaign.quick_design import design
 from hil.cell import Cell
-from hil.cell.text import replaced_value
 from hil.identify import identify_campaign
 from hil.identify.options import FIXED
 from hil.progress import Silent
@@ -89,9 +88,7 @@ class Stage:
     @classmethod
     def set_up(cls, folder: Path, planted: Path | None = None) -> Stage:
         """Design the campaign, and run it undisturbed in virtual time."""
-        loud = fast_cell(folder, **SHORT)
-        quiet = replaced_value(loud.text, "simulation", "current_noise", NOISE)
-        cell = Cell.from_texts(quiet, loud.urdf, loud.path)
+        cell = fast_cell(folder, **SHORT).with_values({"simulation.current_noise": NOISE})
         plan = design(cell, Silent())
         campaign = made(folder / "undisturbed", cell, plan)
         finish_in_virtual_time(campaign, seed=0)
@@ -101,8 +98,7 @@ class Stage:
 def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
     """Run what is missing, with an arm that somebody jogged home."""
     cell = campaign.cell
-    home = replaced_value(cell.text, "simulation", "initial_deg", str(list(cell.campaign.home_deg)))
-    at_home = Cell.from_texts(home, cell.urdf, cell.path)
+    at_home = cell.with_values({"simulation.initial_deg": cell.campaign.home_deg})
     controller = simulated_controller(at_home, seed=seed)
     Campaign.open(campaign.folder.root).run(
         Link.over(SimulatedTransport(controller), cell, finish=controller.finish),

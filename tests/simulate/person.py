@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hil.campaign.motion_watch import OperatorRequest
-from hil.campaign.operator import DryRunSummary, RunStatus
+from hil.campaign.dry_run import DryRun
+from hil.campaign.operator import OperatorRequest, RunStatus
 from tests.simulate.script import Script
 
 
@@ -54,9 +54,9 @@ class Person:
                 self._asked = 0
         return OperatorRequest(self._speed, held)
 
-    def accept_dry_run(self, summary: DryRunSummary) -> bool:
+    def accept_dry_run(self, found: DryRun) -> bool:
         """See `Operator`."""
-        del summary
+        del found
         if self._declines:
             self.struck.append(self._declines.pop())
             return False

@@ -17,7 +17,7 @@ from hil.campaign import Link
 from hil.campaign import link as link_module
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.motion_link import not_ready
-from hil.campaign.stop import Stop
+from hil.campaign.operator import Stop
 from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_controller

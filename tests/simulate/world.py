@@ -19,8 +19,8 @@ from drivers import State
 from drivers.errors import NotAtStandstill
 from drivers.events import MotionEnded
 from hil.campaign import Campaign, Link, link, steering
-from hil.campaign.execution_result import RunResult
-from hil.campaign.stop import Stop
+from hil.campaign.operator import Stop
+from hil.campaign.run import RunResult
 from hil.simulation import simulated_controller
 from sim_fixtures import ControllerSettings
 from tests.hil.fast_cell import pass_rehearsal

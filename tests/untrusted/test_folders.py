@@ -27,8 +27,7 @@ from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import DryRun
-from hil.campaign.folder import CampaignFolder
-from hil.campaign.folder_lock import LOCK
+from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
 from hil.cell import AngleFrame, Cell

@@ -24,7 +24,6 @@ import pytest
 
 from hil.archive import Archive, open_archive
 from hil.cell import Cell
-from hil.cell.link import with_link
 from tests.hil.fast_cell import fast_cell
 from tests.untrusted.wire import BROADCAST, HOSTS, Wire, missing, wire
 
@@ -74,8 +73,8 @@ class Hosts:
 
     def __init__(self, net: Wire, folder: Path, attack: Sequence[str], session: Path | None):
         cell = fast_cell(folder)
-        link = {"transport": "udp", "host": CONTROLLER, "port": PORT, "bind": HOSTS["pc"]}
-        cell.path.write_text(with_link(cell.text, **link))
+        linked = cell.with_link(transport="udp", host=CONTROLLER, port=PORT, bind=HOSTS["pc"])
+        cell.path.write_text(linked.text)
         self.archive = folder / "moved.mcap"
         self._net, self._cell, self._attack, self._session = net, cell.path, attack, session
         self._started: list[Process] = []
