@@ -120,9 +120,10 @@ def fit_shrunk(
     centre: Array | None = None,
     phase: PhaseFactor | None = None,
 ) -> Estimate:
-    """Fit recordings; the covariance is cluster-robust and that of the posterior.
+    """Fit recordings; the covariance is that of least squares, cluster-robust.
 
-    Of an infinite strength it is the one of least squares: an inequality has no covariance.
+    The consistent solution comes from the same samples: as a prior it knows no more than they do,
+    and where they leave parameters open the nominal bodies decide, whose errors nobody knows.
 
     Args:
         model: the robot.
@@ -142,11 +143,7 @@ def fit_shrunk(
         centre = consistent_centre(model, factor, weights, shrinkage.prior_weight).estimate.values
     equations = factor.weighted(weights)
     values = shrunk_values(equations, centre, shrinkage.strength)
-    if math.isinf(shrinkage.strength):
-        found = block_covariance(phase, weights, free.values)
-    else:
-        prior = shrinkage.strength * np.diag(equations.A)
-        found = block_covariance(phase, weights, values, prior)
+    found = block_covariance(phase, weights, free.values)
     augmented = np.append(-values, 1.0)
     squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
     variance = np.maximum(squares, 0.0) / np.maximum(factor.samples, 1)
