@@ -291,7 +291,7 @@ class ReplyPolicy:
         if not in_open or machine.entering:
             return
         if unanswered > self._max_gap:
-            open_mode.require_carried_on(reading, machine.cycle)
+            open_mode.require_carried_on(machine.execution, reading, machine.cycle)
         elif paused:
             open_mode.require_no_pause(reading, machine.cycle)
 
