@@ -95,9 +95,7 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def require_carried_on(
-        self, execution: Execution | None, reading: Reading, cycle: int
-    ) -> None:
+    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
         """The packet read last, the first after a long gap, against what was sent last.
 
         Axes that have closed, or did so since the first set-point, do not matter.
@@ -272,9 +270,7 @@ class PositionMode(OpenMode):
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def require_carried_on(
-        self, execution: Execution | None, reading: Reading, cycle: int
-    ) -> None:
+    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
         """Target and velocity received against the set-point sent last, and some steps more.
 
         A motion goes on from there: as many steps further on its path, or at rest.

@@ -212,7 +212,7 @@ class TrajectoryPlayer:
         """Go on where a controller carried the motion by itself, with what was asked for.
 
         That is at the nearest point of the path, and as fast along it; the velocity across dies
-        away in `cycles`. The distance stays for the rest of the motion, as that from the start does.
+        away in `cycles`. The distance stays for the rest of the motion, like that at the start.
 
         Args:
             position: The controller's set-point (n,) [rad].
@@ -238,7 +238,9 @@ class TrajectoryPlayer:
         self._law.restart(s, rate)
         shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
         self._across = list(shares * (velocity - rate * speed))
-        self._law.aim(0.0 if self._held or self._stopping else self._override, self._allowed["stop"])
+        self._law.aim(
+            0.0 if self._held or self._stopping else self._override, self._allowed["stop"]
+        )
         self._ramp = self._bounds = "stop"
         self._finished = self._stopping and self._law.settled
 
