@@ -277,21 +277,19 @@ class PositionMode(OpenMode):
         """
         where = self._continuing & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
-        raw, step, expected = self._wire.raw, self._step, self._sent
+        raw, step = self._wire.raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
-        follows = isinstance(execution, MotionExecution) and execution.follows and step.any()
-        if follows:
-            ahead = expected + np.arange(self.missed + 1)[:, None] * step
-            steps = int(np.abs(target - ahead).max(axis=1).argmin())
-            expected = ahead[steps]
-            moves = np.abs((velocity[0], step)).max(axis=1) > self._guard.limits.standstill
-            if moves[1] and not moves[0]:
-                step = self._still
-        self._guard.check_after_gap(target, velocity, expected, step, cycle, where)
-        if not follows:
+        if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
+            self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
+        ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
+        steps = int(np.abs(target - ahead).max(axis=1).argmin())
+        moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
+        step = self._still if moved and not moves else step
+        self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
+        # What counts as standstill does not say how fast a slow motion is.
+        step = velocity[0] if moves else step
         position = self.held + self._wire.joint_difference(target - self._sent)
-        step = velocity[0] if moves[0] else step
         speed = self._wire.joint_difference(step) / self._guard.period
         execution.go_on_from(position, speed, SPREAD * steps, cycle)
         self._guard.go_on_from(position, speed, SPREAD * steps)
