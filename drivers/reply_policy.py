@@ -168,7 +168,7 @@ class ReplyPolicy:
         if state is State.OPENING:
             self._open_mode.opening(reading, measured, commanded, machine.cycle)
             self._require_targets(reading.answer.held, machine.cycle)
-            done = self._given_up(machine)
+            done = self._given_up(machine, reading)
         else:
             done = self._open(self._open_mode, machine, measured, commanded)
         if not done:
@@ -205,12 +205,16 @@ class ReplyPolicy:
             arm, axis = self._axis_of.get(slots[bad[0]], (self._arm, slots[bad[0]]))
             raise TargetNotFinite(arm, axis, float(values[bad[0]]), cycle)
 
-    def _given_up(self, machine: Machine) -> bool:
+    def _given_up(self, machine: Machine, reading: Reading) -> bool:
         """Whether nobody waits any longer for the last axis to open."""
         if machine.execution is not None:
             if machine.cycle - machine.entered_at < self._exit_cycles:
                 return False
-            machine.stop(f"some axes did not open within {EXIT_TIMEOUT:g} s")
+            axes = np.flatnonzero(reading.held) + 1
+            alone = (
+                f": if axis {axes[0]} alone is to open, use --only-axis" if len(axes) == 1 else ""
+            )
+            machine.stop(f"some axes did not open within {EXIT_TIMEOUT:g} s{alone}")
         return machine.stop_reason is not None
 
     def _exit_due(self, machine: Machine) -> bool:

@@ -120,13 +120,13 @@ class TrajectoryPlayer:
         self._law = TimeLaw(period)
         self._tabled = True
         self._override = 1.0
-        self._across: list[Array] = []
         self._begun = False
         self._rewind()
 
     def _rewind(self) -> None:
         self._last = self._start + self._offset
         self._given = 0
+        self._across: list[Array] = []
         self._finished = self._held = self._stopping = False
         self._bounds: Literal["plan", "override", "stop"] = "plan"
         self._ramp: Literal["override", "stop"] = "override"
