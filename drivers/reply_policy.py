@@ -14,9 +14,9 @@ was taken, and more than `max_gap` of them in 100 cycles bring a motion to rest 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
 after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
-set-point sent last, or of some steps more, and its velocity (D2) within half the velocity sent last or what
-counts as standstill, or at rest; an arm that itself stands (D4) is held against the velocity too. A
-motion comes to rest from D1 and D2, which count as sent, on its path. Where packets came late
+set-point sent last, or of some steps more, and its velocity (D2) within half the velocity sent last
+or what counts as standstill, or at rest; an arm that itself stands (D4) is held against both. A
+motion comes to rest on its path from D1 and D2, which count as sent. Where packets came late
 by the clock although none is missing, the velocity of the arm (D4) is held against that sent last.
 Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
 unless they were zero. A link may say how old each value is: one that is needed for such a decision,
