@@ -64,7 +64,10 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
     """
     most = int(stretch.talk.life.settings.get("max_gap", 2))
     moved = np.append(False, (stretch.step[:-1] != 0.0).any(axis=1))
-    cuts = np.flatnonzero((_unanswered_before(stretch) > most) & moved)
+    gaps = stretch.talk.records["gap"][stretch.rows].astype(np.intp)
+    # Those that were heard and are in the gap, as of a pile, count once.
+    missed = np.maximum(gaps, _unanswered_before(stretch) - gaps)
+    cuts = np.flatnonzero((missed > most) & moved)
     cuts = cuts[cuts < stretch.leading]
     for first, last in pairwise((0, *cuts.tolist(), len(stretch.sent))):
         yield replace(
@@ -74,7 +77,7 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
             sent=stretch.sent[first:last],
             step=stretch.step[first:last],
             received=stretch.received[:, first:last],
-            carried=_unanswered_before(stretch)[first] * bool(first),
+            carried=int(missed[first]) if first else 0,
             before=stretch.sent[first - 1] if first else stretch.sent[0],
             step_before=stretch.step[first - 1] if first else stretch.step[0],
         )
