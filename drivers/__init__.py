@@ -61,6 +61,7 @@ from drivers.exchange import exchange
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import (
     BoundsName,
+    CarriedSource,
     CorrectionSource,
     FeedForwardSource,
     HoldableSource,
@@ -93,6 +94,7 @@ __all__ = [
     "AnswersLost",
     "AxisLeft",
     "BoundsName",
+    "CarriedSource",
     "CommandedCurrentLimit",
     "CommandedCurrentStep",
     "CorrectionNotCarriedOn",

@@ -99,6 +99,7 @@ class CorrectionMode(OpenMode):
 
     def require_carried_on(
         self,
+        execution: Execution | None,  # noqa: ARG002  the motion is the controller's
         reading: Reading,  # noqa: ARG002  zero is zero in every axis
         cycle: int,
     ) -> None:

@@ -21,6 +21,7 @@ from drivers.events import Outcome
 from drivers.guard_limits import RANK
 from drivers.motion_source import (
     BoundsName,
+    CarriedSource,
     CorrectionSource,
     FeedForwardSource,
     MotionSource,
@@ -269,6 +270,23 @@ class MotionExecution(Execution):
         # The source may reuse its arrays.
         self.position = position.copy()
         return self.position, velocity, bounds
+
+    @property
+    def follows(self) -> bool:
+        """Whether the source goes on from where a controller carried the motion."""
+        going = self.started and not self.finished
+        return going and callable(getattr(self._source, "go_on_from", None))
+
+    def go_on_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
+        """The controller carried the motion on by itself: see `CarriedSource`.
+
+        Raises:
+            SourceFailed: the source cannot go on from there.
+        """
+        try:
+            cast(CarriedSource, self._source).go_on_from(position, velocity, cycles)
+        except BaseException as error:
+            raise _failed("cannot go on", error, cycle) from error
 
     def feed_forward(self, cycle: int) -> tuple[Array, Array]:
         """Velocity (n,) rad/s and motor current (n,) A of the set-point given last.

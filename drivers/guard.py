@@ -35,7 +35,7 @@ from drivers.errors import (
     VelocityLimit,
     VelocityMismatch,
 )
-from drivers.guard_limits import RANK, BoundsInForce, GuardLimits
+from drivers.guard_limits import CARRIED_ON, BoundsInForce, GuardLimits
 from drivers.motion_source import BoundsName
 
 __all__ = ["FIRST_FRACTION", "RELATIVE_TOLERANCE", "Guard", "GuardLimits"]
@@ -82,7 +82,7 @@ class Guard:
         n = limits.n_joints
         self._middle = 0.5 * (limits.lower + limits.upper)
         self._every = np.ones(n, dtype=np.bool_)
-        self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
+        self._sets = {rank: self._bounds(rank) for rank in range(CARRIED_ON + 1)}
         self._in_force = BoundsInForce()
         # Three sent set-points (oldest first), the candidate, and its stated velocity.
         self._history = np.zeros((5, n))
@@ -179,6 +179,14 @@ class Guard:
         self._in_force.reset()
         self._history[:4] = q
         self.check_set_point(q, np.zeros_like(q), "plan", cycle)
+
+    def go_on_from(self, q: Array, qd: Array, cycles: int) -> None:
+        """The controller moved by itself: its target, (n,) rad, and velocity, rad/s, count as sent.
+
+        For so many cycles jerk has no bound.
+        """
+        self._in_force.reset(CARRIED_ON, cycles)
+        self._history[:4] = q - np.arange(3.0, -1.0, -1.0)[:, None] * (self.period * qd)
 
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """What holds in the cycle in which the arm may begin to move.

@@ -22,6 +22,9 @@ encoder are 4.9e-4; at 2 ms this is some 0.5 % of a drive's full speed.
 """
 
 RANK: Final[Mapping[BoundsName, int]] = {"plan": 0, "override": 1, "stop": 2}
+CARRIED_ON: Final = 3
+"""Rank of the bounds of a stop without one on jerk: the steps that a controller made by itself have
+none of the motion's acceleration, so that returning to it is a jump of acceleration."""
 MEMORY: Final = 2
 """Cycles for which wider bounds stay: a third difference reaches over three cycles."""
 
@@ -95,10 +98,11 @@ class GuardLimits:
         return len(self.lower)
 
     def factors(self, rank: int) -> tuple[float, float]:
-        """Factors on acceleration and jerk of a set of bounds, by its `RANK`."""
+        """Factors on acceleration and jerk of a set of bounds, by its `RANK` or `CARRIED_ON`."""
+        stop = self.stop_acceleration
         return (
-            (1.0, self.override_acceleration, self.stop_acceleration)[rank],
-            (1.0, self.override_jerk, self.stop_jerk)[rank],
+            (1.0, self.override_acceleration, stop, stop)[rank],
+            (1.0, self.override_jerk, self.stop_jerk, np.inf)[rank],
         )
 
 
@@ -113,9 +117,9 @@ class BoundsInForce:
         self.rank = 0
         self._age = 0
 
-    def reset(self) -> None:
-        """Nothing was sent yet."""
-        self.rank = self._age = 0
+    def reset(self, rank: int = 0, cycles: int = 0) -> None:
+        """Nothing was sent yet; or a set comes into force that applies for so many cycles more."""
+        self.rank, self._age = rank, -cycles
 
     def take(self, bounds: BoundsName) -> int:
         """The set that the next set-point belongs to; returns the rank of the one in force."""

@@ -26,6 +26,10 @@ Joints = NDArray[np.bool_]
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
 _NEEDED_FIRST: Final = (TARGET, ACTUAL, ACTUAL_VELOCITY)
 _NEEDED_AFTER_GAP: Final = (TARGET, TARGET_VELOCITY, ACTUAL_VELOCITY)
+SPREAD: Final = 2
+"""Cycles for each step that a controller made by itself in which the motion returns to its path.
+Where the motion accelerates, each step leaves the velocity of one cycle of that acceleration across
+the path; so spread it is half of that acceleration, within the bounds of a stop."""
 
 
 class OpenMode(ABC):
@@ -91,13 +95,13 @@ class OpenMode(ABC):
         """
 
     @abstractmethod
-    def require_carried_on(self, reading: Reading, cycle: int) -> None:
+    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
         """The packet read last, the first after a long gap, against what was sent last.
 
         Axes that have closed, or did so since the first set-point, do not matter.
 
         Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
+            NotFinite, MotionNotCarriedOn, MotionHeld, SourceFailed: going on would be a jump.
         """
 
     @abstractmethod
@@ -266,13 +270,31 @@ class PositionMode(OpenMode):
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def require_carried_on(self, reading: Reading, cycle: int) -> None:
-        """Target and velocity received against the set-point sent last."""
+    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
+        """Target and velocity received against the set-point sent last, and some steps more.
+
+        A motion goes on from there: as many steps further on its path, or at rest.
+        """
         where = self._continuing & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
-        raw = self._wire.raw
-        velocity, step = raw[1:4:2], self._step
-        self._guard.check_after_gap(raw[TARGET], velocity, self._sent, step, cycle, where)
+        raw, step = self._wire.raw, self._step
+        target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
+        if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
+            self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
+            return
+        ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
+        steps = int(np.abs(target - ahead).max(axis=1).argmin())
+        moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
+        step = self._still if moved and not moves else step
+        self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
+        # What counts as standstill does not say how fast a slow motion is.
+        step = velocity[0] if moves else step
+        position = self.held + self._wire.joint_difference(target - self._sent)
+        speed = self._wire.joint_difference(step) / self._guard.period
+        execution.go_on_from(position, speed, SPREAD * steps, cycle)
+        self._guard.go_on_from(position, speed, SPREAD * steps)
+        self._history.begin(target)
+        self.held, self._sent = position, target
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:
         """Velocity of the arm against that of the set-points sent last."""

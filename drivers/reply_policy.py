@@ -14,8 +14,9 @@ was taken, and more than `max_gap` of them in 100 cycles bring a motion to rest 
 Unanswered, a controller may hold the last target and so stop the arm, or carry it on, or leave open
 mode, move the arm and come back; one set-point further at full speed would then be a jump. Hence,
 after a gap longer than `max_gap`, open mode goes on only if D1 is within those 10 % of the
-set-point sent last, and its velocity (D2) within half the velocity sent last or what counts as
-standstill; an arm that itself stands (D4) is held against the latter too. Where packets came late
+set-point sent last, or of some steps more, and its velocity (D2) within half the velocity sent last
+or what counts as standstill, or at rest; an arm that itself stands (D4) is held against both. A
+motion comes to rest on its path from D1 and D2, which count as sent. Where packets came late
 by the clock although none is missing, the velocity of the arm (D4) is held against that sent last.
 Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
 unless they were zero. A link may say how old each value is: one that is needed for such a decision,
@@ -168,7 +169,7 @@ class ReplyPolicy:
         if state is State.OPENING:
             self._open_mode.opening(reading, measured, commanded, machine.cycle)
             self._require_targets(reading.answer.held, machine.cycle)
-            done = self._given_up(machine)
+            done = self._given_up(machine, reading)
         else:
             done = self._open(self._open_mode, machine, measured, commanded)
         if not done:
@@ -205,12 +206,16 @@ class ReplyPolicy:
             arm, axis = self._axis_of.get(slots[bad[0]], (self._arm, slots[bad[0]]))
             raise TargetNotFinite(arm, axis, float(values[bad[0]]), cycle)
 
-    def _given_up(self, machine: Machine) -> bool:
+    def _given_up(self, machine: Machine, reading: Reading) -> bool:
         """Whether nobody waits any longer for the last axis to open."""
         if machine.execution is not None:
             if machine.cycle - machine.entered_at < self._exit_cycles:
                 return False
-            machine.stop(f"some axes did not open within {EXIT_TIMEOUT:g} s")
+            axes = np.flatnonzero(reading.held) + 1
+            alone = (
+                f": if axis {axes[0]} alone is to open, use --only-axis" if len(axes) == 1 else ""
+            )
+            machine.stop(f"some axes did not open within {EXIT_TIMEOUT:g} s{alone}")
         return machine.stop_reason is not None
 
     def _exit_due(self, machine: Machine) -> bool:
@@ -291,7 +296,7 @@ class ReplyPolicy:
         if not in_open or machine.entering:
             return
         if unanswered > self._max_gap:
-            open_mode.require_carried_on(reading, machine.cycle)
+            open_mode.require_carried_on(machine.execution, reading, machine.cycle)
         elif paused:
             open_mode.require_no_pause(reading, machine.cycle)
 

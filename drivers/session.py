@@ -30,10 +30,10 @@ controller has to report closed axes first, and a new motion has to be requested
 Every fresh, well-formed packet gets exactly one answer, a duplicate (the same bytes) the same
 bytes again; stale and malformed ones get none and are counted. Motion advances one period per
 answered packet, whatever was missed, and waits where an answer was not taken; more than `max_gap`
-missed in a row, stale ones among them, bring it to rest on its path, if the controller carried it
-on. A packet that comes `PAUSE_CYCLES` later by the clock than its number accounts for gets a
-further set-point only if the arm moves as it was commanded to. What is watched meanwhile, and when
-open mode is left, stands at the head of `drivers.reply_policy`.
+missed in a row, stale ones among them, bring it to rest on its path, from where the controller
+carried or holds it. A packet that comes `PAUSE_CYCLES` later by the clock than its number
+accounts for gets a further set-point only if the arm moves as it was commanded to. What is watched
+meanwhile, and when open mode is left, stands at the head of `drivers.reply_policy`.
 
 In every state an axis that is open with its drive on, of whichever arm, is answered by its target
 only if that is a number; if it is none, drive-off is asked for. In a pause a wanted axis that is

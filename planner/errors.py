@@ -148,7 +148,7 @@ class UnsupportedSolver(PlannerError, RuntimeError):
 
 
 class StartMismatch(PlannerError):
-    """The arm is too far from where the motion begins [rad]."""
+    """The arm is too far from where the motion begins, or goes on [rad]."""
 
     def __init__(self, joint: int, value: float, expected: float, tolerance: float) -> None:
         self.joint = joint
@@ -156,7 +156,7 @@ class StartMismatch(PlannerError):
         self.expected = expected
         self.tolerance = tolerance
         super().__init__(
-            f"joint {joint} is at {value:.6g} rad, the motion begins at {expected:.6g} rad; "
+            f"joint {joint} is at {value:.6g} rad, the motion at {expected:.6g} rad; "
             f"at most {tolerance:.3g} rad of difference is carried along"
         )
 

@@ -19,6 +19,8 @@ from planner.verify import position_rounding
 _ROUNDING = 1e-9
 # Share of half a joint's range by which a set-point rounded on the wire may lie outside it.
 _CARRIED = 9e-7
+# Steps of Newton towards the nearest point of a path, from a few cycles away.
+_TRIES = 8
 
 
 class _SetPoints(NamedTuple):
@@ -124,6 +126,7 @@ class TrajectoryPlayer:
     def _rewind(self) -> None:
         self._last = self._start + self._offset
         self._given = 0
+        self._across: list[Array] = []
         self._finished = self._held = self._stopping = False
         self._bounds: Literal["plan", "override", "stop"] = "plan"
         self._ramp: Literal["override", "stop"] = "override"
@@ -177,18 +180,21 @@ class TrajectoryPlayer:
             StartMismatch: a joint is farther from the planned start than the tolerance.
             LimitExceeded: with the difference carried along, a joint would leave its range.
         """
-        offset = np.asarray(position, dtype=np.float64) - self._start
-        off = ~(np.abs(offset) <= self._tolerance)  # written so that NaN is off
-        if np.any(off):
-            joint = int(np.argmax(off))
-            raise StartMismatch(
-                joint, float(position[joint]), float(self._start[joint]), self._tolerance
-            )
+        offset = self._near(position, self._start)
         self._check_range(offset)
         # The table stays as it is: to copy it would cost the cycle of the first set-point.
         self._offset = offset
         self._begun = True
         self._rewind()
+
+    def _near(self, position: Array, point: Array) -> Array:
+        """Return how far (n,) [rad] a position is from a point of the path, if that is near."""
+        offset = np.asarray(position, dtype=np.float64) - point
+        off = ~(np.abs(offset) <= self._tolerance)  # written so that NaN is off
+        if np.any(off):
+            joint = int(np.argmax(off))
+            raise StartMismatch(joint, float(position[joint]), float(point[joint]), self._tolerance)
+        return offset
 
     def _check_range(self, offset: Array) -> None:
         limits, rounding = self._limits, position_rounding(self._limits)
@@ -201,6 +207,42 @@ class TrajectoryPlayer:
             if np.any(excess > 0.0):
                 joint = int(np.argmax(excess))
                 raise LimitExceeded("position", joint, float(reach[joint]), float(bound[joint]))
+
+    def go_on_from(self, position: Array, velocity: Array, cycles: int) -> None:
+        """Go on where a controller carried the motion by itself, with what was asked for.
+
+        That is at the nearest point of the path, and as fast along it; the velocity across dies
+        away in `cycles`. The distance stays for the rest of the motion, like that at the start.
+
+        Args:
+            position: The controller's set-point (n,) [rad].
+            velocity: Its velocity (n,) [rad/s].
+            cycles: How many set-points have a part of the velocity across.
+
+        Raises:
+            StartMismatch: a joint is farther from the path than the tolerance.
+        """
+        way = self._offset + (position - self._last)
+        if velocity.any() and np.max(np.abs(way)) <= self._tolerance:
+            self._offset, self._last = way, position
+            return
+        s, here = self.motion_time, position - self._offset
+        for _ in range(_TRIES):
+            point, speed = self._path.read(s)
+            square = float(speed @ speed) or 1.0
+            s = min(max(s + float((here - point) @ speed) / square, 0.0), self._duration)
+        self._offset = self._offset + self._near(here, point)
+        self._last = position
+        self._tabled = False
+        rate = max(0.0, float(velocity @ speed) / square)
+        self._law.restart(s, rate)
+        shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
+        self._across = list(shares * (velocity - rate * speed))
+        self._law.aim(
+            0.0 if self._held or self._stopping else self._override, self._allowed["stop"]
+        )
+        self._ramp = self._bounds = "stop"
+        self._finished = self._stopping and self._law.settled
 
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""
@@ -228,9 +270,14 @@ class TrajectoryPlayer:
             self._last = self._table.position[-1] + self._offset
             return self._last, self._rest
         position, velocity = self._path.read(law.motion_time)
+        velocity = velocity * law.rate
+        if self._across:
+            across = self._across.pop()
+            velocity += across
+            self._offset = self._offset + self._period * across
         self._finished = self._stopping and law.settled
         self._last = position + self._offset
-        return self._last, velocity * law.rate
+        return self._last, velocity
 
     def override(self, fraction: float) -> None:
         """Go on at this fraction, 0 to 1, of the planned speed.

@@ -9,12 +9,22 @@ rest; and a new motion, requested after somebody has switched the drive on again
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers import CyclicPacket, State
+from drivers import CyclicPacket, SimulatedTransport, State
+from hil.archive import Archive, ArchiveSpec, open_archive
+from hil.campaign import Link, Stop
+from hil.campaign.intervals import START_TOLERANCE, player_of
+from hil.cell import Cell
+from hil.cell.text import replaced_value
+from hil.simulation import controller_settings, simulated_controller
+from planner import PiecewiseCubic, plan
+from sim_fixtures.fault_script import parse_fault, split_faults
+from sim_fixtures.ns16 import CELL_PATH
 from tests.fault_matrix.faulty_runs import (
     BEHAVIOURS,
     FAULTS,
@@ -76,9 +86,88 @@ def test_fault_at_speed(fault: str, speed: float, while_silent: str) -> None:
     """The arm comes to rest, whatever the controller did meanwhile."""
     run = play_at(fault, speed, while_silent)
     expected = AT_SPEED[fault][SPEEDS.index(speed)].split(" / ")
-    assert run.outcome.partition(" (")[0] == expected[BEHAVIOURS.index(while_silent)]
+    assert run.outcome.partition(" (")[0] == (expected * 3)[BEHAVIOURS.index(while_silent)]
     assert run.broken == []
     assert run.recovery.startswith("completed")
+
+
+def on_ns16(
+    cell: Cell, path: PiecewiseCubic, file: Path, fault: str = "", silent: str = "hold"
+) -> Archive:
+    settings = replace(controller_settings(cell), missed_replies=13, while_silent=silent)
+    controller = simulated_controller(cell, settings=settings)
+    faults = split_faults([parse_fault(fault)])[0] if fault else ()
+    link = Link.over(SimulatedTransport(controller, faults), cell, finish=controller.finish)
+    link.connect(Stop())
+    spec = ArchiveSpec(file, cell.joint_names, cell.period, {"kind": "move"}, durable=False)
+    ended = link.run(player_of(cell, path), spec, Stop())
+    archive = open_archive(file)
+    assert controller.reason == "", "the drive stays on"
+    assert archive.complete
+    assert archive.outcome is not None
+    assert archive.outcome.outcome == ended.outcome == ("stopped" if fault else "completed")
+    return archive
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    """The NS 16 in a cycle of 2 ms."""
+    text = replaced_value(CELL_PATH.read_text("utf-8"), "controller", "cycle_ms", "2")
+    return Cell.from_texts(text, Cell.load(CELL_PATH).urdf, CELL_PATH)
+
+
+@pytest.fixture(scope="module")
+def begun(cell: Cell, tmp_path_factory) -> int:
+    """Packet in which each motion of it begins."""
+    file = tmp_path_factory.mktemp("sound") / "move.mcap"
+    archive = on_ns16(cell, plan([cell.initial, cell.initial + 0.01], cell.joint_limits), file)
+    moves = np.nan_to_num(archive.columns["commanded_velocity"]).any(axis=1)
+    return int(archive.columns["cycle"][np.argmax(moves)]) + 9  # sync packets before init
+
+
+class TestNs16AtSpeed:
+    """A cycle of 2 ms, thresholds of one revolution, a tenth of one per cycle at full speed.
+
+    The arm comes to rest on its path with the drive on, and its archive is whole.
+    """
+
+    WAY = np.array([0.5, 0.5, -0.5, 0.5, -0.4, 0.5])
+
+    @pytest.mark.parametrize("share", SPEEDS)
+    @pytest.mark.parametrize(
+        ("fault", "silent"),
+        [
+            ("lose@{c}x3", "continue"),
+            ("lose@{c}x5", "continue"),
+            ("lose@{c}x5:to_controller", "hold"),
+        ],
+    )
+    def test_it_stops_on_a_straight_path(self, cell, begun, tmp_path, fault, silent, share):
+        limits = cell.joint_limits
+        way = self.WAY * limits.velocity
+        slow = replace(limits, velocity=share * limits.velocity)
+        path = plan([cell.initial, cell.initial + way], slow)
+        strike = begun + round(0.5 * path.duration / cell.period)
+        archive = on_ns16(cell, path, tmp_path / "a.mcap", fault.format(c=strike), silent)
+        q, v = (archive.columns[f"commanded_{name}"] for name in ("position", "velocity"))
+        assert np.nanmax(np.abs(v[:, 0])) == pytest.approx(share * limits.velocity[0], rel=0.02)
+        q = q[np.isfinite(q).all(axis=1)] - cell.initial
+        along = (q @ way) / (way @ way)
+        assert np.all(np.diff(along) >= 0.0) and along[-1] < 0.95
+        np.testing.assert_allclose(q, along[:, None] * way, atol=1e-6)
+
+    @pytest.mark.parametrize("part", [0.15, 0.3, 0.45, 0.6, 0.75])
+    def test_it_stops_on_a_curved_path(self, cell, begun, tmp_path, part):
+        """Everywhere at the limits, where the controller's straight steps leave the path most."""
+        middle = cell.initial + 0.4 * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+        corners = [cell.initial, middle, middle + 0.4, cell.initial + 0.3]
+        path = plan(corners, cell.joint_limits, fly=1.0)
+        strike = begun + round(part * path.duration / cell.period)
+        archive = on_ns16(cell, path, tmp_path / "a.mcap", f"lose@{strike}x3", "continue")
+        q = archive.columns["commanded_position"]
+        planned = path.sample(np.arange(0.0, path.duration, 1e-4))[0]
+        off = np.abs(q[np.isfinite(q).all(axis=1)][:, None] - planned[::10]).max(axis=2).min(axis=1)
+        assert off.max() < 2.0 * START_TOLERANCE
 
 
 @pytest.fixture(scope="module")

@@ -352,6 +352,27 @@ class TestAfterAGap:
         guard.check_after_gap(REST, lags, REST, step, 3, EVERY)
 
 
+class TestCarriedOn:
+    """A controller's own steps: velocity and acceleration count on, jerk for some cycles not."""
+
+    BOUND = 2.0 * 8.0 * PERIOD**2  # of a stop, per cycle
+
+    @joints
+    @signs
+    def test_acceleration_is_bounded_and_jerk_from_the_fifth_cycle_on(self, joint, sign):
+        guard, q, step = Guard(limits(), PERIOD), START, at(joint, sign * 1.5 * PERIOD)
+        guard.go_on_from(q, step / PERIOD, 2)
+        for way in (1.0, -1.0, 1.0, -1.0):
+            step = step + at(joint, way * JUST_BELOW * self.BOUND)
+            q = q + step
+            guard.check_set_point(q, step / PERIOD, "stop", 1)
+        far = q + step + at(joint, JUST_BELOW * self.BOUND)
+        refused(JerkLimit, guard.check_set_point, far, step / PERIOD, "stop", 2)
+        guard.go_on_from(q, step / PERIOD, 2)
+        far = q + step + at(joint, 1.1 * self.BOUND)
+        refused(AccelerationLimit, guard.check_set_point, far, (far - q) / PERIOD, "stop", 3)
+
+
 class TestWhatIsReportedFirst:
     def test_the_first_joint_of_the_first_check_that_fails(self):
         guard = only(velocity=0.5, jerk=50.0)

@@ -311,12 +311,12 @@ class TestAStrayAxisWhileCorrectionsEnd:
 
 
 class TestOpeningThatNeverCompletes:
-    def opening(self, source=None) -> Rig:
+    def opening(self, source=None, opened=N - 1) -> Rig:
         rig = Rig()
         if source is not None:
             rig.session.request(source)
         rig.close()
-        rig.axes["mode"][: N - 1] = Mode.POSITION
+        rig.axes["mode"][:opened] = Mode.POSITION
         rig.cycle()
         assert rig.state is State.OPENING
         return rig
@@ -351,8 +351,9 @@ class TestOpeningThatNeverCompletes:
         assert rig.state is State.EXITING
         assert set(rig.records["interval"]) == {-1}
 
-    def test_a_motion_that_waits_too_long_is_given_up(self):
-        rig = self.opening(source := Cruise())
+    @pytest.mark.parametrize("opened", [1, N - 1])
+    def test_a_motion_that_waits_too_long_is_given_up(self, opened):
+        rig = self.opening(source := Cruise(), opened)
         rig.cycle(TIMEOUT - 1)
         assert rig.state is State.OPENING
         assert rig.exits_asked == 0
@@ -360,6 +361,7 @@ class TestOpeningThatNeverCompletes:
         assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
         assert rig.ended.outcome == "stopped"
         assert "did not open" in rig.ended.reason
+        assert ("axis 1 alone is to open, use --only-axis" in rig.ended.reason) is (opened == 1)
         assert source.begun_at is None
         rig.cycle(TIMEOUT - 1)
         assert rig.state is State.EXITING

@@ -95,19 +95,33 @@ def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterato
     if still is not None and np.any(np.nan_to_num(records["commanded_velocity"][still])):
         yield "set-points that move after the motion was lost or refused"
     for first, last in _stretches(sent & (records["state"] != State.OPENING)):
-        q, v = (records[name][first:last] for name in ("commanded_position", "commanded_velocity"))
-        same = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
-        # What the controller did not take is sent again, with its velocity: no step of the motion.
-        yield from _broken_bounds(q[~(same & v.any(axis=1))])
+        rows = records[first:last]
+        v = rows["commanded_velocity"]
+        # After a long gap a motion goes on from the controller's target, and at its velocity.
+        carried = np.flatnonzero((rows["gap"][1:] > MAX_GAP) & v[:-1].any(axis=1)) + 1
+        for number, part in enumerate(np.split(rows, carried)):
+            yield from _broken_bounds(part, int(part["gap"][0]) if number else 0)
 
 
-def _broken_bounds(q: Array) -> Iterator[str]:
+def _broken_bounds(rows: NDArray[np.void], carried: int) -> Iterator[str]:
+    """Of a motion from rest, or from where the controller carried it by so many steps."""
+    q, v = rows["commanded_position"], rows["commanded_velocity"]
     if np.any(q < LIMITS.lower) or np.any(q > LIMITS.upper):
         yield "a set-point outside the joints' range"
-    q = np.vstack((q[:1], q[:1], q[:1], q))
+    same = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+    # What the controller did not take is sent again, with its velocity: no step of the motion.
+    q = q[~(same & v.any(axis=1))]
+    before = np.tile(q[:1], (3, 1))
+    if carried:
+        step = PERIOD * rows["target_velocity"][0]
+        before = rows["target_position"][0] - np.arange(2.0, -1.0, -1.0)[:, None] * step
+    q = np.vstack((before, q))
     bounds = (LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk)
     for order, (bound, factor) in enumerate(zip(bounds, _STOP_FACTORS, strict=True), start=1):
-        rate = np.abs(np.diff(q, order, axis=0)).max(axis=0) / PERIOD**order
+        rates = np.abs(np.diff(q, order, axis=0)) / PERIOD**order
+        # The controller's own steps have no acceleration: it comes back in a few cycles.
+        free = 2 * carried + 2 if carried and order == 3 else 0
+        rate = rates[free:].max(axis=0, initial=0.0)
         if np.any(rate > bound * factor * (1.0 + 1e-5)):
             yield f"derivative {order} of the set-points is {rate}, allowed is {bound * factor}"
 

@@ -35,7 +35,7 @@ _SPANS: Final[dict[str, dict[str, str]]] = {
         "init packet": "no start",
         "init .. opening": "completed (3)",
         "open at rest": "open (3)",
-        "moving": "505 MotionHeld (3) / stopped (3) / 505 MotionHeld (3)",
+        "moving": "stopped (3)",
         "exiting": "completed (3)",
     },
     "5 packets lost": {
@@ -287,12 +287,10 @@ HEADING: Final = (
     "| fault | " + " | ".join(SITUATIONS) + " |\n" + "|---" * (len(SITUATIONS) + 1) + "|\n"
 )
 
-_STOPPED: Final = "505 MotionHeld / stopped / 505 MotionHeld"
-_TOO_FAR: Final = "505 MotionHeld / 505 MotionNotCarriedOn / 505 MotionHeld"
 _WENT_ON: Final = "stopped / completed / stopped"
 AT_SPEED: Final = {
-    "3 packets lost": (_STOPPED,) * 4,
-    "5 packets lost": (_STOPPED, _STOPPED, _TOO_FAR, _TOO_FAR),
+    "3 packets lost": ("stopped",) * 4,
+    "5 packets lost": ("stopped",) * 4,
     "3 answers lost": (_WENT_ON,) * 4,
     "5 answers lost": (_WENT_ON,) * 4,
 }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from drivers.exchange.motion_transfer import pack, unpack
 from planner import (
@@ -293,3 +294,50 @@ def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused(six_axi
     reached = [player.advance()[0] for _ in range(4000)]
     assert player.finished
     assert np.max(np.array(reached) - upper) <= 1e-12
+
+
+class TestCarriedOn:
+    """A controller took the motion on by itself: `k` steps as long as the last one, or to rest."""
+
+    LONG = 0.7  # of the motion, in which the arm moves fast
+
+    @pytest.fixture
+    def carried(self, motions, six_axis_limits):
+        player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+        player.begin(player.start)
+        given = [player.advance()[0] for _ in range(int(self.LONG * player.duration / PERIOD))]
+        return player, given[-1], given[-1] - given[-2]
+
+    @pytest.mark.parametrize("k", [0, 1, 3, 5])
+    def test_it_stops_on_its_path_within_the_bounds(self, carried, six_axis_limits, motions, k):
+        player, last, step = carried
+        player.go_on_from(last + k * step, step / PERIOD, 2 * k)
+        player.stop()
+        given = [last + (k - 1) * step, last + k * step]
+        while not player.finished:
+            given.append(player.advance()[0])
+        acceleration = np.diff(given, 2, axis=0) / PERIOD**2
+        assert np.all(np.abs(acceleration) <= 2.0 * six_axis_limits.acceleration * (1 + 1e-6))
+        planned = motions[2].sample(np.arange(0.0, player.duration, 1e-4))[0]
+        assert cKDTree(planned).query(given)[0].max() < 2e-3
+
+    def test_brought_to_rest_it_stays_there(self, carried):
+        player, last, step = carried
+        player.go_on_from(last + step, 0.0 * step, 2)
+        player.stop()
+        position, velocity = player.advance()
+        assert player.finished
+        np.testing.assert_array_equal(position, last + step)
+        assert not velocity.any()
+
+    def test_it_goes_on_to_its_end_if_nobody_stops_it(self, carried, motions):
+        player, last, step = carried
+        player.go_on_from(last + 3 * step, step / PERIOD, 6)
+        while not player.finished:
+            position, _ = player.advance()
+        np.testing.assert_allclose(position, motions[2].sample([player.duration])[0][0], atol=2e-3)
+
+    def test_away_from_its_path_it_is_refused(self, carried):
+        player, last, step = carried
+        with pytest.raises(StartMismatch, match="the motion at"):
+            player.go_on_from(last + 3 * step + 2e-3, step / PERIOD, 6)

@@ -12,7 +12,8 @@ controller holds. Rates are those of the motion, without such repetitions.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -39,6 +40,8 @@ _FIRST: Final = 0.1
 """Share of the following-error threshold that target and arm may differ by at first."""
 _LEAP: Final = 0.25
 """Share that the controller's target may ever be off the set-point sent last."""
+_SPREAD: Final = 2
+"""Cycles per packet missed in which a motion comes back to its path (`drivers.open_mode`)."""
 _ORDERS: Final = ("velocity", "acceleration", "jerk")
 
 
@@ -48,10 +51,36 @@ def guard(observed: Observed) -> Iterator[Broken]:
     limits = _Limits.of(observed.cell)
     for talk in talks_of(observed):
         life = 1 + observed.runs.index(talk.life)
-        for stretch in stretches(talk):
+        for stretch in (part for whole in stretches(talk) for part in _parts(whole)):
             for text in _in_stretch(stretch, limits, gears, observed.cell.period):
                 at = stretch.at
                 yield Broken(LAW, f"life {life}, packets {at[0]} to {at[-1]}: {text}")
+
+
+def _parts(stretch: Stretch) -> Iterator[Stretch]:
+    """Apart where a controller led the motion by itself during a long gap.
+
+    What follows goes on from the target received and its velocity, as if these had been sent.
+    """
+    most = int(stretch.talk.life.settings.get("max_gap", 2))
+    moved = np.append(False, (stretch.step[:-1] != 0.0).any(axis=1))
+    gaps = stretch.talk.records["gap"][stretch.rows].astype(np.intp)
+    # Those that were heard and are in the gap, as of a pile, count once.
+    missed = np.maximum(gaps, _unanswered_before(stretch) - gaps)
+    cuts = np.flatnonzero((missed > most) & moved)
+    cuts = cuts[cuts < stretch.leading]
+    for first, last in pairwise((0, *cuts.tolist(), len(stretch.sent))):
+        yield replace(
+            stretch,
+            rows=slice(stretch.rows.start + first, stretch.rows.start + last),
+            leading=min(stretch.leading, last) - first,
+            sent=stretch.sent[first:last],
+            step=stretch.step[first:last],
+            received=stretch.received[:, first:last],
+            carried=int(missed[first]) if first else 0,
+            before=stretch.sent[first - 1] if first else stretch.sent[0],
+            step_before=stretch.step[first - 1] if first else stretch.step[0],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +119,7 @@ class _Limits:
 def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) -> Iterator[str]:
     threshold = np.fmin(limits.following, stretch.talk.init.threshold)
     current = np.fmin(limits.current, stretch.talk.init.current)
-    yield from _first(stretch, threshold)
+    yield from _led_on(stretch, threshold) if stretch.carried else _first(stretch, threshold)
     yield from _feedback(stretch, threshold, current)
     led = slice(0, stretch.leading)
     factors = limits.factors(*_asked_for(stretch))
@@ -108,12 +137,19 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
     after = min(3, len(stretch.sent) - stretch.leading)
     held = np.concatenate((q, q[-1:].repeat(after, axis=0)))
     record_rounding = np.full_like(held, 8.0 * _EPS) * np.abs(held).max(axis=0)
-    yield from _rates(held, limits.rates, factors, record_rounding, period, "recorded")
+    before = np.zeros((3, 1)) + held[:1]
+    if stretch.carried:
+        # Steps without acceleration: the motion comes back to its own within a few cycles.
+        factors[: _SPREAD * stretch.carried + 2, 2] = np.inf
+        before = np.arange(2.0, -1.0, -1.0)[:, np.newaxis] * -stretch.received[1, 0]
+        before = gears.joint(stretch.received[0, 0] + before)
+    yield from _rates(before, held, limits.rates, factors, record_rounding, period, "recorded")
     motor = stretch.sent[led][fresh]
     wire = gears.joint(motor)
     ulps = 0.5 * np.spacing(np.abs(motor).astype(np.float32)).astype(np.float64)
     wire_rounding = ulps @ np.abs(np.linalg.inv(gears.matrix)).T
-    yield from _rates(wire, limits.rates, factors, wire_rounding, period, "float32")
+    before = before if stretch.carried else np.zeros((3, 1)) + wire[:1]
+    yield from _rates(before, wire, limits.rates, factors, wire_rounding, period, "float32")
     yield from _only_when_requested(stretch, recorded)
     yield from _no_leap(stretch)
     yield from _after_long_gaps(stretch)
@@ -121,10 +157,16 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
 
 
 def _rates(
-    q: Array, rates: Array, factors: Array, rounding: Array, period: float, what: str
+    before: Array,
+    q: Array,
+    rates: Array,
+    factors: Array,
+    rounding: Array,
+    period: float,
+    what: str,
 ) -> Iterator[str]:
-    """Differences of set-points (k, n), each known to `rounding` (k, n) [rad]."""
-    rows = np.concatenate((q[:1].repeat(3, axis=0), q))  # before the first one it stands
+    """Differences of set-points (k, n), known to `rounding` (k, n) [rad], after three others."""
+    rows = np.concatenate((before, q))
     worst = rounding.max(axis=0)
     for order, (name, bound) in enumerate(zip(_ORDERS, rates, strict=True), 1):
         found = np.abs(np.diff(rows, order, axis=0)[3 - order :]) / period**order
@@ -188,6 +230,25 @@ def _first(stretch: Stretch, threshold: Array) -> Iterator[str]:
         yield "the first set-point was sent to an arm or a target in motion"
 
 
+def _led_on(stretch: Stretch, threshold: Array) -> Iterator[str]:
+    """After a long gap a motion goes on only where the controller led it, further or to rest."""
+    target, velocity, actual, measured = stretch.received[:4, 0]
+    step, slack = stretch.step_before, _FLOAT32 + _STANDSTILL
+    ahead = stretch.before + np.arange(stretch.carried + 1)[:, np.newaxis] * step
+    wide = threshold * (1.0 + 2.0 * _TOLERANCE)
+    if not (np.abs(target - ahead) <= _FIRST * wide).all(axis=1).any():
+        yield "a motion went on after a long gap from a target that is not on its way"
+    if np.any(np.abs(actual - target) > wide):
+        yield "a motion went on after a long gap with an arm that does not follow"
+    rests = np.all(np.abs(velocity) <= slack)
+    if rests and np.any(np.abs(stretch.sent[0] - target) > slack):
+        yield "a motion went on after a long gap though the controller had brought it to rest"
+    off = np.abs(velocity - step) > np.maximum(0.5 * np.abs(step), slack)
+    off |= (np.abs(measured) <= _STANDSTILL) & (np.abs(step) > 2.0 * slack)
+    if off.any() and not rests:
+        yield "a motion went on after a long gap though the controller had not carried it on"
+
+
 def _feedback(stretch: Stretch, threshold: Array, current: Array) -> Iterator[str]:
     """Set-points go on only to an arm that follows, and a controller that takes them."""
     led = slice(1, stretch.leading)
@@ -229,9 +290,10 @@ def _distance_to_last(stretch: Stretch) -> Array:
     depth = int(stretch.talk.life.settings.get("max_gap", 2)) + 1
     k = stretch.leading
     fresh = ~stretch.again[:k]
-    sent = stretch.sent[:k][fresh]
+    first = stretch.received[0, :1] if stretch.carried else stretch.sent[:1]
+    sent = np.concatenate((first, stretch.sent[:k][fresh]))
     target = stretch.received[0, 1:k]
-    last = np.cumsum(fresh)[: k - 1] - 1
+    last = np.cumsum(fresh)[: k - 1]
     nearest = np.full(target.shape, np.inf)
     for back in range(depth):
         nearest = np.fmin(nearest, np.abs(target - sent[np.maximum(last - back, 0)]))
@@ -277,7 +339,8 @@ def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]
     # A set-point sent again has the step that it had.
     fresh = ~stretch.again[: len(q)]
     motor, rounding, told = motor[fresh], rounding[fresh], stretch.step[: len(q)][fresh]
-    step = np.diff(motor, axis=0, prepend=motor[:1])
+    first = stretch.received[0, :1] if stretch.carried else motor[:1]
+    step = np.diff(motor, axis=0, prepend=first)
     slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
     if np.any(np.abs(told - step) > slack):
         yield "D2 is not the step from one set-point to the next"

@@ -73,6 +73,8 @@ class Stretch:
         sent: (k, n) D1 of the answers, motor revolutions.
         step: (k, n) D2 of the answers.
         received: (5, k, n) D1..D5 of the packets.
+        carried: packets missed before, in a motion that goes on from where a controller led it.
+        before, step_before: (n,) D1 and D2 of the answer before.
     """
 
     talk: Talk
@@ -81,6 +83,9 @@ class Stretch:
     sent: Array
     step: Array
     received: Array
+    before: Array
+    step_before: Array
+    carried: int = 0
 
     @property
     def again(self) -> Flags:
@@ -125,4 +130,6 @@ def _stretch(talk: Talk, modes: Modes, rows: slice) -> Stretch:
         answers[:, :, 0],
         answers[:, :, 1],
         np.moveaxis(received[:, :, :5], 2, 0),
+        answers[0, :, 0],
+        answers[0, :, 1],
     )
