@@ -140,13 +140,13 @@ def time_panel(
             for stretch in plot.shaded:
                 axes.axvspan(*stretch, color=BAND, linewidth=0.0, zorder=0.5)
             for trace in plot.traces:
-                style = (0, (4, 2)) if trace.dashed else "-"
-                line: dict[str, Any] = {
-                    "color": trace.colour,
-                    "linewidth": trace.width,
-                    "linestyle": style,
-                }
-                axes.plot(*thinned(time, trace.values), solid_joinstyle="round", **line)
+                axes.plot(
+                    *thinned(time, trace.values),
+                    color=trace.colour,
+                    linewidth=trace.width,
+                    linestyle=(0, (4, 2)) if trace.dashed else "-",
+                    solid_joinstyle="round",
+                )
             if plot.reach is not None:
                 axes.set_ylim(-plot.reach, plot.reach)
             headed(axes, plot.heading)
