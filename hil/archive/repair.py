@@ -198,7 +198,7 @@ def copy_of(
     writer.add_metadata(header.METADATA, header.sealed(described))
     recovered = found.definitions
     for piece in found.pieces:
-        record = container.record_at(stream, piece.offset, piece.length)
+        record = container.record_at(stream, piece.offset, piece.size)
         if piece.opcode != container.CHUNK:
             writer.copy(record)
             continue
