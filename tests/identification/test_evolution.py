@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from identification.excitation import Scores, SearchSettings
+from identification.excitation.searches.problem import ROW, unplanned
 from identification.excitation.searches.run import Evolution
-from identification.excitation.searches.scores import ROW, unplanned
 
 
 def scored(log10_det: float, coupling_index: float, excess: float) -> np.ndarray:

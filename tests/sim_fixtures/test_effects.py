@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim_fixtures import SettingError, UnmodelledEffects
-from sim_fixtures.effects import WARM_UP_TIME, FrictionDrift, TorqueRipple
+from sim_fixtures.arm import WARM_UP_TIME, FrictionDrift, TorqueRipple
 
 
 def test_nothing_is_on_unless_asked_for() -> None:

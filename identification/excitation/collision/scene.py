@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import link_bodies, obstacles, withdrawn
+from identification.excitation.collision.bodies import Workspace, link_bodies, obstacles, withdrawn
 from identification.excitation.collision.built_in import (
     SLACK,
     BuiltIn,
@@ -30,7 +30,6 @@ from identification.excitation.collision.poses import (
     turning,
 )
 from identification.excitation.collision.separation import Indices, Separation
-from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import PostureError
 from identification.model.kinematics import Chain, chain_from_urdf
 from planner import JointLimits
