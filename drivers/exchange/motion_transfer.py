@@ -1,8 +1,8 @@
 """A motion source on its way from one process to another.
 
 It is pickled into sealed memory: what it holds in large arrays is not copied when it is read, but
-mapped, read-only, where it lies. Its descriptor goes over the socket between supervisor and exchange,
-answers come back (`Inbox`).
+mapped, read-only, where it lies. Its descriptor goes over the socket between supervisor and
+exchange, answers come back (`Inbox`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""python-can's buses: opened by name, their errors in our words, and one end of the profile on one."""
+"""python-can's buses: opened by name, with errors in our words; one end of the profile on one."""
 
 from __future__ import annotations
 

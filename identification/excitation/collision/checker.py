@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision.bodies import Workspace
-from identification.excitation.collision.built_in import BuiltIn, exceptions
 from identification.excitation.collision.gaps import (
     Near,
     Touch,
@@ -19,7 +18,7 @@ from identification.excitation.collision.gaps import (
     what_is_near,
 )
 from identification.excitation.collision.poses import joint_poses
-from identification.excitation.collision.scene import Path, Scene
+from identification.excitation.collision.scene import BuiltIn, Path, Scene, exceptions
 from identification.excitation.collision.separation import Indices
 from identification.excitation.joint_limits import rate_bounds
 from identification.model.motion import Motion
