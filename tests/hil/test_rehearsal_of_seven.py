@@ -13,7 +13,7 @@ from hil.campaign.rehearsal_twin import FASTEST, Twin
 from hil.cell import Cell
 from hil.cli import app
 from hil.progress import Silent
-from sim_fixtures.plant import ElasticPlant
+from sim_fixtures.elastic_plant import ElasticPlant
 from sim_fixtures.truth import PlantTruth
 from tests.hil.new_cells import described_robot, filled_in
 
