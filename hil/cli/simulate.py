@@ -24,8 +24,7 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import SettingError
 from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import PATIENCE
-from sim_fixtures.tally import Histogram, Tally
+from sim_fixtures.serve import PATIENCE, Histogram, Tally
 
 REFRESH: Final = 0.25
 WIDTH: Final = 110
