@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
 from hil.reading import lies_there
-from hil.results import Results
-from hil.results.results import ConductResult, RecordedResult, StepResult, WarmUpResult
+from hil.results import ConductResult, RecordedResult, Results, StepResult, WarmUpResult
 from hil.terminal_text import plural
 
 from .dry_run import DryRun

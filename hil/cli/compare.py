@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json as json_module
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
 from hil.batch.workers import LocalWorkers
-from hil.cli.arguments import JsonOption, QuietOption, print_json
+from hil.cli.arguments import JsonOption, QuietOption
 from hil.compare import compare_campaigns, gather
 from hil.compare.words import caveat, findings, to_dict, verdict
 from hil.files import make_folder, write_together
@@ -56,7 +57,7 @@ def compare(
         write_together(output.parent, {output.name: comparison_bytes(found)})
         reporter.say(f"report: {output}")
     if json:
-        print_json(to_dict(found))
+        typer.echo(json_module.dumps(to_dict(found)))
     else:
         if not quiet:
             for one in findings(found):
