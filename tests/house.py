@@ -29,7 +29,7 @@ TARGETS: Final[Mapping[str, int | None]] = {
 }
 CEILINGS: Final[Mapping[str, int]] = {
     "product lines": 99_300,
-    "product files": 435,
+    "product files": 436,
     "test lines": 93_900,
     "test files": 476,
     "import circles": 0,

@@ -38,7 +38,20 @@ def test_help_says_where_to_start() -> None:
     assert "hil demo" in done.stdout
     for command in COMMANDS:
         assert f" {command} " in done.stdout
-        assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+        asked = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+        assert asked.exit_code == 0
+        assert COMMANDS.purposes[command].replace("`", "") in " ".join(asked.stdout.split())
+
+
+def test_help_imports_no_numerics() -> None:
+    look = "import sys; from hil.cli import app; app(['--help'], standalone_mode=False);"
+    look += "print('loaded', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.partition("loaded ")[2].split())
+    ours = {name for name in loaded if name.split(".")[0] == "hil"}
+    cli = {"hil", "hil.cli", "hil.errors", "hil.importing", "hil.terminal_text", "hil.version"}
+    assert ours == cli
+    assert not {"numpy", "scipy", "pinocchio", "pydantic", "drivers", "planner"} & loaded
 
 
 @pytest.mark.parametrize("arguments", [[], ["run"], ["import", "log"], ["archive", "check"]])
