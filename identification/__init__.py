@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str) -> Any:
     """A name of `identification.api`."""
-    if not name.startswith("_"):
+    if name == "__all__" or not name.startswith("_"):
         api = import_module("identification.api")
-        if name in api.__all__:
+        if name in ("__all__", *api.__all__):
             return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
