@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import hil as hil_package
 from hil.archive import open_archive
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
@@ -41,6 +42,13 @@ def test_help_says_where_to_start() -> None:
         asked = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
         assert asked.exit_code == 0
         assert COMMANDS.purposes[command].replace("`", "") in " ".join(asked.stdout.split())
+
+
+def test_the_package_says_what_its_names_are_for() -> None:
+    assert hil_package.__doc__ is not None
+    for name in hil_package.__all__:
+        assert f"`{name}`" in hil_package.__doc__
+        assert getattr(hil_package, name).__doc__
 
 
 def test_help_imports_no_numerics() -> None:
