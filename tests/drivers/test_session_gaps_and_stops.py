@@ -168,6 +168,24 @@ class TestLongGaps:
         assert rig.state is State.OPEN
         assert source.stops == 1
 
+    @pytest.mark.parametrize(("missed", "cycles"), [(3, 6), (7, 14), (8, 15), (400, 15)])
+    def test_jerk_has_no_bound_for_30_ms_at_most(self, missed, cycles):
+        """However far a controller carried the motion on, by the steps it had."""
+        rig, source = moving_at(0.1)
+        spread = []
+
+        def go_on_from(position, velocity, cycles):
+            source._position = position
+            spread.append(cycles)
+
+        source.go_on_from = go_on_from
+        rig.miss(missed)
+        rig.axes["d"][:, 0] += missed * rig.axes["d"][:, 1]
+        rig.axes["d"][:, 2] = rig.axes["d"][:, 0]
+        rig.cycle()
+        assert spread == [cycles]
+        assert rig.state is State.OPEN
+
     def test_a_short_gap_is_bridged_even_so(self):
         rig, source, _ = self.after_gap(2, self.held)
         assert rig.state is State.OPEN
