@@ -286,6 +286,8 @@ class PositionMode(OpenMode):
         if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
+        # One that is reported late is further on by now.
+        target = target + self._history.lag * velocity[0]
         ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
@@ -298,7 +300,7 @@ class PositionMode(OpenMode):
         spread = min(SPREAD * steps, round(RETURN / self._guard.period))
         execution.go_on_from(position, speed, spread, cycle)
         self._guard.go_on_from(position, speed, spread)
-        self._history.begin(target)
+        self._history.go_on_from(target, step)
         self.held, self._sent = position, target
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:
