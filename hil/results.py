@@ -299,6 +299,13 @@ class ExcitationResult(Frozen):
     executed: CriteriaResult
 
 
+def outside_mark(z: float | None) -> str:
+    """`out3` or `out2` for a deviation beyond 3 or 2 standard deviations; "" for any other."""
+    if z is None or abs(z) <= 2.0:
+        return ""
+    return "out3" if abs(z) > 3.0 else "out2"
+
+
 class ParameterResult(Frozen):
     """One parameter: pooled estimate, its standard deviation, and what it is compared with."""
 
@@ -339,6 +346,21 @@ class ParameterResult(Frozen):
     def deviation(self) -> float | None:
         """(estimate - truth) / std; None without a truth or a usable standard deviation."""
         return self.deviation_of(self.estimate, self.std)
+
+    @property
+    def outside(self) -> str:
+        """Mark of its deviation, see :func:`outside_mark`."""
+        return outside_mark(self.deviation)
+
+    @property
+    def grade(self) -> Literal["well", "roughly", "hardly", "undetermined"]:
+        """How well the data determine it: to 10 %, to 50 %, worse, or not at all."""
+        if self.undetermined or not math.isfinite(self.std):
+            return "undetermined"
+        size = abs(self.estimate)
+        return (
+            "well" if self.std <= 0.1 * size else "roughly" if self.std <= 0.5 * size else "hardly"
+        )
 
     def deviation_of(self, estimate: float, std: float) -> float | None:
         """The same of another estimate of this parameter."""
@@ -574,6 +596,12 @@ class Results(Frozen):
             if found is not None and len(found) != count:
                 raise ValueError(f"{name} has {len(found)} entries and not {count}")
         return self
+
+    @property
+    def not_significant(self) -> list[str]:
+        """Labels of parameters whose 95 % interval includes zero."""
+        factor = self.uncertainty.interval_factor
+        return [p.label for p in self.parameters if not abs(p.estimate) > factor * p.std]
 
     def save(self, path: Path) -> None:
         """Write `path` as indented JSON."""

@@ -21,8 +21,7 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged, SettingError
 from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, serve
-from sim_fixtures.tally import Tally
+from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, Tally, serve
 
 _PR_SET_TIMERSLACK: Final = 29
 

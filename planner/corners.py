@@ -182,10 +182,10 @@ def fly_by_all(
         Allowance.of_many([bounds[index] for index in flown]),
         np.array([shares[index] for index in flown]),
     )
-    for index, leave, enter, taken, join in zip(flown, *rounded, strict=True):
+    for index, leave, enter, share, join in zip(flown, *rounded, strict=True):
         if join is not None:
-            how: How = "flown" if taken == shares[index] else "reduced"
-            corners[index] = Corner(float(leave), float(enter), join, float(taken), how)
+            how: How = "flown" if share == shares[index] else "reduced"
+            corners[index] = Corner(float(leave), float(enter), join, float(share), how)
     return corners
 
 
@@ -434,8 +434,8 @@ def round_corners(
         fly: Share of the ramps that each is asked to take (c,).
     """
     count = len(before)
-    leave, enter, taken = np.zeros((3, count))
-    corners = Corners(leave, enter, taken, [None] * count)
+    nothing = np.zeros((3, count))
+    corners = Corners(nothing[0], nothing[1], nothing[2], [None] * count)
     task = _Task(moves, before, after, bounds, fly)
     flown = (moves.slowing_down[before] > 0.0) & (moves.speeding_up[after] > 0.0)
     asked = np.flatnonzero(flown & (fly >= LEAST_SHARE))

@@ -26,8 +26,8 @@ from planner.corners import Corner
 from planner.errors import InvalidSetting, PlannerError
 from planner.limits import JointLimits
 from planner.moves import Leg, assembled, between, check, corner, leg, passage
-from planner.path_reader import PathReader
 from planner.piecewise_cubic import PiecewiseCubic
+from planner.player import PathReader
 from planner.rrs import (
     AccelerationKind,
     Event,

@@ -6,9 +6,9 @@ is common, because captures of foreign programs pin it.
 
 from __future__ import annotations
 
+from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.controller import SimulatedController
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.effects import UnmodelledEffects
 from sim_fixtures.elastic_plant import ElasticPlant
 from sim_fixtures.errors import FixtureError, PlantDiverged, SettingError, SimulationError
 from sim_fixtures.plant import Plant

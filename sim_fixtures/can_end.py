@@ -15,11 +15,10 @@ import can
 
 from drivers.errors import TransportClosed
 from drivers.transports.base import TransportError
-from drivers.transports.can.bus import open_bus
+from drivers.transports.can.bus import Port, open_bus
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
 from drivers.transports.can.layout import MAX_AXES
-from drivers.transports.can.port import Port
 from drivers.transports.can.transport import CanSpec
 from sim_fixtures.far_end import FarEndError
 

@@ -37,13 +37,11 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from sim_fixtures.arm import SimulatedArm
+from sim_fixtures.arm import Mishap, SimulatedArm, UnmodelledEffects
 from sim_fixtures.controller_faults import ControllerFault
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.effects import UnmodelledEffects
 from sim_fixtures.errors import SettingError
 from sim_fixtures.layout import Layout
-from sim_fixtures.mishaps import Mishap
 from sim_fixtures.own_motion import OwnMotion
 from sim_fixtures.plant import Plant
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep

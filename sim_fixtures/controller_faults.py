@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from sim_fixtures.mishaps import Mishap
+from sim_fixtures.arm import Mishap
 
 SLIP = 1.5
 """Size of an encoder's slip, as a multiple of the axis's following-error threshold."""

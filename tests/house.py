@@ -28,15 +28,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 102_198,
-    "product files": 514,
-    "test lines": 95_097,
-    "test files": 522,
+    "product lines": 99_300,
+    "product files": 436,
+    "test lines": 93_900,
+    "test files": 476,
     "import circles": 0,
     "imports inside functions": 38,
-    "files with one importer": 33,
+    "files with one importer": 24,
     "banned names": 0,
-    "functions over 60 lines": 36,
+    "functions over 60 lines": 35,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {

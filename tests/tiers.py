@@ -23,7 +23,6 @@ SAFETY: Final = (
     "hil/test_run.py",
     "hil/test_run_command.py",
     "hil/test_run_kills.py",
-    "hil/test_run_trust.py",
     "process_death",
     "simulate",
     "untrusted",

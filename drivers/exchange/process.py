@@ -17,7 +17,7 @@ from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log, memory
 from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventReader
-from drivers.exchange.inbox import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
+from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.notices import ExchangeEvent
 from drivers.exchange.realtime import RealTimeReport
 from drivers.exchange.settings import ExchangeSettings

@@ -23,7 +23,7 @@ from drivers.exchange.control import (
     bin_of,
 )
 from drivers.exchange.event_log import EventWriter
-from drivers.exchange.inbox import WITHDRAWN, Inbox
+from drivers.exchange.motion_transfer import WITHDRAWN, Inbox
 from drivers.exchange.notices import (
     NO_ARCHIVE,
     NO_SUPERVISOR,

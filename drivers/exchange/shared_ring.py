@@ -47,13 +47,8 @@ class SharedCycleRing(CycleRecords):
     @classmethod
     def create(cls, n_joints: int, capacity: int) -> SharedCycleRing:
         """Ask for memory for `capacity` records."""
-        if capacity < 2:
-            raise ValueError(f"a shared ring of {capacity} records; at least 2 are needed")
-        size = _HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize
-        fd = memory.create("hil-cycles", size)
-        words = memoryview(memory.attach(fd)).cast("B")[:_HEADER_BYTES].cast("q")
-        words[_JOINTS], words[_CAPACITY], words[_TAG] = n_joints, capacity, _MAGIC
-        return cls(fd, n_joints)
+        row = cycle_dtype(n_joints).itemsize
+        return cls(_asked_for("hil-cycles", "records", _MAGIC, n_joints, row, capacity), n_joints)
 
     @classmethod
     def attach(cls, fd: int, n_joints: int) -> SharedCycleRing:
@@ -103,13 +98,8 @@ class SharedPacketRing(PacketRows):
     @classmethod
     def create(cls, capacity: int = CAPACITY) -> SharedPacketRing:
         """Ask for memory for `capacity` packets."""
-        if capacity < 2:
-            raise ValueError(f"a shared ring of {capacity} packets; at least 2 are needed")
-        fd = memory.create("hil-packets", _HEADER_BYTES + capacity * PACKET_DTYPE.itemsize)
-        words = memoryview(memory.attach(fd)).cast("B")[:_HEADER_BYTES].cast("q")
-        words[_JOINTS], words[_CAPACITY] = PACKET_DTYPE.itemsize, capacity
-        words[_TAG] = _PACKETS_MAGIC
-        return cls(fd)
+        row = PACKET_DTYPE.itemsize
+        return cls(_asked_for("hil-packets", "packets", _PACKETS_MAGIC, row, row, capacity))
 
     def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
         """Keep one packet, over the oldest where there is no room."""
@@ -181,6 +171,16 @@ class PacketReader(_RowReader):
     def __init__(self, fd: int) -> None:
         check = (PACKET_DTYPE.itemsize, _PACKETS_MAGIC, "raw packets")
         super().__init__(fd, PACKET_DTYPE, check, acknowledge=False)
+
+
+def _asked_for(name: str, what: str, magic: int, width: int, row: int, capacity: int) -> int:
+    """Descriptor of memory for a ring of `capacity` rows of `row` bytes; see `_checked`."""
+    if capacity < 2:
+        raise ValueError(f"a shared ring of {capacity} {what}; at least 2 are needed")
+    fd = memory.create(name, _HEADER_BYTES + capacity * row)
+    words = memoryview(memory.attach(fd)).cast("B")[:_HEADER_BYTES].cast("q")
+    words[_JOINTS], words[_CAPACITY], words[_TAG] = width, capacity, magic
+    return fd
 
 
 def _checked(

@@ -213,7 +213,7 @@ def records(
             raise Damage(offset, "is cut off")
         opcode, length = RECORD.unpack(head)
         if not opcode:  # a hole of a file is zeros, and would be as many records as it has bytes
-            raise Damage(offset, "is none")
+            raise Damage(offset, "is zeros, where one must begin")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
         if length > LARGEST_RECORD and opcode not in skip:

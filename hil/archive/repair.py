@@ -16,7 +16,7 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import IO, BinaryIO, Protocol
+from typing import IO, BinaryIO
 
 import zstandard
 from mcap.records import Chunk
@@ -32,18 +32,11 @@ from hil.archive.writer import sync_folder
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.reading import opened
 
-
-class Output(Protocol):
-    """What bytes are written to."""
-
-    def write(self, data: bytes, /) -> object:
-        """Take the next bytes."""
-
-
+Write = Callable[[bytes], object]
 _NAMED = 40  # characters that the temporary file takes over of the name
 
 
-def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]], None]) -> None:
+def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, Write], None]) -> None:
     """Make an archive of another one; `target` is at any moment what it was, or whole.
 
     File and folder are on the disk when this returns, and the file has the mode of its source.
@@ -51,7 +44,7 @@ def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]],
     Args:
         source: the archive to make it of.
         target: the file to write or to replace, which may be the source.
-        fill: writes the content, given the source and the new file.
+        fill: writes the content, given the source and what takes the bytes of the new file.
 
     Raises:
         ArchiveWriteError: the disk refuses.
@@ -60,7 +53,7 @@ def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, IO[bytes]],
     try:
         with source.open("rb") as stream, _beside(target) as output:
             os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
-            fill(stream, output)
+            fill(stream, output.write)
             output.flush()
             os.fsync(output.fileno())
             back = open_archive(output.name, fields=())
@@ -171,17 +164,6 @@ def _samples_lost(found: Survey) -> int | None:
     return None if stated is None else max(0, stated - found.samples)
 
 
-class _Comparison:
-    """A file to write to that remembers whether all was as in another one."""
-
-    def __init__(self, other: BinaryIO) -> None:
-        self.same = True
-        self._other = other
-
-    def write(self, data: bytes) -> None:
-        self.same = self.same and self._other.read(len(data)) == data
-
-
 def is_indexed(found: Survey) -> bool:
     """Whether message indexes, summary and all else that follows from a sound content fit it.
 
@@ -189,29 +171,34 @@ def is_indexed(found: Survey) -> bool:
         found: of a file whose content has no fault.
     """
     with opened(found.path) as stream, opened(found.path) as other:
-        comparison = _Comparison(other)
-        copy_of(found, stream, comparison)
-        return comparison.same and not other.read(1)
+        same = True
+
+        def compare(data: bytes) -> None:
+            nonlocal same
+            same = same and other.read(len(data)) == data
+
+        copy_of(found, stream, compare)
+        return same and not other.read(1)
 
 
 def copy_of(
-    found: Survey, stream: BinaryIO, output: Output, *, outcome: Mapping[str, str] | None = None
+    found: Survey, stream: BinaryIO, write: Write, *, outcome: Mapping[str, str] | None = None
 ) -> None:
     """Write what stands of an archive as a new one.
 
     Args:
         found: what stands of it.
         stream: the archive.
-        output: the new one.
+        write: takes the bytes of the new one.
         outcome: entries of its outcome that are to be others than before.
     """
-    writer, parser = McapWriter(output.write), ChunkParser()
+    writer, parser = McapWriter(write), ChunkParser()
     described = _description(found)
     writer.start(schema.PROFILE, schema.LIBRARY)
     writer.add_metadata(header.METADATA, header.sealed(described))
     recovered = found.definitions
     for piece in found.pieces:
-        record = container.record_at(stream, piece.offset, piece.length)
+        record = container.record_at(stream, piece.offset, piece.size)
         if piece.opcode != container.CHUNK:
             writer.copy(record)
             continue

@@ -44,20 +44,6 @@ class Fault(NamedTuple):
     loss: bool
 
 
-class Piece(NamedTuple):
-    """A record that stands.
-
-    Attributes:
-        offset: where it begins in the file.
-        length: with its head.
-        opcode: kind of record.
-    """
-
-    offset: int
-    length: int
-    opcode: int
-
-
 Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
 
 
@@ -75,7 +61,8 @@ class Survey(Scan):
         path: the file.
         size: its length.
         written_by: profile and library, None where the record is damaged.
-        pieces: records that stand, but for header and outcome, in the order of the file.
+        pieces: records that stand, but for header and outcome, in the order of the file, without
+            their bodies.
         definitions: schemas and channels that only the summary still has.
         faults: what is wrong.
     """
@@ -92,7 +79,7 @@ class Survey(Scan):
         self.path = path
         self.size = os.fstat(stream.fileno()).st_size
         self.written_by: tuple[str, str] | None = None
-        self.pieces: list[Piece] = []
+        self.pieces: list[Record] = []
         self.definitions: list[Record] = []
         self.faults: list[Fault] = []
         self._stream = stream
@@ -185,7 +172,7 @@ class Survey(Scan):
                 self._keep(record)
 
     def _keep(self, record: Record) -> None:
-        self.pieces.append(Piece(record.offset, record.size, record.opcode))
+        self.pieces.append(record._replace(body=b""))
 
     def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
         """Take header or outcome; another one is left as it is."""

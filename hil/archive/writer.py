@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -227,8 +226,6 @@ Array = NDArray[np.float64]
 
 FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash costs at most that
 
-_OWN_KEYS = frozenset(("format_version", "attachments", "checksum", "joint_names", "period"))
-
 
 class ArchiveWriter:
     """An archive being recorded.
@@ -266,8 +263,6 @@ class ArchiveWriter:
         packets: bool = False,
     ) -> None:
         self._path = Path(path)
-        if not (math.isfinite(period) and period > 0.0):
-            raise ArchiveWriteError(self._path, f"period is {period!r} s", field="period")
         self._period = period
         self._n_joints = len(joint_names)
         self._encoder = CycleEncoder(joint_names, period)
@@ -494,14 +489,9 @@ def checked_metadata(
     """Join the caller's entries with our own, and with what the file name says.
 
     Raises:
-        ArchiveWriteError: a key that is ours, no kind or an unknown one, or a contradiction
-            between entries and file name.
+        ArchiveWriteError: no kind or an unknown one, or a contradiction between entries and file
+            name.
     """
-    reserved = _OWN_KEYS.intersection(metadata)
-    if reserved:
-        raise ArchiveWriteError(
-            path, f"{', '.join(sorted(reserved))} is written by the archive itself"
-        )
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}
     entries = {**named, **{key: str(value) for key, value in metadata.items()}}

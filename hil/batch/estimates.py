@@ -35,6 +35,7 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
 from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
+from .workers import plus
 
 Array = NDArray[np.float64]
 
@@ -204,16 +205,16 @@ class Group:
         self.warnings.count(summary)
         if summary.ref.use == "excitation":
             self.refs.append(summary.ref)
-            self.products = _plus(self.products, summary.products)
+            self.products = plus(self.products, summary.products)
         else:
-            self.unseen = _plus(self.unseen, summary.total)
+            self.unseen = plus(self.unseen, summary.total)
 
     def add(self, other: Group) -> None:
         """Add what is fitted elsewhere."""
         self.refs += other.refs
         self.repetitions += other.repetitions
-        self.unseen = _plus(self.unseen, other.unseen)
-        self.products = _plus(self.products, other.products)
+        self.unseen = plus(self.unseen, other.unseen)
+        self.products = plus(self.products, other.products)
         self.warnings.add(other.warnings)
         self.settings |= other.settings
 
@@ -371,8 +372,3 @@ def _conditioning(found: Estimate) -> list[str]:
         "parameters apart, and sums of squares lose digits there; `hil identify` on these archives "
         "uses QR"
     ]
-
-
-def _plus(one: Any, other: Any) -> Any:
-    """The sum of two terms that may be nothing."""
-    return one if other is None else other if one is None else one + other

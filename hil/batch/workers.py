@@ -16,7 +16,6 @@ import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any, Final, Generic, NamedTuple, Self, TypeVar
 
 from hil.errors import HilError
@@ -78,10 +77,9 @@ class WorkerSoftwareError(HilError):
     """A worker that runs other software than the one who asked it."""
 
 
-def sum_run(terms: Sequence[T | None], add: Callable[[T, T], T]) -> T | None:
-    """Add the terms from first to last; None is nothing, and what the sum of nothing is."""
-    present = [term for term in terms if term is not None]
-    return reduce(add, present) if present else None
+def plus(one: Any, other: Any, add: Callable[[Any, Any], Any] = operator.add) -> Any:
+    """The sum of two terms, each of which may be None, which is nothing."""
+    return one if other is None else other if one is None else add(one, other)
 
 
 class TreeSum(Generic[T]):
@@ -99,7 +97,7 @@ class TreeSum(Generic[T]):
         if level == len(self._levels):
             self._levels.append((0, None))
         count, total = self._levels[level]
-        total = sum_run([total, term], self._add)
+        total = plus(total, term, self._add)
         self._levels[level] = (count + 1, total)
         if count + 1 == FAN_IN:
             self._levels[level] = (0, None)

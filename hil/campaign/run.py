@@ -124,7 +124,7 @@ class Run:
     @property
     def simulated(self) -> bool:
         """Whether nothing but a simulated arm can move."""
-        return (self.link or self.cell).only_simulated
+        return self.cell.only_simulated if self.link is None else self.link.only_simulated
 
     @property
     def virtual(self) -> bool:

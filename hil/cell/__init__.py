@@ -1,7 +1,6 @@
 """The cell: robot + drive train + controller link + limits, from one TOML file."""
 
-from .cell import Cell
+from .cell import AngleFrame, Cell
 from .errors import CellError
-from .frame import AngleFrame
 
 __all__ = ["AngleFrame", "Cell", "CellError"]

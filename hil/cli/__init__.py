@@ -13,7 +13,7 @@ import json
 import os
 import sys
 from collections import UserDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Annotated, Any
@@ -21,14 +21,12 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.text import Text
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from hil.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
 from hil.importing import leave_if_interrupted
 from hil.terminal_text import printable
 from hil.version import software
-from identification import IdentificationError
-from planner import PlannerError
 
 INTERNAL = 1
 """Exit status of an internal error, and where a disk is full or refuses to be written."""
@@ -49,10 +47,19 @@ def exit_code_of(error: BaseException) -> int:
         if isinstance(cause, OSError) and cause.errno in DISK_REFUSES:
             return INTERNAL
         cause = cause.__cause__
-    if isinstance(error, PlannerError | IdentificationError):
+    if _comes_from_below(error):
         return USAGE
     code = getattr(error, "exit_code", 1)  # HilError, and what typer says of a wrong command line
     return code if isinstance(code, int) else 1
+
+
+def _comes_from_below(error: BaseException) -> bool:
+    """Whether a package that knows no exit status refused; it is loaded where that was raised."""
+    for package, name in (("identification", "IdentificationError"), ("planner", "PlannerError")):
+        errors = sys.modules.get(f"{package}.errors")
+        if errors is not None and isinstance(error, getattr(errors, name)):
+            return True
+    return False
 
 
 def as_json(error: BaseException) -> dict[str, Any]:
@@ -112,12 +119,13 @@ class LazyCommands(UserDict[str, Any]):
     A module has either a function of the command's name, or an `app` of several commands.
 
     Args:
-        names: of the commands, in the order of the help.
+        purposes: what each command is for, by its name, in the order of the help.
         modules: of those whose module is called otherwise.
     """
 
-    def __init__(self, names: Sequence[str], **modules: str) -> None:
-        super().__init__({name: modules.get(name, name) for name in names})
+    def __init__(self, purposes: Mapping[str, str], **modules: str) -> None:
+        self.purposes = purposes
+        super().__init__({name: modules.get(name, name) for name in purposes})
 
     def __getitem__(self, name: str) -> Any:
         """The command, imported if it was not yet."""
@@ -153,31 +161,67 @@ def without_flag_types(command: Any) -> Any:
 
 
 COMMANDS = LazyCommands(
-    (
-        "demo",
-        "design",
-        "rehearse",
-        "status",
-        "report",
-        "replay",
-        "identify",
-        "reidentify",
-        "compare",
-        "export",
-        "gains",
-        "payload",
-        "plan",
-        "plot",
-        "new",
-        "move",
-        "run",
-        "record",
-        "simulate",
-        "study",
-        "doctor",
-        "import",
-        "archive",
-    ),
+    {
+        "demo": "Design, run, archive, identify and report, all on the simulated COMAU NS 16.",
+        "design": (
+            "Search the motion that excites and decouples the parameters of CELL. Nothing moves."
+        ),
+        "rehearse": (
+            "Run exactly the plan of CAMPAIGN on a simulated arm, and judge it. Nothing moves."
+        ),
+        "status": "Show which steps of CAMPAIGN are done, which is next, and what to type for it.",
+        "report": "Make the report of CAMPAIGN anew and print where it is.",
+        "replay": (
+            "Simulate held-out motions under their recorded torques: how far models go astray."
+        ),
+        "identify": (
+            "Estimate the dynamic parameters from archives, and say whether the result is good."
+        ),
+        "reidentify": (
+            "Identify every arm from all archives below some folders, campaign by campaign."
+        ),
+        "compare": (
+            "Compare campaigns of one arm: did the friction change, on which axis, what does "
+            "it carry?"
+        ),
+        "export": (
+            "Write the identified arm for a simulator, read it back, and say what the format "
+            "leaves out."
+        ),
+        "gains": (
+            "Find the torque constant of every motor, from recordings with and without a "
+            "known payload."
+        ),
+        "payload": (
+            "Weigh what the arm carries: mass, centre of mass and inertia with 95 % intervals."
+        ),
+        "plan": (
+            "Plan a motion through via points and say how each of them is passed. Nothing moves."
+        ),
+        "plot": (
+            "Draw what is in an archive: position, speed, current, torque, following error, events."
+        ),
+        "new": 'Write a commented cell file for an arm; what nobody has said is marked "?".',
+        "move": "Move the arm on a straight way in joint space, slowly, and archive it.",
+        "run": "Run what is missing of a campaign on its controller, then identify and report.",
+        "record": (
+            "Record while the controller's own program moves the arm. Nothing is commanded "
+            "from here."
+        ),
+        "simulate": (
+            "Be the controller: a simulated C4G with its arm, for a PC program on a real "
+            "network or bus."
+        ),
+        "study": (
+            "Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16."
+        ),
+        "doctor": (
+            "Measure whether this PC can answer a controller every 1 or 2 ms, and say what "
+            "to change."
+        ),
+        "import": "Turn other people's recordings into archives that `hil identify` reads.",
+        "archive": "Look into archives, check and repair them.",
+    },
     **{"import": "imports"},
 )
 
@@ -190,6 +234,13 @@ class Group(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
         without_flag_types(self)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Show the commands by their purposes: none of them is imported for that."""
+        purposes = COMMANDS.purposes.items()
+        self.commands = {name: TyperCommand(name, help=text) for name, text in purposes}
+        super().format_help(ctx, formatter)
+        self.commands = COMMANDS
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """The context of one call, which knows whether JSON is asked for."""
@@ -243,8 +294,6 @@ def main() -> None:
     """Run the command line; known errors become one sentence and an exit status."""
     try:
         app(standalone_mode=True)
-    except (HilError, IdentificationError, PlannerError) as error:
-        _fail(str(error), exit_code_of(error), stopped=isinstance(error, OperatorStopError))
     except OSError as error:
         if error.errno not in DISK_REFUSES:
             raise
@@ -252,6 +301,10 @@ def main() -> None:
         _fail(f"{file}cannot be written ({error.strerror}); make room", INTERNAL)
     except KeyboardInterrupt:
         _fail("interrupted", 130, stopped=True)
+    except Exception as error:
+        if not isinstance(error, HilError) and not _comes_from_below(error):
+            raise
+        _fail(str(error), exit_code_of(error), stopped=isinstance(error, OperatorStopError))
 
 
 def _fail(text: str, status: int, *, stopped: bool = False) -> None:

@@ -14,7 +14,7 @@ from hil.archive.overview import Overview, overview
 from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
 from hil.cli import exit_code_of
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import JsonOption, print_json
 from hil.errors import ArchiveError, InputError
 from hil.terminal_text import printable
 
@@ -89,7 +89,7 @@ def repair(
         _say_error(file, error, as_json=as_json)
         raise typer.Exit(FAILED) from error
     if as_json:
-        typer.echo(json.dumps(_repair_dict(done)))
+        print_json(_repair_dict(done))
         raise typer.Exit(LOST if done.losses else 0)
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
@@ -120,7 +120,7 @@ def _saved(samples: int, lost: int | None) -> str:
 
 def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps({"file": str(path), "archive": False, "error": str(error)}))
+        print_json({"file": str(path), "archive": False, "error": str(error)})
     else:
         typer.echo(_shown([f"error: {error}"]), err=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +50,11 @@ ConventionOption = Annotated[
         show_default=False,
     ),
 ]
+
+
+def print_json(document: object) -> None:
+    """Print what a script reads: one JSON object."""
+    typer.echo(json.dumps(document))
 
 
 def figures(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import math
 import os
 import shlex
@@ -20,7 +19,7 @@ from hil.campaign.operator import Stop, stop_on_interrupt
 from hil.campaign.quick_design import quick_settings
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.design import DesignSettings, Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, margins, weakest
 from hil.design.compare import References, references
@@ -359,7 +358,7 @@ def design(
         say_campaign(reporter, folder, made, files)
         if json:
             found = design_summary(done, folder) | campaign_summary(folder, made, files)
-            typer.echo(json_format.dumps(found, allow_nan=False))
+            print_json(found)
         else:
             typer.echo(printable(summary_line(done, folder)))
         draw_pictures(folder, done, loaded, beside, together=known is not None)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import JsonOption, print_json
 from hil.cli.verdict import NOT_GOOD
 from hil.doctor.diagnosis import as_json, examine, show
 from hil.doctor.link import controller_in, link_of
@@ -55,7 +54,7 @@ def doctor(
         reporter=reporter(quiet=json),
     )
     if json:
-        typer.echo(json_format.dumps(as_json(diagnosis)))
+        print_json(as_json(diagnosis))
     else:
         show(diagnosis, Console())
     if not diagnosis.fit or diagnosis.provisional:

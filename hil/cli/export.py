@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, print_json
 from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
 from hil.cli.verdict import NOT_GOOD
 from hil.exporting import FormatName, default_output, export_model
@@ -67,7 +66,7 @@ def export(
     target = output or default_output(archives, to)
     exported = export_model(found, target, to, ensemble=ensemble, seed=seed)
     if json:
-        typer.echo(json_format.dumps(exported.to_dict(), allow_nan=False))
+        print_json(exported.to_dict())
     else:
         for line in exported.lines()[-1 if quiet else 0 :]:
             say(line)

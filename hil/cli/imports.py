@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import math
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hil.archive import open_archive
-from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures
+from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures, print_json
 from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
@@ -244,7 +243,7 @@ def _tell(path: Path, *, json: bool) -> None:
     found = open_archive(path).header.findings
     if json:
         summary = {"archive": str(path), "found": found.lines, "warnings": found.warnings}
-        typer.echo(json_format.dumps(summary))
+        print_json(summary)
         return
     for line in found.lines:
         say(line)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hil.campaign import stop_on_interrupt
-from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures
+from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures, print_json
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.importers import convention_of
@@ -137,7 +136,7 @@ def new(
             "unknown": list(unknown),
             "notes": list(known.notes),
         }
-        typer.echo(json_format.dumps(summary))
+        print_json(summary)
         return
     for note in known.notes:
         say(f"note: {note}")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically
 from hil.plots import save
@@ -92,7 +91,7 @@ def plot(
             "stop": view.stop,
             "peak_share_of_limit": peaks,
         }
-        typer.echo(json_format.dumps(summary))
+        print_json(summary)
         return
     for problem in (view.facts.damage, view.facts.lost):
         if problem:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import sys
 import time
 from pathlib import Path
@@ -18,7 +17,7 @@ from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
-from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption
+from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError
 from hil.progress import say
 from hil.recording import archive_path
@@ -108,7 +107,7 @@ def record(
     if not json:
         _report(path, done, loaded)
     elif early is None:
-        typer.echo(json_format.dumps(figures))
+        print_json(figures)
     if early is not None:
         raise early.beside(figures)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import math
 import re
 from collections import Counter
@@ -20,7 +19,7 @@ from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
 from hil.batch.types import Arm, BatchEstimator, BatchResult, Broken, LevelEstimate
 from hil.batch.workers import TIMEOUT, LocalWorkers, Workers
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.cli.identify_options import (
     BandwidthOption,
     DelayOption,
@@ -320,7 +319,7 @@ def reidentify(
             written = [*write_tables(output, result), page]
             write_trend_report(page, found)
     if json:
-        typer.echo(json_module.dumps(as_dict(result, found, written)))
+        print_json(as_dict(result, found, written))
     else:
         _say(result, found, written, reporter, quiet=quiet)
     if result.broken:

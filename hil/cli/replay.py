@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, print_json
 from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
@@ -69,7 +68,7 @@ def replay(
     if (folder / RESULTS).exists() and archives[0].is_dir():
         report_replay(folder, found.results, replayed.beside, reporter)
     if json:
-        typer.echo(json_format.dumps({"picture": str(target), **replayed.to_dict()}))
+        print_json({"picture": str(target), **replayed.to_dict()})
     else:
         for line in replayed.lines()[-1 if quiet else 0 :]:
             say(line)

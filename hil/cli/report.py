@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hil.campaign import Campaign
-from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
 from hil.results import Results, csv_tables
@@ -39,4 +38,4 @@ def report(
         return
     verdict = Results.load(opened.folder.results).verdict
     document = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
-    typer.echo(json_format.dumps(document))
+    print_json(document)

@@ -15,7 +15,7 @@ from hil.archive.live import LiveView
 from hil.campaign import Campaign, Link, stop_on_interrupt
 from hil.campaign.run import RunResult
 from hil.cell_link import require_watchable
-from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.cli.payload import payload_lines
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
@@ -163,7 +163,7 @@ def _weigh(
     weighed = weigh(campaign, name, run=run_side, mount=mount, reporter=make_reporter(quiet=silent))
     found = weighed.found
     if json:
-        typer.echo(json_format.dumps(found.as_json() | {"pairs": weighed.pairs}))
+        print_json(found.as_json() | {"pairs": weighed.pairs})
     else:
         say("\n".join(payload_lines(found)))
     if found.estimate.contradicted:
@@ -199,7 +199,7 @@ def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool)
         finish(found.results, json=False, quiet=quiet)
         return
     verdict = json_format.loads(as_json(found.results))
-    typer.echo(json_format.dumps({**result.to_dict(), "verdict": verdict}))
+    print_json({**result.to_dict(), "verdict": verdict})
     if not found.verdict.good:
         raise typer.Exit(NOT_GOOD)
 
@@ -207,7 +207,7 @@ def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool)
 def _tell(result: RunResult, *, json: bool) -> None:
     """What was done, where nothing is identified."""
     if json:
-        typer.echo(json_format.dumps({**result.to_dict(), "verdict": None}))
+        print_json({**result.to_dict(), "verdict": None})
         return
     done, wanted = result.repetitions
     tested, tests = result.validations

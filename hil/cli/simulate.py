@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 import os
 import time
 from dataclasses import fields, replace
@@ -14,7 +13,7 @@ import typer
 
 from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.move import joint_index
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
@@ -24,8 +23,7 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import SettingError
 from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import PATIENCE
-from sim_fixtures.tally import Histogram, Tally
+from sim_fixtures.serve import PATIENCE, Histogram, Tally
 
 REFRESH: Final = 0.25
 WIDTH: Final = 110
@@ -363,7 +361,7 @@ simulate.__doc__ = HELP
 def _report(served: Served, status: Status, *, json: bool, interrupted: bool) -> None:
     """Print the summary; leave with the exit status that the session has earned."""
     if json:
-        typer.echo(json_format.dumps(_figures(served)))
+        print_json(_figures(served))
     else:
         status.clear()
         typer.echo(printable("\n".join(_sentences(served))))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_module
-
-import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
-from hil.cli.arguments import CampaignArgument, JsonOption
+from hil.cli.arguments import CampaignArgument, JsonOption, print_json
 from hil.terminal_text import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
@@ -28,7 +25,7 @@ def status(
     """
     found = Campaign.open(campaign).status()
     if json:
-        typer.echo(json_module.dumps(found.to_dict()))
+        print_json(found.to_dict())
         return
     console = Console()
     console.print(_table(found))

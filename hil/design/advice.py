@@ -24,7 +24,7 @@ from identification.excitation import (
     midpoints,
     sampled,
 )
-from identification.excitation.collision.built_in import NEAR
+from identification.excitation.collision.scene import NEAR
 from identification.model.motion import Motion
 from planner import Trajectory
 

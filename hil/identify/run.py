@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.conduct import conduct_of
 from hil.campaign.folder import CampaignFolder
+from hil.campaign.status import conduct_of
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter

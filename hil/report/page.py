@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -36,9 +35,9 @@ from hil.report.series import ReportSeries
 from hil.results import (
     ChoiceResult,
     CriteriaResult,
-    ParameterResult,
     RecordedResult,
     Results,
+    outside_mark,
 )
 
 _METHODS: Final = {
@@ -59,7 +58,6 @@ _CRITERIA: Final = (
 )
 _MOST_CANDIDATES: Final = 6
 """Candidates of one choice that are shown: the first, and the best of the others."""
-_WELL, _ROUGHLY = 0.1, 0.5
 _PAIRS: Final = 10
 
 Fact = tuple[str, str]
@@ -96,7 +94,6 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "estimation_facts": estimation_facts(results),
         "criteria": criteria(results),
         "shown_candidates": shown_candidates,
-        "tally": parameters.tally(results),
         "expression": parameters.expression,
         "routes": routes,
         "reported_title": parameters.reported_title(results),
@@ -141,9 +138,8 @@ def trust_context(results: Results) -> dict[str, Any]:
     """What `trust.html.j2` and `consistency.html.j2` need."""
     essential, consistency = results.essential, results.consistency
     return {
-        "trust": trust(results),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
-        "outside_mark": parameters.outside_mark,
+        "outside_mark": outside_mark,
         "elimination_panels": [] if essential is None else elimination_panels(essential),
         "shift_panels": [] if consistency is None else shift_panels(results, consistency),
     }
@@ -279,37 +275,6 @@ def shown_candidates(choice: ChoiceResult) -> list[int]:
     # The first is the simplest, against which the others had to pay: least squares.
     best = sorted(shown[1:], key=lambda k: (k != choice.chosen, errors[k]))
     return [0, *best[: _MOST_CANDIDATES - 1]]
-
-
-@dataclass(frozen=True)
-class Trust:
-    """Parameters of the full model by how well the data determine them."""
-
-    well: list[str]
-    roughly: list[str]
-    hardly: list[str]
-    undetermined: list[str]
-    not_learned: list[str] | None
-    """Of which the nominal figures say more than the data; None without a prior."""
-
-
-def trust(results: Results) -> Trust:
-    """Sort the parameters by relative standard deviation."""
-    found: dict[str, list[str]] = {"well": [], "roughly": [], "hardly": [], "undetermined": []}
-    for parameter in results.parameters:
-        found[_grade(parameter)].append(parameter.name)
-    without_prior = all(parameter.learned is None for parameter in results.parameters)
-    not_learned = [p.name for p in results.parameters if p.learned is False]
-    return Trust(**found, not_learned=None if without_prior else not_learned)
-
-
-def _grade(parameter: ParameterResult) -> str:
-    if parameter.undetermined or not math.isfinite(parameter.std):
-        return "undetermined"
-    size = abs(parameter.estimate)
-    if parameter.std <= _WELL * size:
-        return "well"
-    return "roughly" if parameter.std <= _ROUGHLY * size else "hardly"
 
 
 def when(recorded: Sequence[RecordedResult]) -> str:

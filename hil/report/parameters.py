@@ -14,22 +14,7 @@ from hil.results import ParameterResult, Results
 
 Array = NDArray[np.float64]
 
-# Shares of a normal distribution outside 2 and 3 standard deviations.
-_OUTSIDE_2, _OUTSIDE_3 = 0.045500, 0.002700
 _VISCOUS_UNITS = frozenset({"N·m·s/rad", "N·m/(rad/s)", "N m s/rad", "Nms/rad"})
-
-
-@dataclass(frozen=True)
-class Tally:
-    """How many parameters are where; `expected_*` is what chance alone would give."""
-
-    compared: int
-    outside_2: list[str]
-    outside_3: list[str]
-    expected_2: str
-    expected_3: str
-    not_significant: list[str]
-    total: int
 
 
 @dataclass(frozen=True)
@@ -88,13 +73,6 @@ _SLOTS = {
 }
 
 
-def outside_mark(z: float | None) -> str:
-    """`out3` or `out2` for a deviation beyond 3 or 2 standard deviations; "" for any other."""
-    if z is None or abs(z) <= 2.0:
-        return ""
-    return "out3" if abs(z) > 3.0 else "out2"
-
-
 def expression(p: ParameterResult) -> str:
     """What the name stands for; viscous friction also in the unit that manufacturers print."""
     text = p.expression if p.expression != p.name else ""
@@ -103,24 +81,6 @@ def expression(p: ParameterResult) -> str:
     scale = math.pi / 180.0
     per_degree = f"{numbers.beside(scale * p.estimate, scale * p.std)} N·m per °/s"
     return f"{text}; {per_degree}" if text else per_degree
-
-
-def tally(results: Results) -> Tally:
-    """Count what the table marks."""
-    compared = [(p, z) for p in results.parameters if (z := p.deviation) is not None]
-    return Tally(
-        compared=len(compared),
-        outside_2=[p.label for p, z in compared if abs(z) > 2.0],
-        outside_3=[p.label for p, z in compared if abs(z) > 3.0],
-        expected_2=numbers.fixed(_OUTSIDE_2 * len(compared), 1),
-        expected_3=numbers.fixed(_OUTSIDE_3 * len(compared), 1),
-        not_significant=[
-            p.label
-            for p in results.parameters
-            if not abs(p.estimate) > results.uncertainty.interval_factor * p.std
-        ],
-        total=len(results.parameters),
-    )
 
 
 def routes(results: Results) -> list[Route]:

@@ -28,21 +28,6 @@ _STEERING: Final = re.compile(
 """Control characters, and those that turn the order of the others (Unicode Annex 9)."""
 
 
-class Numbering:
-    """Numbers figures and tables in the order in which the page shows them."""
-
-    def __init__(self) -> None:
-        self._figures, self._tables = itertools.count(1), itertools.count(1)
-
-    def figure(self) -> int:
-        """The next figure's."""
-        return next(self._figures)
-
-    def table(self) -> int:
-        """The next table's."""
-        return next(self._tables)
-
-
 def environment() -> Environment:
     """The templates of the pages: `page.html.j2` is what all of them extend.
 
@@ -60,16 +45,11 @@ def environment() -> Environment:
     )
     style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
     found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
-    found.globals |= {"numbers": numbers, "numbering": Numbering()}
-    for name in (
-        "significant",
-        "fixed",
-        "beside",
-        "percent",
-        "with_std",
-        "unit_text",
-        "capitalised",
-    ):
+    # Figures and tables are numbered in the order in which the page shows them.
+    figures, tables = itertools.count(1), itertools.count(1)
+    numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
+    found.globals |= {"numbers": numbers, "numbering": numbering}
+    for name in _FORMATS:
         found.filters[name] = getattr(numbers, name)
     return found
 

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Final, Protocol
+from typing import Final
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -173,18 +173,6 @@ def far_end_of(cell: Cell) -> str:
     )
 
 
-class Display(Protocol):
-    """Where a screen is drawn."""
-
-    def draw(self, shown: Shown) -> None:
-        """Show it."""
-        ...
-
-    def close(self) -> None:
-        """Leave the terminal as it was."""
-        ...
-
-
 class FullScreen:
     """A terminal's other page, so that the shell's own lines come back at the end."""
 
@@ -235,16 +223,6 @@ class PlainLines:
     def _catch_up(self) -> None:
         while self._unsaid:
             put(self._console, self._unsaid.popleft())
-
-
-class Nothing:
-    """Shows nothing."""
-
-    def draw(self, shown: Shown) -> None:
-        """Show nothing."""
-
-    def close(self) -> None:
-        """Nothing is to be put back."""
 
 
 class ScreenError(RuntimeError):
@@ -400,9 +378,13 @@ class Screen:
         self._undo = contextlib.ExitStack()
         over = threading.Event()
         self._undrawn = self._keyboard = None
+        if self._quiet:
+            return
         if self._full:
             self._keyboard = self._undo.enter_context(Keyboard(self.press))
-        display = self._display()
+            display: FullScreen | PlainLines = FullScreen(self._console)
+        else:
+            display = PlainLines(self._console, self._said)
         thread = threading.Thread(
             target=self._draw, args=(display, over), name="screen", daemon=True
         )
@@ -415,12 +397,7 @@ class Screen:
 
         self._undo.callback(close)
 
-    def _display(self) -> Display:
-        if self._full:
-            return FullScreen(self._console)
-        return Nothing() if self._quiet else PlainLines(self._console, self._said)
-
-    def _draw(self, display: Display, over: threading.Event) -> None:
+    def _draw(self, display: FullScreen | PlainLines, over: threading.Event) -> None:
         try:
             while not over.wait(REFRESH_PERIOD):
                 display.draw(self.shown())

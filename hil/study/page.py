@@ -27,8 +27,9 @@ from hil.report.figures.canvas import (
     place,
     ruled,
 )
+from hil.report.figures.motion import time_panel
 from hil.report.figures.parameters import matrix_panel
-from hil.report.figures.svg import Panel, Plot, Trace, drawing, to_panel, traces_text
+from hil.report.figures.svg import MOST_POINTS, Panel, Plot, Trace, drawing, to_panel
 from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord
@@ -163,39 +164,31 @@ def _example(condition: ConditionResult, example: ExampleRecord, j: int, name: s
     errors = {k: measured - series for k, series in predicted.items()}
     colours = {k: COLOURS[list(labels).index(k) % 4] for k in predicted}
     width = _WIDTH - _LEFT - _RIGHT
+    reach = 1.05 * max(float(np.abs(error).max()) for error in errors.values()) or 1.0
     # A row for each error: where there is noise, one line over another would hide it.
     traces = [Trace(measured, WIDE, 4.0, "measured")]
-    traces += [Trace(series, colours[k], 1.1, labels[k]) for k, series in predicted.items()]
+    traces += [
+        Trace(series, colours[k], 1.1, labels[k], dashed=colours[k] == COLOURS[1])
+        for k, series in predicted.items()
+    ]
     plots = [Plot((_LEFT, 20.0, width, 128.0), "torque [N·m]", traces)] + [
         Plot(
             (_LEFT, 172.0 + 72.0 * row, width, 48.0),
             f"measured − {labels[k]} [N·m]",
             [Trace(error, colours[k], 1.0, labels[k])],
+            reach=reach,
         )
         for row, (k, error) in enumerate(errors.items())
     ]
-    reach = 1.05 * max(float(np.abs(error).max()) for error in errors.values()) or 1.0
-    with drawing():
-        figure = blank(_WIDTH, 188.0 + 72.0 * len(errors))
-        for row, plot in enumerate(plots):
-            axes = place(figure, *plot.box)
-            for one in plot.traces:
-                dashed = row == 0 and one.colour == COLOURS[1]
-                style = (0, (4, 2)) if dashed else "-"
-                axes.plot(time, one.values, color=one.colour, linewidth=one.width, linestyle=style)
-            axes.set_xlim(0.0, float(time[-1]))
-            headed(axes, plot.heading)
-            if row:
-                axes.axhline(0.0, color=MUTED, linewidth=0.8)
-                axes.set_ylim(-reach, reach)
-            ruled(axes, "both", x_ticks=6, y_ticks=3 if row else 4)
-            axes.tick_params(labelbottom=row == len(plots) - 1)
-        footed(axes, "time [s]")
-        rms = ", ".join(
-            f"{labels[k]} {numbers.significant(float(np.sqrt(np.mean(error**2))))}"
-            for k, error in errors.items()
-        )
-        note = f"RMS error {rms} N·m"
-        alt = f"{name}: measured and predicted torque over {time[-1]:.1f} s; {note}."
-        key, text = f"e{condition.key}{j}", traces_text(time, plots)
-        return to_panel(figure, key=key, title=name, note=note, alt=alt, traces=text)
+    rms = ", ".join(
+        f"{labels[k]} {numbers.significant(float(np.sqrt(np.mean(error**2))))}"
+        for k, error in errors.items()
+    )
+    note = f"RMS error {rms} N·m"
+    words = {
+        "key": f"e{condition.key}{j}",
+        "title": name,
+        "note": note,
+        "alt": f"{name}: measured and predicted torque over {time[-1]:.1f} s; {note}.",
+    }
+    return time_panel(188.0 + 72.0 * len(errors), time, plots, MOST_POINTS, **words)

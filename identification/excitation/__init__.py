@@ -1,7 +1,7 @@
 """Choosing motions that excite the parameters: criteria, constraints, searches."""
 
+from identification.excitation.collision.bodies import Box, Wall, Workspace
 from identification.excitation.collision.checker import CollisionChecker, Contact
-from identification.excitation.collision.workspace import Box, Wall, Workspace
 from identification.excitation.constraints import (
     KINDS,
     SAMPLE_PERIOD,
@@ -43,7 +43,7 @@ from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.ledger import Progress
 from identification.excitation.searches.polish import PolishResult, dominating, polish
 from identification.excitation.searches.population import Population
-from identification.excitation.searches.problem import Problem
+from identification.excitation.searches.problem import Method, Problem, Scores, SearchSettings
 from identification.excitation.searches.run import (
     RESCORE_PERIOD,
     Design,
@@ -51,8 +51,6 @@ from identification.excitation.searches.run import (
     search,
 )
 from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
-from identification.excitation.searches.scores import Scores
-from identification.excitation.searches.settings import Method, SearchSettings
 from identification.excitation.sines import SineGenome
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.via_points import ViaPointGenome

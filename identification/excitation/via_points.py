@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
@@ -10,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.genome import between
-from identification.excitation.straight_paths import free_segments, straight_way
 from planner import (
     FourierSeries,
     JointLimits,
@@ -22,6 +22,22 @@ from planner import (
 from planner.arrays import read_only
 
 Array = NDArray[np.float64]
+
+# Spacing [rad] of the postures at which a way is looked at.
+_LOOK_EVERY: Final = 0.1
+
+
+def straight_way(start: Array, end: Array) -> Array:
+    """Return postures (m, n) [rad] on the straight line between two, some 0.1 rad apart."""
+    steps = int(np.ceil(np.max(np.abs(end - start)) / _LOOK_EVERY)) + 1
+    return np.linspace(start, end, steps + 1)
+
+
+def free_segments(checker: CollisionChecker, segments: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return which ways (m_i, n) keep the clearance at every posture, (len(ways),)."""
+    starts = np.cumsum([0, *(len(way) for way in segments[:-1])])
+    return np.logical_and.reduceat(checker.clear(np.concatenate(segments)), starts)
+
 
 # Draws of one via point before the last one is used as it is.
 _DRAWS: Final = 50

@@ -30,7 +30,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.export.urdf import WriteBackError, write_urdf
+from identification.export.urdf import TENSOR, WriteBackError, as_text, rnea, write_urdf
 from identification.export.xml_source import comment_text, with_comment
 from identification.model.elements import TorsionSpring
 from identification.model.friction import Coulomb, Cubic, JointTerm, Kind, Quadratic, Tanh, Viscous
@@ -144,7 +144,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     root = Node("mujoco", model=name)
     _comment(root, remarks)
     _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    _add(root, "option", gravity=_row(model.gravity), timestep=_row(_TIMESTEP),
+    _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(_TIMESTEP),
          integrator="implicitfast")  # fmt: skip
     places = {-1: _add(root, "worldbody")}
     for joint, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
@@ -153,19 +153,25 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         _stick(places[parent], model.chain.translation[joint])
         link = places[joint] = _add(places[parent], "body", name=arm.link(joint), **place)
         six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        _add(link, "inertial", pos=_row(mass.centre), mass=_row(mass.mass), fullinertia=_row(six))
+        _add(
+            link,
+            "inertial",
+            pos=as_text(mass.centre),
+            mass=as_text(mass.mass),
+            fullinertia=as_text(six),
+        )
         friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
         _add(
             link,
             "joint",
             name=joint_name,
             type="hinge" if model.chain.revolute[joint] else "slide",
-            axis=_row(model.chain.axis[joint]),
-            armature=_row(0.0 if coupled[joint] else rotors[joint, joint]),
-            damping=_row(_damping(arm, joint)),
-            frictionloss=_row(max(0.0, friction.get("f0", 0.0))),
-            solreffriction=_row([_FRICTION_TIME, 1.0]),
-            **_if(stiffness != 0.0, stiffness=_row(stiffness), springref=_row(rest)),
+            axis=as_text(model.chain.axis[joint]),
+            armature=as_text(0.0 if coupled[joint] else rotors[joint, joint]),
+            damping=as_text(_damping(arm, joint)),
+            frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
+            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+            **_if(stiffness != 0.0, stiffness=as_text(stiffness), springref=as_text(rest)),
             **_range(ranges, joint),
             **_effort(ranges, joint, "actuatorfrcrange"),
         )
@@ -196,22 +202,28 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         place = _rpy(model.chain.rotation[joint], model.chain.translation[joint])
         _add(link, "pose", relative_to=above).text = place
         inertial = _add(link, "inertial")
-        _nested(inertial, pose=_row([*mass.centre, 0.0, 0.0, 0.0]), mass=_row(mass.mass))
-        tensor = {n: _row(mass.inertia[i, j]) for n, (i, j) in _TENSOR.items()}
+        _nested(inertial, pose=as_text([*mass.centre, 0.0, 0.0, 0.0]), mass=as_text(mass.mass))
+        tensor = {n: as_text(mass.inertia[i, j]) for n, (i, j) in TENSOR.items()}
         _nested(_add(inertial, "inertia"), **tensor)
         kind = "revolute" if model.chain.revolute[joint] else "prismatic"
         node = _add(root, "joint", name=joint_name, type=kind)
         _nested(node, parent=above, child=links[joint])
         axis = _add(node, "axis")
-        _nested(axis, xyz=_row(model.chain.axis[joint]))
+        _nested(axis, xyz=as_text(model.chain.axis[joint]))
         known = {key: float(value[joint]) for key, value in ranges._asdict().items()}
-        _nested(_add(axis, "limit"), **{k: _row(v) for k, v in known.items() if math.isfinite(v)})
+        _nested(
+            _add(axis, "limit"), **{k: as_text(v) for k, v in known.items() if math.isfinite(v)}
+        )
         friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
         _nested(
             _add(axis, "dynamics"),
-            damping=_row(friction.get("f1", 0.0)),
-            friction=_row(max(0.0, friction.get("f0", 0.0))),
-            **_if(stiffness != 0.0, spring_stiffness=_row(stiffness), spring_reference=_row(rest)),
+            damping=as_text(friction.get("f1", 0.0)),
+            friction=as_text(max(0.0, friction.get("f0", 0.0))),
+            **_if(
+                stiffness != 0.0,
+                spring_stiffness=as_text(stiffness),
+                spring_reference=as_text(rest),
+            ),
         )
         for frame, (rotation, translation) in arm.fixed(joint).items():
             fixed = _add(root, "frame", name=frame, attached_to=links[joint])
@@ -405,7 +417,7 @@ def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
     """Torques of a URDF's bodies and damping."""
     model = pinocchio_model(text, arm.model.locked)
     model.gravity.linear = arm.model.gravity
-    return _rnea(model, motion) + np.asarray(model.damping) * motion.velocity
+    return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
 
 
 def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
@@ -429,9 +441,9 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
         x, y, z, *rpy = _figures(links[child], "pose")
         place = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
         places[child] = model.addJoint(places[parent], kind_of(axis), place, joint.get("name"))
-        tensor = [float(_figures(links[child], f"inertial/inertia/{n}")[0]) for n in _TENSOR]
+        tensor = [float(_figures(links[child], f"inertial/inertia/{n}")[0]) for n in TENSOR]
         matrix = np.zeros((3, 3))
-        for (i, j), value in zip(_TENSOR.values(), tensor, strict=True):
+        for (i, j), value in zip(TENSOR.values(), tensor, strict=True):
             matrix[i, j] = matrix[j, i] = value
         centre = _figures(links[child], "inertial/pose")[:3]
         mass = float(_figures(links[child], "inertial/mass")[0])
@@ -441,7 +453,7 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
         for figures, tag in ((damping, "damping"), (stiffness, "spring_stiffness"),
                              (rest, "spring_reference")):  # fmt: skip
             figures.append(float(joint.findtext(f"axis/dynamics/{tag}") or 0.0))
-    torque = _rnea(model, motion) + np.array(damping) * motion.velocity
+    torque = rnea(model, *motion[1:4]) + np.array(damping) * motion.velocity
     return np.asarray(torque + np.array(stiffness) * (motion.position - np.array(rest)))
 
 
@@ -497,20 +509,6 @@ FORMATS: Final[Mapping[str, Format]] = {
 }
 """Formats by name."""
 
-_TENSOR: Final = {
-    "ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2),
-}  # fmt: skip
-
-
-def _rnea(model: pin.Model, motion: Motion) -> Array:
-    data, still = model.createData(), pin.neutral(model)
-    return np.array(
-        [
-            pin.rnea(model, data, pin.integrate(model, still, q), qd, qdd)
-            for q, qd, qdd in zip(*motion[1:4], strict=True)
-        ]
-    )
-
 
 def _damping(arm: Arm, joint: int) -> list[float]:
     """Return the coefficients of v, v |v| and v³."""
@@ -529,14 +527,14 @@ def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
         for k, (own, direction) in enumerate(zip(inertia, directions.T, strict=True)):
             share = np.zeros(len(names))
             share[coupled] = direction
-            rows.append((f"rotors_{k + 1}", share, {"armature": _row(max(0.0, float(own)))}))
+            rows.append((f"rotors_{k + 1}", share, {"armature": as_text(max(0.0, float(own)))}))
     own_friction = arm.friction[len(names) :]
     for motor, share, row in zip(
         friction.motors, friction.motor_speeds(), own_friction, strict=True
     ):
         loss, slope = max(0.0, row.get("f0", 0.0)), row.get("f1", 0.0)
-        figures = {"damping": _row(slope), "frictionloss": _row(loss)}
-        figures["solreffriction"] = _row([_FRICTION_TIME, 1.0])
+        figures = {"damping": as_text(slope), "frictionloss": as_text(loss)}
+        figures["solreffriction"] = as_text([_FRICTION_TIME, 1.0])
         rows.append((f"motor_{motor + 1}", share, figures))
     if not rows:
         return
@@ -544,34 +542,37 @@ def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
     for name, share, figures in rows:
         tendon = _add(tendons, "fixed", name=name, **figures)
         for joint in np.flatnonzero(share):
-            _add(tendon, "joint", joint=names[joint], coef=_row(share[joint]))
+            _add(tendon, "joint", joint=names[joint], coef=as_text(share[joint]))
 
 
 def _stick(parent: Node, end: Array) -> None:
     """Add a stick to a body that shows where its next joint is: no mass, no contact."""
     if np.linalg.norm(end) > _SHORTEST:
-        line = _row([0.0, 0.0, 0.0, *end])
-        _add(parent, "geom", type="capsule", fromto=line, size=_row(_THICKNESS), mass="0",
+        line = as_text([0.0, 0.0, 0.0, *end])
+        _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
              contype="0", conaffinity="0")  # fmt: skip
 
 
 def _pose(rotation: Array, translation: Array) -> dict[str, str]:
-    return {"pos": _row(translation), "xyaxes": _row([*rotation[:, 0], *rotation[:, 1]])}
+    return {
+        "pos": as_text(translation),
+        "xyaxes": as_text([*rotation[:, 0], *rotation[:, 1]]),
+    }
 
 
 def _rpy(rotation: Array, translation: Array) -> str:
-    return _row([*translation, *pin.rpy.matrixToRpy(rotation)])
+    return as_text([*translation, *pin.rpy.matrixToRpy(rotation)])
 
 
 def _range(ranges: Ranges, joint: int) -> dict[str, str]:
     lower, upper = float(ranges.lower[joint]), float(ranges.upper[joint])
     known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
-    return _if(known, range=_row([lower, upper]))
+    return _if(known, range=as_text([lower, upper]))
 
 
 def _effort(ranges: Ranges, joint: int, name: str) -> dict[str, str]:
     most = float(ranges.effort[joint])
-    return _if(math.isfinite(most), **{name: _row([-most, most])})
+    return _if(math.isfinite(most), **{name: as_text([-most, most])})
 
 
 def _if(there: bool, **attributes: str) -> dict[str, str]:
@@ -591,11 +592,6 @@ def _add(parent: Node, tag: str, /, **attributes: str) -> Node:
 def _nested(node: Node, /, **texts: str) -> None:
     for tag, text in texts.items():
         _add(node, tag).text = text
-
-
-def _row(values: float | Sequence[float] | Array) -> str:
-    """Return numbers as the shortest text that is read back as the same ones."""
-    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
 
 
 def _figures(node: Node, path: str) -> Array:

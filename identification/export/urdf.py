@@ -19,7 +19,7 @@ it is returned.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -97,7 +97,7 @@ def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Arr
 
 
 _N_LINK: Final = len(LINK_SYMBOLS)
-_TENSOR: Final = {
+TENSOR: Final = {
     "ixx": (0, 0),
     "ixy": (0, 1),
     "ixz": (0, 2),
@@ -232,8 +232,8 @@ def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]
     turned = turn.T @ of.inertia @ turn
     missing = []
     for name, child, values in (
-        ("origin", origin, {"xyz": _vector(of.centre)}),
-        ("mass", mass, {"value": _number(of.mass)}),
+        ("origin", origin, {"xyz": as_text(of.centre)}),
+        ("mass", mass, {"value": as_text(of.mass)}),
         ("inertia", tensor, _tensor_attributes(turned)),
     ):
         if child is None:
@@ -257,7 +257,7 @@ def _friction_edits(
 ) -> Iterator[Edit]:
     """Set, or put in, damping and dry friction of a joint."""
     values = {
-        attribute: _number(coefficients[symbol])
+        attribute: as_text(coefficients[symbol])
         for symbol, attribute in _DYNAMICS.items()
         if math.isfinite(coefficients.get(symbol, math.nan))
     }
@@ -272,8 +272,8 @@ def _friction_edits(
 
 def _inertial_lines(of: Body) -> list[str]:
     return [
-        _tag("origin", {"xyz": _vector(of.centre), "rpy": "0 0 0"}),
-        _tag("mass", {"value": _number(of.mass)}),
+        _tag("origin", {"xyz": as_text(of.centre), "rpy": "0 0 0"}),
+        _tag("mass", {"value": as_text(of.mass)}),
         _tag("inertia", _tensor_attributes(of.inertia)),
     ]
 
@@ -283,16 +283,13 @@ def _tag(name: str, values: dict[str, str]) -> str:
 
 
 def _tensor_attributes(tensor: Array) -> dict[str, str]:
-    return {name: _number(tensor[place]) for name, place in _TENSOR.items()}
+    return {name: as_text(tensor[place]) for name, place in TENSOR.items()}
 
 
-def _vector(values: Array) -> str:
-    return " ".join(_number(value) for value in values)
-
-
-def _number(value: float) -> str:
-    """Return the shortest text that is read back as the same number."""
-    return repr(float(value) + 0.0)  # no minus in front of zero
+def as_text(values: float | Sequence[float] | Array) -> str:
+    """Return numbers as the shortest text that is read back as the same ones."""
+    # No minus in front of zero.
+    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
 
 
 def _rotation(rpy: str) -> Array:
@@ -406,6 +403,11 @@ def _inverse_dynamics(text: str, model: RobotModel, q: Array, qd: Array, qdd: Ar
     """Return the torques (m, n) that pinocchio finds for a description."""
     arm = pinocchio_model(text, model.locked)
     arm.gravity.linear = model.gravity
+    return rnea(arm, q, qd, qdd)
+
+
+def rnea(arm: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
+    """Return pinocchio's torques (m, n) of a model, for motion arrays (m, n)."""
     data = arm.createData()
     still = pin.neutral(arm)  # joints that turn on and on have two coordinates
     return np.array(

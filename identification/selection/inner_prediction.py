@@ -261,20 +261,16 @@ def choose_settings(
         now = _with(now, left_out=LEFT_OUT[0])
     if "presliding" in questions:
         now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
-    delay: list[Choice] = []
     if "estimator" in questions:
         # The consistent solution is found once: what is compared on the way has to follow the data.
         quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
-    if "delay" in questions:
-        late = [_with(now, torque_delay=delay) for delay in delays]
-        found = trial.decide(DELAY, [now, *late], share=0.0)
-        now, delay = found.settings, [found.choice]
     first = now
     now, choices = _sweep(trial, first, questions)
+    if "delay" in questions:
+        first, now, choices = _with_delay(trial, first, now, choices, questions, delays)
     if "low-pass" in questions:
         now, choices = _with_low_pass(trial, first, now, choices, questions, low_passes)
-    choices = [*delay, *choices]
     # Models with other columns are compared, each with a centre of its own: now it needs one, too.
     trial.renew_centres()
     if "friction" in questions:
@@ -292,6 +288,32 @@ def choose_settings(
     if not math.isfinite(trial.errors(now).overall):
         return start, ()
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
+
+
+def _with_delay(
+    trial: _Trial,
+    first: Settings,
+    now: Settings,
+    choices: list[Choice],
+    questions: Collection[Question],
+    delays: Sequence[float],
+) -> tuple[Settings, Settings, list[Choice]]:
+    """Compensate a delay that was found, where that predicts better.
+
+    All else is chosen anew beside it: presliding, for one, stands in for a part of a delay.
+
+    Returns:
+        The settings before and after the sweep, and its choices.
+    """
+    compared: list[Choice] = []
+    for delay in delays:
+        late = _with(first, torque_delay=delay)
+        swept, behind = _sweep(trial, late, questions)
+        found = trial.decide(DELAY, [now, swept], share=0.0)
+        compared.append(found.choice)
+        if found.choice.chosen:
+            first, now, choices = late, swept, behind
+    return first, now, [*compared, *choices]
 
 
 def _with_low_pass(

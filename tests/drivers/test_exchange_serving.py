@@ -5,8 +5,10 @@ from __future__ import annotations
 import socket
 import time
 
+import numpy as np
 import pytest
 
+from drivers import CyclicPacket, Mode, State
 from drivers.errors import RequestError
 from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
 from drivers.exchange import (
@@ -23,9 +25,9 @@ from drivers.exchange import (
 )
 from drivers.exchange.control import PATIENCE, STALE
 from drivers.exchange.receive_queue import POLL
+from drivers.exchange.rehearsal import Rehearsal, rehearse
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
-from drivers.states import State
-from tests.drivers.rig import N
+from tests.drivers.rig import PERIOD, N, drive_train, limits
 
 STEP = 0.01
 
@@ -284,3 +286,18 @@ class TestWhatIsTold:
         bench.session.counters.discarded = {"late": 4, "answered late": 3}
         bench.serving.conclude()
         assert (bench.control.late, bench.control.answered_late) == (7, 3)
+
+
+@pytest.mark.parametrize("period", [0.001, 0.002])
+def test_it_goes_as_far_as_a_motion_in_open_mode(period):
+    assert rehearse(drive_train(), limits(), period) is State.OPEN
+
+
+def test_it_tells_the_arm_to_stay_in_the_middle_of_its_range():
+    lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
+    rehearsal = Rehearsal(drive_train(), limits(lower=lower, upper=upper), PERIOD)
+    for _ in range(5):
+        answer = CyclicPacket.decode(rehearsal.cycle(), N)
+    assert (answer.axes["mode"] == Mode.POSITION).all()
+    told = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
+    np.testing.assert_allclose(told, 0.5 * (lower + upper), atol=1e-6)

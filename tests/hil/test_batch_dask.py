@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 import subprocess
 import sys
 import time
@@ -39,6 +38,7 @@ from hil.progress import Silent
 from hil.version import install_command
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
+from tests.hil.mcap_bytes import metadata
 from tests.hil.web_folder import served
 
 PATIENCE = 60.0  # s; the machine may be busy
@@ -317,13 +317,8 @@ def _copy_with_mark(source: Path, target: Path, mark: str) -> None:
     for path in sorted(source.rglob("*.mcap")):
         copy = target / path.relative_to(source)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        data = path.read_bytes()
-        name, entries = b"mark", struct.pack("<I", len(mark)) + mark.encode() + bytes(4)
-        body = struct.pack("<I", len(name)) + name + struct.pack("<I", len(entries)) + entries
-        head = len(container.MAGIC)
-        copy.write_bytes(
-            data[:head] + container.RECORD.pack(container.METADATA, len(body)) + body + data[head:]
-        )
+        data, head = path.read_bytes(), len(container.MAGIC)
+        copy.write_bytes(data[:head] + metadata("mark", {mark: ""}) + data[head:])
 
 
 def _figures(result: BatchResult) -> list[tuple[str, tuple[bytes, ...]]]:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import hil as hil_package
 from hil.archive import open_archive
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
@@ -38,7 +39,27 @@ def test_help_says_where_to_start() -> None:
     assert "hil demo" in done.stdout
     for command in COMMANDS:
         assert f" {command} " in done.stdout
-        assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+        asked = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+        assert asked.exit_code == 0
+        assert COMMANDS.purposes[command].replace("`", "") in " ".join(asked.stdout.split())
+
+
+def test_the_package_says_what_its_names_are_for() -> None:
+    assert hil_package.__doc__ is not None
+    for name in hil_package.__all__:
+        assert f"`{name}`" in hil_package.__doc__
+        assert getattr(hil_package, name).__doc__
+
+
+def test_help_imports_no_numerics() -> None:
+    look = "import sys; from hil.cli import app; app(['--help'], standalone_mode=False);"
+    look += "print('loaded', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.partition("loaded ")[2].split())
+    ours = {name for name in loaded if name.split(".")[0] == "hil"}
+    cli = {"hil", "hil.cli", "hil.errors", "hil.importing", "hil.terminal_text", "hil.version"}
+    assert ours == cli
+    assert not {"numpy", "scipy", "pinocchio", "pydantic", "drivers", "planner"} & loaded
 
 
 @pytest.mark.parametrize("arguments", [[], ["run"], ["import", "log"], ["archive", "check"]])

@@ -10,9 +10,9 @@ import pytest
 
 from hil.archive.header import motion_name
 from hil.campaign import Campaign, MotionFailedError
-from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
+from hil.campaign.status import conduct_of
 from hil.campaign.warmup import WarmMotion, WarmUp
 from hil.cell import Cell
 from hil.identify import identify_campaign

@@ -1,46 +1,74 @@
-"""A run: its gates, dry run, warm-up, quality checks, and what a next run takes over."""
+"""A run: gates, dry run, warm-up, quality checks, and what it does not take for granted."""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import shutil
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+import hil.files
 from drivers.transports import SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
-from hil.campaign import Campaign, CampaignFolderError, Link, NotRehearsedError
+from hil.batch.cache import Where
+from hil.batch.discovery import discover
+from hil.campaign import (
+    Campaign,
+    CampaignFolderError,
+    Link,
+    MotionRefusedError,
+    NotRehearsedError,
+    quality,
+)
+from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.dry_run import OVERRIDE, DryRun, agreement
 from hil.campaign.errors import (
     AgainstGravityError,
+    ArmChangedError,
     DryRunError,
     MotionFailedError,
     RepetitionsRejectedError,
 )
+from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.gates import require_rehearsed
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
+from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
+from hil.campaign.status import conduct_of
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
+from hil.cli import app
+from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
+from hil.motion_checks import MotionChecks
+from hil.move import send, straight_way
+from hil.progress import Silent
 from hil.screen.screen import Pace
 from hil.simulation import (
     controller_settings,
     planted_truth,
     simulated_controller,
+    simulated_drive,
     simulated_link,
 )
 from sim_fixtures.controller_faults import Faultable
 from sim_fixtures.fault_script import parse_fault, split_faults
+from tests.hil.batch_workers import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 
 Array = NDArray[np.float64]
@@ -51,16 +79,17 @@ class Person:
     """Somebody at the screen.
 
     Args:
-        accepts: what is answered to a dry run.
         requests: override and hold by what is being run.
+        accepts: what is answered to a dry run.
     """
 
     can_answer = True
 
     def __init__(
         self,
-        accepts: bool = True,
         requests: Callable[[RunStatus], OperatorRequest] = lambda _: OperatorRequest(),
+        *,
+        accepts: bool = True,
     ) -> None:
         self.accepts, self.requests = accepts, requests
         self.seen: list[RunStatus] = []
@@ -70,7 +99,7 @@ class Person:
         self.seen.append(status)
 
     def request(self) -> OperatorRequest:
-        return self.requests(self.seen[-1])
+        return self.requests(self.seen[-1]) if self.seen else OperatorRequest()
 
     def accept_dry_run(self, summary: DryRun) -> bool:
         self.asked.append(summary)
@@ -95,11 +124,15 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, designed: Campaign) ->
 
 @pytest.fixture
 def make(tmp_path: Path, designed: Campaign) -> Make:
-    """A rehearsed campaign of a few seconds, with `[campaign]` changed."""
+    """A rehearsed campaign of a few seconds; of a real arm where that is wanted."""
 
-    def made(*, rehearsed: bool = True, **settings: float) -> Campaign:
+    def made(
+        name: str = "campaign", *, real: bool = False, rehearsed: bool = True, **settings: float
+    ) -> Campaign:
         cell = fast_cell(tmp_path, **{"repetitions": 1, **settings})
-        campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
+        if real:
+            cell = cell.with_link(transport="udp", host="192.0.2.7")
+        campaign = Campaign.create(tmp_path / name, cell, designed.plan)
         if rehearsed:
             pass_rehearsal(campaign.folder)
         return campaign
@@ -107,14 +140,14 @@ def make(tmp_path: Path, designed: Campaign) -> Make:
     return made
 
 
-@dataclass(frozen=True)
 class Push:
     """Somebody leans against the upper arm for 0.1 s."""
 
-    cycle: int
+    def __init__(self, cycle: int, load: float = 0.15) -> None:
+        self.cycle, self._load = cycle, load
 
     def inflict(self, on: Faultable) -> None:
-        on.suffer("load", 1, 0.15, 50)
+        on.suffer("load", 1, self._load, 50)
 
 
 def kinds(result: RunResult) -> list[str]:
@@ -122,8 +155,6 @@ def kinds(result: RunResult) -> list[str]:
 
 
 # --- gates
-
-
 def test_a_plan_is_not_run_before_exactly_it_was_rehearsed(make: Make) -> None:
     campaign = make(rehearsed=False)
     with pytest.raises(NotRehearsedError, match=r"was not rehearsed; run `hil rehearse .*`") as no:
@@ -267,8 +298,6 @@ class TestTimeLeft:
 
 
 # --- what slow torques say
-
-
 def test_a_joint_that_is_mirrored_is_named_and_accepted_by_name_only(
     tmp_path: Path, designed: Campaign
 ) -> None:
@@ -321,8 +350,6 @@ def test_a_torque_is_judged_by_the_weight_beside_friction_and_not_without_any() 
 
 
 # --- quality
-
-
 def test_a_repetition_that_was_slowed_is_rejected_with_its_reason_and_run_again(
     make: Make,
 ) -> None:
@@ -492,8 +519,6 @@ def test_an_amended_archive_keeps_its_content(tmp_path: Path, undisturbed: Campa
 
 
 # --- what a next run takes over
-
-
 def test_an_archive_whose_run_was_killed_before_it_entered_it_is_not_made_again(
     tmp_path: Path, undisturbed: Campaign
 ) -> None:
@@ -517,8 +542,6 @@ def test_an_archive_whose_run_was_killed_before_it_entered_it_is_not_made_again(
 
 
 # --- warm-up
-
-
 def test_the_change_per_motion_is_that_of_the_joint_that_changes_most() -> None:
     k = np.arange(8.0)
     friction = np.column_stack([20.0 * (1.0 - 0.01 * k), np.full(8, 5.0), np.full(8, np.nan)])
@@ -605,3 +628,650 @@ def test_a_damaged_record_of_a_warm_up_or_a_dry_run_is_named(make: Make) -> None
     campaign.folder.warmup.write_text("{}", "utf-8")
     with pytest.raises(CampaignFolderError, match=r"warmup\.json is damaged"):
         campaign.run(unrehearsed=True)
+
+
+# --- What a run does not take for granted: files that were edited, copied, torn or half written
+
+
+class Real:
+    """A link in virtual time that says of itself that it leads to a real arm."""
+
+    only_simulated = False
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+
+@pytest.fixture(scope="module")
+def dry(tmp_path_factory: pytest.TempPathFactory, designed: Campaign) -> Campaign:
+    """A campaign whose dry run is done and accepted, and nothing more; tests copy it."""
+    folder = tmp_path_factory.mktemp("dry")
+    cell = fast_cell(folder, repetitions=1)
+    campaign = Campaign.create(folder / "campaign", cell, designed.plan)
+    pass_rehearsal(campaign.folder)
+    campaign.run(dry_run_only=True, operator=Person())
+    return campaign
+
+
+def copied(campaign: Campaign, to: Path) -> Campaign:
+    shutil.copytree(campaign.folder.root, to)
+    return Campaign.open(to)
+
+
+# --- exactly what was looked at is what is sent
+def test_a_cell_that_is_edited_while_it_is_rehearsed_is_not_rehearsed(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    path = campaign.folder.cell
+
+    class Editing(Silent):
+        def say(self, text: str) -> None:
+            if "as modelled" in text:
+                edited = path.read_text().replace("standstill_s = 0.3", "standstill_s = 0.7")
+                path.write_text(edited)
+
+    with pytest.raises(CampaignFolderError, match=r"cell\.toml was changed after it was read"):
+        campaign.rehearse(reporter=Editing())
+    assert Rehearsal.load(campaign.folder) is None
+
+
+def test_motions_of_a_campaign_in_memory_are_not_sent_once_the_folder_holds_others(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    mine = copied(dry, tmp_path / "campaign")
+    text = mine.folder.cell.read_text().replace("standstill_s = 0.3", "standstill_s = 0.7")
+    mine.folder.cell.write_text(text)
+    mine.folder.seal()
+    pass_rehearsal(mine.folder)
+    with pytest.raises(CampaignFolderError, match=r"cell\.toml was changed after it was read"):
+        mine.run(accept_dry_run=True)
+    assert not list(mine.folder.archives.glob("excitation*"))
+
+
+def test_a_link_to_another_arm_is_refused_and_one_to_the_same_elsewhere_is_not(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    other = campaign.cell.with_values({"limits.velocity_deg": [300.0, 300.0]})
+    with pytest.raises(CampaignFolderError, match=r"opened with another cell \(\[limits\]"):
+        campaign.run(simulated_link(other))
+    there = campaign.cell.with_link(port=4711)
+    assert campaign.run(simulated_link(there)).complete
+
+
+def test_a_mesh_belongs_to_what_was_rehearsed(tmp_path: Path) -> None:
+    folder = CampaignFolder(tmp_path)
+    folder.cell.write_text('[cell]\nname = "a"\nmesh_folders = ["meshes"]\n')
+    folder.urdf.write_text(
+        '<robot name="a"><link name="b"><collision><geometry>'
+        '<mesh filename="package://arm/link.stl"/></geometry></collision></link></robot>'
+    )
+    mesh = tmp_path / "meshes" / "arm" / "link.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.write_bytes(b"a cube")
+    folder.seal()
+    before = folder.plan_hash
+    mesh.write_bytes(b"a larger cube")
+    assert folder.plan_hash != before
+    with pytest.raises(NotRehearsedError, match=r"mesh package://arm/link\.stl is not the one"):
+        folder.require_unchanged()
+    # On another computer, which reads what was recorded, the mesh need not be there.
+    mesh.unlink()
+    assert folder.plan_hash == before
+
+
+# --- gates
+def test_a_dry_run_of_a_simulated_arm_opens_no_gate_to_a_real_one_however_it_came_there(
+    make: Make,
+) -> None:
+    did = make("did", real=True)
+    did.run(
+        simulated_link(did.cell, instead_of_hardware=True), dry_run_only=True, operator=Person()
+    )
+    found = DryRun.load(did.folder)
+    assert found is not None
+    for name, edited in (("copied", found), ("edited", replace(found, simulated=False))):
+        mine = make(name, real=True)
+        edited.accepted_now().save(mine.folder.dry_run)
+        with pytest.raises(DryRunError, match="was not done"):
+            mine.run(Real(simulated_link(mine.cell, instead_of_hardware=True)))
+        step = mine.status().steps[2]
+        assert (step.name, step.state) == ("dry run", "next")
+        assert "does not count" in step.sentence
+        assert not list(mine.folder.archives.iterdir())
+
+
+@pytest.mark.parametrize("said", [{"operator": "me"}, {"simulated": "no"}, None])
+def test_the_link_says_which_kind_of_arm_moved_whatever_the_caller_says(
+    make: Make, monkeypatch: pytest.MonkeyPatch, said: dict[str, str] | None
+) -> None:
+    campaign = make(real=True)
+    twin = simulated_link(campaign.cell, instead_of_hardware=True)
+    if said is None:  # as of a version that left it to the caller
+        monkeypatch.setattr("hil.campaign.run.provenance_of", lambda *_, **__: {})
+    campaign.run(twin, provenance=said, dry_run_only=True)
+    monkeypatch.undo()
+    first = next(campaign.folder.archives.iterdir())
+    kind = open_archive(first, fields=()).header.entries.get("simulated")
+    assert kind == (None if said is None else "yes")
+    real = Real(simulated_link(campaign.cell, instead_of_hardware=True))
+    with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
+        campaign.run(real, dry_run_only=True)
+    assert DryRun.that_counts(
+        campaign.folder, plan_hash=campaign.folder.plan_hash, motions=2, simulated=False
+    ) is None  # fmt: skip
+
+
+def test_a_dry_run_whose_archives_are_gone_or_that_is_of_an_older_version_does_not_count(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    gone = copied(dry, tmp_path / "gone")
+    next(gone.folder.archives.glob("dryrun*")).unlink()
+    with pytest.raises(DryRunError, match="was not done"):
+        gone.run()
+    old = copied(dry, tmp_path / "old")
+    text = old.folder.dry_run.read_text().replace('"format_version": 2', '"format_version": 1')
+    old.folder.dry_run.write_text(text)
+    with pytest.raises(CampaignFolderError, match="format version 1"):
+        old.run()
+
+
+def peak_speed(campaign: Campaign, name: str) -> Array:
+    """Of a motion, as a share of the joints' speed limits (n,)."""
+    commanded = open_archive(campaign.folder.archives / name).columns["commanded_position"]
+    commanded = commanded[~np.isnan(commanded).any(axis=1)]
+    speed = np.abs(np.diff(commanded, axis=0)).max(axis=0) / campaign.cell.period
+    return np.asarray(speed / campaign.cell.joint_limits.velocity)
+
+
+def test_a_way_that_nobody_has_watched_is_gone_no_faster_than_a_dry_run(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    """The arm was jogged elsewhere since; `approach_speed` of this cell is full speed."""
+    campaign = copied(dry, tmp_path / "campaign")
+    elsewhere = campaign.cell.with_values({"simulation.initial_deg": [70.0, -70.0]})
+    result = campaign.run(simulated_link(elsewhere))
+    ways = [name for name in result.archives if name.startswith("move")]
+    assert len(ways) >= 2
+    for name in ways:
+        assert peak_speed(campaign, name).max() <= OVERRIDE * 1.001
+
+
+def test_the_controllers_own_figures_do_not_replace_those_that_were_checked(
+    tmp_path: Path, designed: Campaign
+) -> None:
+    wrong = designed.cell.with_values({"drive_train.gear_ratio": [101.0, -80.0]})
+    campaign = Campaign.create(tmp_path / "campaign", wrong, designed.plan)
+    pass_rehearsal(campaign.folder)
+    controller = simulated_controller(designed.cell)
+    link = Link.over(
+        SimulatedTransport(controller), campaign.cell, controller.finish, accept_init=True
+    )
+    with pytest.raises(NotRehearsedError, match=r"this link uses the controller's .*rehearse"):
+        campaign.run(link, accept_dry_run=True)
+    assert not list(campaign.folder.archives.iterdir())
+    flag = CliRunner().invoke(app, ["run", str(campaign.folder.root), "--accept-init"])
+    assert flag.exit_code == 2
+
+
+def to_one_that_announces(campaign: Campaign, old: str, new: str) -> Link:
+    """A link to a simulated controller whose own cell file differs in one line."""
+    assert old in campaign.cell.text
+    text = campaign.cell.text.replace(old, new)
+    other = Cell.from_texts(text, campaign.cell.urdf, campaign.cell.path)
+    controller = simulated_controller(other)
+    return Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+
+
+CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "told"),
+    [
+        (CURRENT, MotionRefusedError,
+         r"motor of shoulder: \S+ A, .*controller announces 3 A .*cell file says 20 A: write"),
+        (("following_error = [1.0, 1.0]", "following_error = [1.0, 0.01]"), NotRehearsedError,
+         r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
+        (("cycle_ms = 2", "cycle_ms = 1"), ControllerFault,
+         r"cycle is 1 ms in the controller, 2 ms in the cell; correct the cell file, or the c\w+$"),
+    ],
+)  # fmt: skip
+def test_what_the_controller_announces_is_looked_at_before_anything_moves(
+    tmp_path: Path, dry: Campaign, line: tuple[str, str], error: type[HilError], told: str
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    before = sorted(campaign.folder.archives.iterdir())
+    with pytest.raises(error, match=told):
+        campaign.run(to_one_that_announces(campaign, *line))
+    assert sorted(campaign.folder.archives.iterdir()) == before
+
+
+def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [30.0, 13.0]")
+    assert campaign.run(link, dry_run_only=True).dry_run == "accepted"
+    link.connect(Stop())
+    checks = MotionChecks.of(campaign.cell)
+    assert checks_in_force(campaign.cell, link.connection, checks) is checks
+
+
+def test_a_narrower_limit_that_every_motion_keeps_is_told(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [19.5, 12.0]")
+    (note,) = [one for one in campaign.run(link).notes if "limits" in one]
+    assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
+
+
+def test_a_single_way_keeps_the_current_limit_that_the_controller_announces(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    cell = dry.cell
+    link = to_one_that_announces(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
+    way = straight_way(cell, link.connect(Stop()), cell.home)
+    with pytest.raises(MotionRefusedError, match=r"the way .*announces 0\.5 A"):
+        send(way, cell, link, tmp_path / "move.mcap", stop=Stop())
+    assert not (tmp_path / "move.mcap").exists()
+
+
+def test_what_a_warm_up_sends_is_checked_in_the_run_that_sends_it(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make(warmup_drift=0.9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+    next(campaign.folder.archives.glob("validation*")).unlink()
+    campaign.folder.warmup.unlink()
+    checked: list[object] = []
+    refusal = MotionChecks.refusal
+
+    def spied(checks: MotionChecks, motion: Any) -> str | None:
+        checked.append(motion)
+        return refusal(checks, motion)
+
+    monkeypatch.setattr(MotionChecks, "refusal", spied)
+    assert "warmup" in kinds(campaign.run(unrehearsed=True))
+    assert any(motion is campaign.plan.excitation.trajectory for motion in checked)
+
+
+def test_a_rehearsal_on_other_gears_than_the_cell_files_opens_no_gate(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make()
+    campaign.folder.rehearsal.unlink()
+    stop = Stop()
+
+    class Stopping(Silent):
+        def say(self, text: str) -> None:
+            stop.requested = stop.requested or "what the model leaves out" in text
+
+    drive = simulated_drive(campaign.cell)
+    with pytest.raises(OperatorStopError):
+        campaign.rehearse(drive=drive, stop=stop, reporter=Stopping())
+    found = campaign.folder.rehearsed.rglob("manifest.json")
+    assert {path.parent.parent.name for path in found} == {"other_drive"}, "never gone on with"
+
+    from hil.campaign import rehearsal_run
+
+    passed = make("passed")
+    good = Rehearsal.load(passed.folder)
+    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: good)
+    assert campaign.rehearse(drive=drive) is good
+    assert Rehearsal.load(campaign.folder) is None
+
+
+def test_a_plan_that_failed_with_another_seed_passes_and_says_so(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hil.campaign import rehearsal_run
+
+    campaign = make()
+    good = Rehearsal.load(campaign.folder)
+    pass_rehearsal(campaign.folder, passed=False)
+    assert good is not None
+    other = good.model_copy(update={"seed": 7})
+    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: other)
+    told = "passed with seed 7, but failed with seed 1"
+    assert told in campaign.rehearse(seed=7).line
+    assert told in campaign.rehearse(seed=7, again=True).line, "nor is it forgotten"
+    assert told in campaign.status().steps[1].sentence
+    assert any(told in note for note in campaign.run(dry_run_only=True).notes)
+    assert any(told in one for one in conduct_of(campaign.folder).steps[0].details)
+
+
+def without_last(content: dict[str, Any]) -> None:
+    content["criteria"].pop()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: content.update(passed="yes"),
+        lambda content: content.update(criteria=[]),
+        lambda content: content["criteria"][2].update(passed=False),
+        lambda content: content.update(format_version=7),
+        without_last,
+    ],
+)
+def test_a_rehearsal_passed_only_if_each_of_its_criteria_did(
+    tmp_path: Path, dry: Campaign, edit: Callable[[dict[str, Any]], None]
+) -> None:
+    folder = CampaignFolder(tmp_path)
+    content = json.loads(dry.folder.rehearsal.read_text())
+    content["plan_hash"] = folder.plan_hash
+    folder.rehearsal.write_text(json.dumps(content))
+    require_rehearsed(folder)
+    edit(content)
+    folder.rehearsal.write_text(json.dumps(content))
+    with pytest.raises(CampaignFolderError, match=r"rehearsal\.json cannot be read"):
+        require_rehearsed(folder)
+
+
+def test_one_damaged_archive_is_left_out_and_its_motion_made_again(
+    tmp_path: Path, dry: Campaign
+) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    first = campaign.folder.archives / campaign.folder.manifest()[0].name
+    first.write_bytes(first.read_bytes()[:50])
+    assert campaign.run().complete
+
+
+# --- quality
+class Killed(BaseException):
+    """A run dies."""
+
+
+def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
+    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = make(repetitions=2)
+
+    def slow_second(status: RunStatus) -> OperatorRequest:
+        return OperatorRequest(0.5 if (status.phase, status.number) == ("repetition", 2) else 1.0)
+
+    def dies(*_: object) -> None:
+        raise Killed
+
+    monkeypatch.setattr(quality, "amend_outcome", dies)
+    with suppress(Killed):
+        campaign.run(operator=Person(slow_second), unrehearsed=True)
+    monkeypatch.undo()
+    slowed = campaign.folder.archives / "excitation_001_a1.mcap"
+    outcome = open_archive(slowed, fields=()).outcome
+    assert outcome is not None and outcome.outcome == "completed"
+    found = discover([str(campaign.folder.root)], Where(str(tmp_path / "cache")), Here())
+    assert slowed.as_posix() not in {ref.location for ref in found.refs}
+    (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
+    assert "not named in its campaign's manifest.json" in told.reason
+    good = campaign.folder.completed("excitation")
+    doubts = gather_sources([*good, slowed], 0.5).warnings
+    assert any(doubt.startswith(f"{slowed.name} is not named") for doubt in doubts)
+    again = campaign.run(unrehearsed=True)
+    assert again.repetitions == (2, 2)
+    assert [one.archive for one in again.rejected] == [slowed.name], "judged by the next run"
+
+
+def run_pushed(campaign: Campaign, *faults: Push) -> RunResult:
+    """A run during which the arm is leant against."""
+    controller = simulated_controller(campaign.cell, faults=list[Any](faults))
+    link = Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+    return campaign.run(link, unrehearsed=True, durable=False)
+
+
+def middle_of(campaign: Campaign, archive: str) -> int:
+    """The cycle in the middle of a motion."""
+    found = open_archive(campaign.folder.archives / archive, fields=["cycle"])
+    return int(np.mean(found.columns["cycle"][[0, -1]]))
+
+
+def test_a_first_repetition_that_was_touched_does_not_spoil_all_others(make: Make) -> None:
+    undisturbed = finished(make("undisturbed"))
+    campaign = make(repetitions=3)
+    result = run_pushed(campaign, Push(middle_of(undisturbed, "excitation_000_a1.mcap")))
+    assert result.complete
+    assert [one.archive for one in result.rejected] == [
+        "excitation_001_a1.mcap", "excitation_001_a2.mcap", "excitation_000_a1.mcap"
+    ]  # fmt: skip
+    assert "agree with each other, not with this" in result.rejected[2].reason
+    assert any("excitation_000_a1.mcap was the only repetition" in note for note in result.notes)
+    good = [path.name for path in campaign.folder.completed("excitation")]
+    assert good == ["excitation_000_a2.mcap", "excitation_001_a3.mcap", "excitation_002_a1.mcap"]
+    touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
+    assert touched.outcome is not None and touched.outcome.outcome == "rejected"
+    assert not campaign.folder.damaged()
+
+
+class Drag(Push):
+    """From a cycle on something drags on the upper arm for good."""
+
+    def inflict(self, on: Faultable) -> None:
+        on.suffer("load", 1, self._load, 10**9)
+
+
+def test_an_arm_that_is_changed_in_mid_campaign_stops_it_and_outvotes_nobody(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=3)).folder.archives
+    third = open_archive(undisturbed / "excitation_002_a1.mcap", fields=["cycle"])
+    campaign = make(repetitions=3)
+    with pytest.raises(ArmChangedError) as changed:
+        run_pushed(campaign, Drag(int(third.columns["cycle"][0]) - 1, load=0.05))
+    assert changed.value.exit_code == 5
+    assert changed.value.reference == ("excitation_000_a1.mcap", "excitation_001_a1.mcap")
+    assert changed.value.later == tuple(f"excitation_002_a{k}.mcap" for k in (1, 2, 3))
+    for part in ("excitation_001_a1.mcap", "excitation_002_a3.mcap", "current of shoulder"):
+        assert part in str(changed.value)
+    good = [path.name for path in campaign.folder.completed("excitation")]
+    assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is judged anew"
+
+
+@pytest.mark.slow
+def test_two_first_repetitions_that_were_touched_differently_are_left_out(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=2))
+    first, second = (middle_of(undisturbed, f"excitation_00{n}_a1.mcap") for n in (0, 1))
+    campaign = make(repetitions=3)
+    result = run_pushed(campaign, Push(first), Push(second, load=-0.1))
+    assert result.complete
+    assert [one.archive for one in result.rejected] == [
+        "excitation_001_a1.mcap", "excitation_001_a2.mcap", "excitation_001_a3.mcap",
+        "excitation_000_a1.mcap",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_minority_that_agrees_does_not_outvote_those_that_count(make: Make) -> None:
+    undisturbed = finished(make("undisturbed", repetitions=3))
+    campaign = make(repetitions=3)
+    cycle = middle_of(undisturbed, "excitation_002_a1.mcap")
+    length = cycle - middle_of(undisturbed, "excitation_001_a1.mcap")
+    result = run_pushed(campaign, Push(cycle), Push(cycle + length))
+    assert result.complete
+    rejected = [one.archive for one in result.rejected]
+    assert rejected == ["excitation_002_a1.mcap", "excitation_002_a2.mcap"]
+
+
+def finished(campaign: Campaign) -> Campaign:
+    campaign.run(unrehearsed=True, durable=False)
+    return campaign
+
+
+def slowed_once(phase: str) -> Person:
+    """Somebody who slows motions of a kind until one is rejected for it."""
+
+    def requests(status: RunStatus) -> OperatorRequest:
+        told = any("rejected" in note for note in status.notes)
+        return OperatorRequest(0.5 if status.phase == phase and not told else 1.0)
+
+    return Person(requests)
+
+
+def test_a_repetition_that_somebody_slowed_is_no_attempt_while_he_has_let_go(make: Make) -> None:
+    campaign = make(bad_repetitions=0)
+    result = campaign.run(operator=slowed_once("repetition"), unrehearsed=True)
+    assert result.complete
+    assert len(result.rejected) == 1
+    kept = make("kept", bad_repetitions=0)
+    with pytest.raises(RepetitionsRejectedError, match="of no use 1 time,"):
+        kept.run(operator=Person(lambda status: OperatorRequest(0.5)), unrehearsed=True)
+
+
+def test_a_script_that_slows_each_repetition_for_a_moment_does_not_move_the_arm_for_ever(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.campaign.runner.MOST_BY_HAND", 2)
+    monkeypatch.setattr("hil.campaign.steering.SHOWN_EVERY", 0.0)
+    campaign, stop = make(), Stop()
+
+    def at_its_begin(status: RunStatus) -> OperatorRequest:
+        stop.requested = len(list(campaign.folder.archives.glob("excitation*"))) > 4
+        done = None if status.motion is None else status.motion.motion_time
+        begins = status.phase == "repetition" and done is not None and done < 0.5
+        return OperatorRequest(0.5 if begins else 1.0)
+
+    with pytest.raises(RepetitionsRejectedError, match=r"of no use 2 times.* held or slowed"):
+        campaign.run(operator=Person(at_its_begin), stop=stop, unrehearsed=True)
+
+
+# --- warm-up
+def rested(campaign: Campaign, seconds: float) -> None:
+    """The arm moved last so many seconds ago."""
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    replace(found, moved_at=time.time() - seconds).save(campaign.folder.warmup)
+
+
+def test_warmth_is_told_by_what_was_written_down_and_not_by_the_times_of_files(make: Make) -> None:
+    campaign = make(warmup_drift=0.9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+
+    def again(file_times: float) -> list[str]:
+        next(campaign.folder.archives.glob("validation*")).unlink()
+        for path in campaign.folder.archives.iterdir():
+            os.utime(path, (file_times, file_times))
+        return kinds(campaign.run(unrehearsed=True))
+
+    assert "warmup" not in again(time.time() - 10.0 * COLD_AFTER), "it moved a moment ago"
+    rested(campaign, -3600.0)
+    assert "warmup" in again(time.time()), "a clock was put back"
+
+
+@pytest.mark.parametrize("when", ["before", "held"])
+def test_an_arm_that_rests_for_hours_in_mid_campaign_is_warmed_up_anew(
+    make: Make, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """Between two repetitions, or while a person holds the next one before it begins."""
+    campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
+    passed = [0.0]
+    monkeypatch.setattr("hil.campaign.warmup.time.time", lambda: clock() + passed[0])
+
+    class Leaves(Person):
+        def show(self, status: RunStatus) -> None:
+            super().show(status)
+            second = (status.phase, status.number) == ("repetition", 2)
+            if second if when == "held" else any("good" in note for note in status.notes):
+                passed[0] = 2.0 * 3600.0
+
+    result = campaign.run(operator=Leaves(), unrehearsed=True)
+    assert result.complete
+    made = [kind for kind in kinds(result) if kind in ("warmup", "excitation")]
+    cold = ["excitation"] if when == "held" else []
+    assert made == [*["warmup"] * 4, "excitation", *cold, *["warmup"] * 4, "excitation"]
+    assert len(result.rejected) == len(cold)
+    assert any("rested for 120 min during the campaign" in note for note in result.notes)
+
+
+def test_a_warm_up_motion_that_was_slowed_tells_nothing_of_friction(make: Make) -> None:
+    campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
+    result = campaign.run(operator=slowed_once("warm-up"), unrehearsed=True)
+    assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    assert [one.archive for one in found.motions] == [
+        "warmup_000_a2.mcap", "warmup_001_a1.mcap", "warmup_002_a1.mcap"
+    ]  # fmt: skip
+    assert any("not warm" in note for note in result.notes)
+
+
+def test_a_warm_up_motion_whose_run_was_killed_before_it_was_noted_is_not_made_again(
+    make: Make,
+) -> None:
+    campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
+    campaign.run(unrehearsed=True)
+    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    assert found is not None
+    entries = json.loads((campaign.folder.root / "manifest.json").read_text())
+    later = ("warmup_002", "standstill", "excitation", "validation", "move_001")
+    entries["archives"] = [e for e in entries["archives"] if not e["name"].startswith(later)]
+    (campaign.folder.root / "manifest.json").write_text(json.dumps(entries))
+    for path in campaign.folder.archives.glob("*"):
+        if path.name.startswith(later[1:]):
+            path.unlink()
+    replace(found, motions=found.motions[:2], outcome="going on").save(campaign.folder.warmup)
+    result = campaign.run(unrehearsed=True)
+    assert result.adopted == ("warmup_002_a1.mcap",)
+    assert "warmup" not in kinds(result)
+    assert result.warm_up == "not warm"
+
+
+# --- folder, disk, and the person who stops
+def test_whoever_looks_whether_a_run_is_at_work_keeps_none_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.campaign.folder.LOCK_PATIENCE", 30.0)
+    folder = CampaignFolder(tmp_path)
+    lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
+    fcntl.flock(lock, fcntl.LOCK_SH)
+    assert not folder.busy
+    threading.Timer(0.1, os.close, [lock]).start()
+    with folder.locked():
+        assert folder.busy
+
+
+@pytest.mark.parametrize("name", ["dry_run.json", "warmup.json"])
+def test_a_disk_that_refuses_is_told_and_gone_on_with(
+    make: Make, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    drift = 1e-9 if name == "warmup.json" else 0.0
+    campaign = make(warmup_drift=drift, warmup_least=3, warmup_most=3)
+    write = hil.files._write_through
+
+    def full(path: Path, content: str | bytes) -> None:
+        if path.name.startswith(name):
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(hil.files, "_write_through", full)
+    with pytest.raises(OutputError, match=rf"{name} cannot be written \(No space left"):
+        campaign.run(accept_dry_run=True)
+    monkeypatch.undo()
+    again = campaign.run(accept_dry_run=True)
+    assert again.complete
+    assert "dryrun" not in kinds(again)
+
+
+def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) -> None:
+    campaign = copied(dry, tmp_path / "campaign")
+    found = DryRun.load(campaign.folder)
+    assert found is not None
+    replace(found, accepted=None).save(campaign.folder.dry_run)
+    stop = Stop()
+
+    class Leaves(Person):
+        def accept_dry_run(self, summary: DryRun) -> bool:
+            stop.requested = True
+            return False
+
+    with pytest.raises(OperatorStopError, match="is not accepted") as stopped:
+        campaign.run(operator=Leaves(), stop=stop)
+    assert stopped.value.exit_code == 130
+
+
+def test_recordings_of_a_real_arm_without_a_dry_run_are_not_told_to_be_in_order(
+    make: Make,
+) -> None:
+    campaign = make(real=True)
+    link = simulated_link(campaign.cell, instead_of_hardware=True)
+    campaign.run(link, unrehearsed=True)
+    step = campaign.status().steps[2]
+    assert (step.name, step.state) == ("dry run", "next")

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel
+from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.collision.workspace import Workspace
 from identification.excitation.constraints import (
     KINDS,
     Constraints,

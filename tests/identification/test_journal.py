@@ -27,7 +27,7 @@ from identification.excitation import (
     ViaPointGenome,
 )
 from identification.excitation.searches.journal import digest
-from identification.excitation.searches.scores import ROW, unplanned
+from identification.excitation.searches.problem import ROW, unplanned
 from planner.worker import load, pack
 from tests.identification.searching import LIMITS, URDF, problem
 

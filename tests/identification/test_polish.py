@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from identification.excitation.constraints import KINDS
 from identification.excitation.searches.polish import dominating, generation_size, polish
+from identification.excitation.searches.problem import Scores, unplanned
 from identification.excitation.searches.scale import Scale
-from identification.excitation.searches.scores import Scores, unplanned
 
 N = 12
 TARGET = np.linspace(0.2, 0.8, N)
@@ -289,7 +289,7 @@ def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index,
 ON_ITS_OWN = """
 import numpy as np
 from identification.excitation.searches.polish import polish
-from identification.excitation.searches.scores import Scores, unplanned
+from identification.excitation.searches.problem import Scores, unplanned
 
 class Bowl:
     def score(self, genes):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner import FourierSeries, plan
-from planner.path_reader import PathReader
+from planner.player import PathReader
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,7 @@ from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.far_end import UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Request
-from sim_fixtures.tally import Tally
+from sim_fixtures.serve import Request, Tally
 from tests.process_death.product import ArchivedSoFar, listening
 from tests.process_death.rounds import Round
 

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim_fixtures import Plant, PlantDiverged, PlantTruth, SettingError, ns16
+from sim_fixtures import (
+    ElasticPlant,
+    Plant,
+    PlantDiverged,
+    PlantTruth,
+    SettingError,
+    UnmodelledEffects,
+    ns16,
+)
+from sim_fixtures.arm import WARM_UP_TIME, FrictionDrift, TorqueRipple
+from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
 
 Array = NDArray[np.float64]
 START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
@@ -227,3 +240,185 @@ def test_links_have_the_planted_share_of_the_inertia_of_the_urdf(truth: PlantTru
         np.testing.assert_allclose(
             body.toDynamicParameters(), factor * own.toDynamicParameters(), rtol=1e-12, atol=1e-14
         )
+
+
+def test_nothing_is_on_unless_asked_for() -> None:
+    none = UnmodelledEffects()
+    assert (none.torque_ripple, none.friction_drift, none.delay) == (0.0, 0.0, 0.0)
+    assert not none.is_elastic
+
+
+def test_the_cell_file_documents_the_default_sizes(cell: dict[str, Any]) -> None:
+    sizes = UnmodelledEffects.default_sizes(6)
+    planted = cell["simulation"]
+    assert sizes.torque_ripple == planted["torque_ripple"]
+    assert sizes.friction_drift == planted["friction_drift"]
+    assert sizes.elasticity == tuple(planted["elasticity"])
+    assert sizes.delay == planted["delay"]
+
+
+def test_ripple_repeats_twice_per_motor_turn_with_the_stated_amplitude() -> None:
+    ripple = TorqueRipple(np.array([5.0, 2.0]), np.random.default_rng(1))
+    turns = np.linspace(0.0, 1.0, 401)
+    torque = np.array([ripple.torque([t, t]) for t in turns])
+    np.testing.assert_allclose(np.abs(torque).max(axis=0), [5.0, 2.0], rtol=1e-3)
+    np.testing.assert_allclose(torque[:201], torque[200:], atol=1e-9)
+    np.testing.assert_allclose(torque[:-1].mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_friction_falls_from_cold_to_hot_by_the_stated_share() -> None:
+    drift = FrictionDrift(0.08, 2)
+    cold = drift.scale(np.zeros(2), 0.001)
+    np.testing.assert_allclose(cold, 1.04, rtol=1e-6)
+    previous = cold
+    for _ in range(3000):  # half an hour; one joint races, the other rests
+        factor = drift.scale(np.array([1e6, 0.0]), 6.0)
+        assert factor[0] <= previous[0]
+        previous = factor
+    np.testing.assert_allclose(factor, [0.96, 1.04], rtol=1e-4)
+
+
+def test_a_joint_warms_up_in_ten_minutes() -> None:
+    drift = FrictionDrift(0.1, 1)
+    factor = drift.scale(np.array([1e9]), 0.0)
+    for _ in range(round(WARM_UP_TIME)):
+        factor = drift.scale(np.array([1e9]), 1.0)
+    assert factor[0] == pytest.approx(1.05 - 0.1 * (1.0 - np.exp(-1.0)), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"torque_ripple": -0.1},
+        {"delay": float("nan")},
+        {"friction_drift": 1.0},
+        {"elasticity": (1e-6, -1e-6)},
+    ],
+)
+def test_impossible_sizes_are_refused(sizes: dict[str, Any]) -> None:
+    with pytest.raises(SettingError):
+        UnmodelledEffects(**sizes)
+
+
+SOFT = (1.0e-6, 1.0e-6, 2.5e-6, 0.0, 0.0, 0.0)
+
+
+def elastic(truth: PlantTruth, compliance: tuple[float, ...] = SOFT) -> ElasticPlant:
+    return ElasticPlant(ns16.urdf_text(), truth, elasticity=compliance, step=STEP, position=START)
+
+
+def test_springs_carry_gravity_from_the_start(truth: PlantTruth) -> None:
+    plant = elastic(truth)
+    gravity = pin.computeGeneralizedGravity(plant.model, plant.model.createData(), START)
+    np.testing.assert_allclose(plant.motor_position - START, gravity * SOFT, atol=1e-15)
+    for _ in range(200):
+        plant.step(gravity, STEP)
+    np.testing.assert_allclose(plant.position, START, atol=1e-9)
+
+
+def test_only_elastic_axes_deflect(truth: PlantTruth) -> None:
+    plant = elastic(truth)
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        plant.step(rng.normal(size=6) * 300.0, STEP)
+    stretch = plant.motor_position - plant.position
+    np.testing.assert_array_equal(stretch[3:], 0.0)
+    assert np.all(np.abs(stretch[:3]) > 1e-6)
+
+
+def test_a_stiff_gear_is_a_rigid_one(truth: PlantTruth) -> None:
+    stiff = elastic(truth, (5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0))
+    rigid = Plant(ns16.urdf_text(), truth, position=START)
+    for k in range(1000):
+        torque = np.array([900.0, -300.0, 0.0, 5.0, 15.0, 8.0]) * np.sin(0.01 * k)
+        stiff.step(torque, STEP)
+        rigid.step(torque, STEP)
+    assert np.abs(rigid.velocity).max() > 0.3
+    np.testing.assert_allclose(stiff.velocity, rigid.velocity, atol=2e-2)
+    np.testing.assert_allclose(stiff.position, rigid.position, atol=2e-3)
+
+
+def test_damped_springs_lose_energy_and_never_gain_it(frictionless: PlantTruth) -> None:
+    plant = elastic(frictionless)
+    start = plant.energy()
+    energies = []
+    for _ in range(2000):
+        plant.step(np.zeros(6), STEP)
+        energies.append(plant.energy())
+    assert plant.velocity @ plant.velocity > 1.0  # it did swing
+    assert max(energies) < start + 0.01  # J; of some hundred in motion
+    assert start - 20.0 < energies[-1] < start
+
+
+def test_a_struck_link_rings_at_the_frequency_of_its_spring(truth: PlantTruth) -> None:
+    """Motor held by its brake, link free: an oscillator with the link's own inertia."""
+    plant = ElasticPlant(
+        ns16.urdf_text(), truth, elasticity=(1e-6, 0.0, 0.0, 0.0, 0.0, 0.0), step=STEP,
+        position=START, brake_torque=1e5,
+    )  # fmt: skip
+    plant.close_brakes(True)
+    plant.set_state(START, [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    swing = []
+    for _ in range(1000):
+        plant.step(np.zeros(6), STEP)
+        swing.append(plant.position[0] - START[0])
+    inertia = pin.crba(plant.model, plant.model.createData(), START)[0, 0]
+    crossings = np.nonzero(np.diff(np.sign(swing)) != 0)[0]
+    period = 2.0 * np.mean(np.diff(crossings)) * STEP
+    assert 2.0 * np.pi / period == pytest.approx(np.sqrt(1e6 / inertia), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("compliance", "message"),
+    [
+        ((0.0,) * 6, "compliances"),
+        ((1e-6,) * 5, "compliances"),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 1e-8), "resonances below"),
+    ],
+)
+def test_springs_that_cannot_be_integrated_are_refused(
+    truth: PlantTruth, compliance: tuple[float, ...], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        elastic(truth, compliance)
+
+
+def random_inverse_inertia(rng: np.random.Generator, n: int) -> Array:
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.1 * np.eye(n)
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 6), push=st.floats(0.01, 100.0))
+def test_friction_holds_what_it_can_and_opposes_what_slides(seed: int, n: int, push: float) -> None:
+    rng = np.random.default_rng(seed)
+    inverse = random_inverse_inertia(rng, n)
+    coulomb = rng.uniform(0.0, 50.0, n) * rng.integers(0, 2, n)
+    free = STEP * push * rng.normal(size=n)
+    guess = rng.uniform(-60.0, 60.0, n)
+    result = resolve_dry_friction(free.tolist(), inverse, coulomb.tolist(), STEP, guess.tolist())
+    velocity, torque = np.array(result.velocity), np.array(result.torque)
+
+    slack = 10.0 * TOLERANCE * (coulomb.max() + 1.0)
+    assert np.all(np.abs(torque) <= coulomb)
+    sliding = velocity != 0.0
+    np.testing.assert_allclose(torque[sliding], (coulomb * np.sign(velocity))[sliding], atol=slack)
+    # momentum: what friction did not take away is still there
+    balance = free - STEP * inverse @ torque - velocity
+    np.testing.assert_allclose(balance, 0.0, atol=STEP * np.abs(inverse).sum() * slack)
+
+
+def test_a_joint_slides_on_when_its_coulomb_torque_grows_a_little() -> None:
+    """A guess just short of the bound must not pass for a torque that holds."""
+    result = resolve_dry_friction([1.0], np.eye(1), [10.0 * (1.0 + 1e-9)], STEP, [10.0])
+    assert result.velocity[0] > 0.9
+
+
+def test_without_friction_nothing_changes() -> None:
+    result = resolve_dry_friction([0.3, -0.2], np.eye(2), [0.0, 0.0], STEP, [5.0, -5.0])
+    assert result.velocity == [0.3, -0.2]
+    assert result.torque == [0.0, 0.0]
+
+
+def test_friction_never_pushes_a_joint_backwards() -> None:
+    result = resolve_dry_friction([0.001, -0.002], np.eye(2), [100.0, 100.0], STEP, [0.0, 0.0])
+    assert result.velocity == [0.0, 0.0]

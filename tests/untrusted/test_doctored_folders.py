@@ -16,11 +16,11 @@ import pytest
 
 from hil.archive import ArchiveName, Samples, open_archive, write_samples
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.conduct import conduct_of
 from hil.campaign.dry_run import Acceptance, DryRun, GravityCheck
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.quality import Played
 from hil.campaign.rehearsal import Criterion, Rehearsal
+from hil.campaign.status import conduct_of
 from hil.campaign.warmup import FrictionMeter, WarmUp
 from hil.errors import ArchiveError, HilError, InputError
 from identification import IdentificationError

@@ -31,8 +31,15 @@ class CanError(TransportError):
         self.reason = reason
         self.remedy = remedy
 
-    def __reduce__(self) -> tuple[type[CanError], tuple[object, ...]]:
-        return type(self), (self.reason, self.remedy)
+    def __reduce__(self) -> tuple[object, ...]:
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(kind: type[CanError], args: tuple[object, ...], state: dict[str, object]) -> CanError:
+    """An error as it was, whatever its constructor takes."""
+    error = kind.__new__(kind, *args)
+    vars(error).update(state)
+    return error
 
 
 class CanAxesError(CanError):
@@ -40,9 +47,6 @@ class CanAxesError(CanError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason, "the profile carries one to six axes of arm 1; use UDP")
-
-    def __reduce__(self) -> tuple[type[CanAxesError], tuple[object, ...]]:
-        return type(self), (self.reason,)
 
 
 class CanBusLoadError(CanError):
@@ -63,10 +67,6 @@ class CanBusLoadError(CanError):
         self.load = load
         self.limit = limit
         self.period = period
-        self._frames = frames
-
-    def __reduce__(self) -> tuple[type[CanBusLoadError], tuple[object, ...]]:
-        return type(self), (self.load, self.limit, self.period, self._frames)
 
 
 class CanModeError(CanError):
@@ -81,9 +81,6 @@ class CanModeError(CanError):
         super().__init__(reason, "the profile moves axes in modes 4, 5 and 7; use UDP for others")
         self.mode = mode
         self.slot = slot
-
-    def __reduce__(self) -> tuple[type[CanModeError], tuple[object, ...]]:
-        return type(self), (self.mode, self.slot, self.reason)
 
 
 class CanValueError(CanError):
@@ -103,7 +100,3 @@ class CanValueError(CanError):
         self.field = field
         self.slot = slot
         self.value = value
-        self._held = held
-
-    def __reduce__(self) -> tuple[type[CanValueError], tuple[object, ...]]:
-        return type(self), (self.field, self.slot, self.value, self._held)

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from drivers.errors import TransportClosed
 from drivers.packets import Mode
 from drivers.transports.base import TransportError
-from drivers.transports.can.bus import open_bus
+from drivers.transports.can.bus import Port, open_bus
 from drivers.transports.can.bus_load import BusRates, ProfileName
 from drivers.transports.can.ends import PcEnd
 from drivers.transports.can.errors import CanAxesError, CanError, CanModeError
 from drivers.transports.can.layout import MAX_AXES
-from drivers.transports.can.port import Port
 
 _WITHIN_THIS_PROCESS: Final = "virtual"
 """python-can's bus that no other program can open."""

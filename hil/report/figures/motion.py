@@ -65,7 +65,7 @@ def _excitation(series: ReportSeries, time: Array, j: int, name: str) -> Panel:
         _plot(122.0, 78.0, "velocity [rad/s]", [Trace(velocity, SECOND, 1.5, "v")], shaded),
     )
     words = {"key": f"x{j}", "title": name, "note": note, "alt": alt}
-    return _panel(240.0, time, plots, _POINTS, **words)
+    return time_panel(240.0, time, plots, _POINTS, **words)
 
 
 def torque_panels(series: ReportSeries, errors: Sequence[TorqueError]) -> list[Panel]:
@@ -87,7 +87,7 @@ def _torque(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Pa
         _plot(172.0, 50.0, f"measured − predicted [{joint.unit}]", error, shaded),
     )
     words = {"key": f"t{j}", "title": joint.joint, "note": joint.words, "alt": alt}
-    return _panel(262.0, time, plots, MOST_POINTS, **words)
+    return time_panel(262.0, time, plots, MOST_POINTS, **words)
 
 
 PARTS: Final = (
@@ -119,7 +119,7 @@ def _split(series: ReportSeries, time: Array, j: int, joint: TorqueError) -> Pan
     shaded = _left_out(time, series.example_used, j)
     plot = _plot(20.0, 140.0, f"torque [{joint.unit}]", lines, shaded)
     words = {"key": f"g{j}", "title": joint.joint, "note": note, "alt": alt}
-    return _panel(200.0, time, (plot,), _POINTS, **words)
+    return time_panel(200.0, time, (plot,), _POINTS, **words)
 
 
 def _plot(
@@ -129,7 +129,9 @@ def _plot(
     return Plot((_LEFT, top, _INNER, height), heading, traces, shaded=shaded)
 
 
-def _panel(height: float, time: Array, plots: Sequence[Plot], points: int, **words: str) -> Panel:
+def time_panel(
+    height: float, time: Array, plots: Sequence[Plot], points: int, **words: str
+) -> Panel:
     """Plots over the same time, one above the other, with their samples to zoom into."""
     with drawing():
         figure = blank(_WIDTH, height)
@@ -138,7 +140,15 @@ def _panel(height: float, time: Array, plots: Sequence[Plot], points: int, **wor
             for stretch in plot.shaded:
                 axes.axvspan(*stretch, color=BAND, linewidth=0.0, zorder=0.5)
             for trace in plot.traces:
-                _line(axes, time, trace.values, trace.colour, trace.width)
+                axes.plot(
+                    *thinned(time, trace.values),
+                    color=trace.colour,
+                    linewidth=trace.width,
+                    linestyle=(0, (4, 2)) if trace.dashed else "-",
+                    solid_joinstyle="round",
+                )
+            if plot.reach is not None:
+                axes.set_ylim(-plot.reach, plot.reach)
             headed(axes, plot.heading)
             _zero_line(axes, plot)
         _time_axes(all_axes, time)
@@ -151,10 +161,6 @@ def _zero_line(axes: Axes, plot: Plot) -> None:
     highest = max(float(np.max(trace.values)) for trace in plot.traces)
     if lowest < 0.0 < highest:
         axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
-
-
-def _line(axes: Axes, time: Array, values: Array, color: str, width: float) -> None:
-    axes.plot(*thinned(time, values), color=color, linewidth=width, solid_joinstyle="round")
 
 
 def _time_axes(all_axes: Sequence[Axes], time: Array) -> None:

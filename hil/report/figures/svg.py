@@ -179,12 +179,14 @@ class Trace:
         colour: of the palette.
         width: of the line [px].
         name: what it is, in a word.
+        dashed: so that two of a colour's lightness differ in print.
     """
 
     values: Array
     colour: str
     width: float
     name: str
+    dashed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +199,7 @@ class Plot:
         traces: its lines, the lowest first.
         limits: values at which dashed lines are drawn.
         shaded: stretches of time [s] that are shaded, from the first instant on.
+        reach: largest value of a range about zero; the range of the lines if None.
     """
 
     box: tuple[float, float, float, float]
@@ -204,6 +207,7 @@ class Plot:
     traces: Sequence[Trace]
     limits: Sequence[float] = ()
     shaded: Sequence[tuple[float, float]] = ()
+    reach: float | None = None
 
 
 def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS) -> str:

@@ -9,13 +9,17 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.built_in import BuiltIn, exceptions
-from identification.excitation.collision.gaps import touch_between
-from identification.excitation.collision.near import Near, Touch, bulges_of, what_is_near
+from identification.excitation.collision.bodies import Workspace
+from identification.excitation.collision.gaps import (
+    Near,
+    Touch,
+    bulges_of,
+    touch_between,
+    what_is_near,
+)
 from identification.excitation.collision.poses import joint_poses
-from identification.excitation.collision.scene import Path, Scene
+from identification.excitation.collision.scene import BuiltIn, Path, Scene, exceptions
 from identification.excitation.collision.separation import Indices
-from identification.excitation.collision.workspace import Workspace
 from identification.excitation.joint_limits import rate_bounds
 from identification.model.motion import Motion
 from planner import FourierSeries, JointLimits, PiecewiseCubic

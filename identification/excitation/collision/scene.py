@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import coal
 import numpy as np
@@ -12,14 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import link_bodies, obstacles, withdrawn
-from identification.excitation.collision.built_in import (
-    SLACK,
-    BuiltIn,
-    always_close,
-    never_clear,
-    random_postures,
-)
+from identification.excitation.collision.bodies import Workspace, link_bodies, obstacles, withdrawn
 from identification.excitation.collision.curvature import Curvature, carrier
 from identification.excitation.collision.poses import (
     Bodies,
@@ -30,12 +23,59 @@ from identification.excitation.collision.poses import (
     turning,
 )
 from identification.excitation.collision.separation import Indices, Separation
-from identification.excitation.collision.workspace import Workspace
 from identification.excitation.errors import PostureError
 from identification.model.kinematics import Chain, chain_from_urdf
 from planner import JointLimits
 
 Array = NDArray[np.float64]
+
+
+# Shapes that are closer than the margin, and than this [m], in all postures tried are built that
+# way; a wider margin must not check less.
+NEAR: Final = 0.05
+# A foot's distance from what it stands in changes by this [m] at most.
+STILL: Final = 0.002
+# A link that never keeps the margin keeps the farthest distance that was tried, less this [m].
+SLACK: Final = 0.005
+_N_POSTURES = 200
+_SEED = 20140901
+# Ranges below this [rad, m] count as ranges that nobody gave.
+_NO_RANGE = 1e-6
+
+
+class BuiltIn(NamedTuple):
+    """Two shapes that are not checked against each other, because they are always too close.
+
+    Attributes:
+        first, second: the shapes' names (of a link: those that pinocchio gives them, the link's
+            with a number), or an obstacle's.
+        nearest, farthest: their distance in the postures tried [m], negative where they overlap.
+    """
+
+    first: str
+    second: str
+    nearest: float
+    farthest: float
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second} ({self.nearest:.3f} to {self.farthest:.3f} m)"
+
+
+def exceptions(built_in: Sequence[BuiltIn], narrowed: Sequence[BuiltIn]) -> str | None:
+    """Return the sentence that says what is not checked, or with less than the margin."""
+    sentences = []
+    if built_in:
+        pairs = "; ".join(map(str, built_in))
+        sentences.append(
+            f"not checked for collisions, always too close by the way the arm is built: {pairs}"
+        )
+    if narrowed:
+        pairs = "; ".join(map(str, narrowed))
+        sentences.append(
+            f"checked with the largest distance that the mounting leaves instead of the margin:"
+            f" {pairs}"
+        )
+    return "; ".join(sentences) or None
 
 
 class Path(NamedTuple):
@@ -97,7 +137,7 @@ class Scene:
         pairs = [
             (a, b)
             for a, b in combinations(range(len(self._bodies)), 2)
-            if a < len(links) and self._joints_apart(a, b) > (0 if b >= len(links) else 1)
+            if a < len(links) and self.joints_apart(a, b) > (0 if b >= len(links) else 1)
         ]
         self.separation = Separation(self._bodies, pairs)
         self._tried = random_postures(model, limits)
@@ -183,10 +223,10 @@ class Scene:
             a, b = self.indices(pair)
             names = self._bodies[a].shape_name, self._bodies[b].shape_name
             plane = self._bodies[b].normal is not None
-            if (always := always_close(tried, pair, self.margin)) is not None:
+            if (always := tried.always_close(pair)) is not None:
                 left_out.append(BuiltIn(*names, *always))
                 continue
-            if plane and (range_ := never_clear(tried, pair, self.margin)) is not None:
+            if plane and (range_ := tried.never_clear(pair)) is not None:
                 narrowed.append(BuiltIn(*names, *range_))
                 self._bodies.append(
                     withdrawn(self._bodies[b], self.margin - narrowed[-1].farthest + SLACK)
@@ -207,15 +247,11 @@ class Scene:
         distances = np.min([tried.distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
 
-    def joints_between(self, pair: int) -> int:
-        """Count the joints between the bodies of a pair."""
-        return self._joints_apart(*self.indices(pair))
-
     def with_obstacle(self, pair: int) -> bool:
         """Whether the second body of a pair is an obstacle."""
         return bool(self.separation.second[pair] >= self._n_links)
 
-    def _joints_apart(self, a: int, b: int) -> int:
+    def joints_apart(self, a: int, b: int) -> int:
         """Count the joints between two bodies."""
         trunks = [
             set(self._chain.ancestors(joint)) if joint >= 0 else set()
@@ -230,15 +266,75 @@ class _Tried:
     def __init__(self, scene: Scene, path: Path) -> None:
         self._scene, self._path = scene, path
         self._samples = np.arange(len(path.q))
-        self.joints_between, self.with_obstacle = scene.joints_between, scene.with_obstacle
-
-    def lower_bounds(self, pair: int) -> Array:
-        pairs = np.full(len(self._samples), pair)
-        return self._scene.separation.bound(self._path.bodies, pairs, self._samples)[0]
+        self._near = min(scene.margin, NEAR)
 
     def distances(self, pair: int) -> Array:
+        """Return the distances of a pair in the postures tried (k,) [m]."""
         samples = self._samples.tolist()
         return np.array([self._scene.distance(pair, self._path, k) for k in samples])
+
+    def always_close(self, pair: int) -> tuple[float, float] | None:
+        """Return nearest and farthest distance [m] of a pair that is built in, else None.
+
+        Two links: two joints apart at most, and too close in every posture. An obstacle and a
+        shape of the first link, which can but turn in it: too close at the same distance in every
+        posture; one that comes nearer and goes farther is checked along the motion.
+        """
+        obstacle = self._scene.with_obstacle(pair)
+        found = self._near_always(pair, 1 if obstacle else 2)
+        if found is None or not found[1] < self._near:
+            return None
+        return None if obstacle and not found[1] - found[0] <= STILL else found
+
+    def never_clear(self, pair: int) -> tuple[float, float] | None:
+        """Return nearest and farthest distance [m] of a link that never keeps a plane's margin.
+
+        It is one of the two links next to the mounting, such as an upper arm whose shoulder turns
+        close above the floor; in some postures it does not touch.
+        """
+        found = self._near_always(pair, 2)
+        return found if found is not None and SLACK < found[1] < self._near else None
+
+    def _near_always(self, pair: int, most_joints: int) -> tuple[float, float] | None:
+        """Return the range of the distance [m] of a pair that may be near in every posture."""
+        scene = self._scene
+        if scene.joints_apart(*scene.indices(pair)) > most_joints:
+            return None
+        pairs = np.full(len(self._samples), pair)
+        if not np.all(
+            scene.separation.bound(self._path.bodies, pairs, self._samples)[0] < self._near
+        ):
+            return None
+        distances = self.distances(pair)
+        return float(distances.min()), float(distances.max())
+
+
+def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
+    """Return postures within limits, half a turn to either side where there are none (k, n).
+
+    Args:
+        model: the arm.
+        limits: in use; None for those of the description, where none given means 0 to 0.
+    """
+    lower, upper = _described(model) if limits is None else (limits.lower, limits.upper)
+    range_ = upper - lower
+    # Written so that what is no number or infinite counts as no limit.
+    limited = (range_ > _NO_RANGE) & (range_ < 2.0 * np.pi)
+    lower, upper = np.where(limited, lower, -np.pi), np.where(limited, upper, np.pi)
+    shares = np.random.default_rng(_SEED).random((_N_POSTURES, model.nv))
+    postures: Array = lower + shares * (upper - lower)
+    return postures
+
+
+def _described(model: pin.Model) -> tuple[Array, Array]:
+    """Return the limits of a description, (n,) each; 0 for joints that turn without end."""
+    lower, upper = np.zeros((2, model.nv))
+    for joint in range(1, model.njoints):
+        if model.joints[joint].nq == 1:  # one without end counts as two numbers in pinocchio
+            index, limit = model.joints[joint].idx_v, model.joints[joint].idx_q
+            lower[index] = model.lowerPositionLimit[limit]
+            upper[index] = model.upperPositionLimit[limit]
+    return lower, upper
 
 
 def _length(chain: Chain) -> float:

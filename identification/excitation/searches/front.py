@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from identification.excitation.searches.scale import Scale
 
 if TYPE_CHECKING:
-    from identification.excitation.searches.scores import Scores
+    from identification.excitation.searches.problem import Scores
 
 Array = NDArray[np.float64]
 

@@ -30,9 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.errors import ForeignJournalError, JournalError
-from identification.excitation.searches.problem import Problem
-from identification.excitation.searches.scores import ROW, Scores
-from identification.excitation.searches.settings import SearchSettings
+from identification.excitation.searches.problem import ROW, Problem, Scores, SearchSettings
 from identification.model.robot import RobotModel
 
 # Another release of any of these may draw or compute something else.

@@ -12,7 +12,7 @@ from identification.excitation.errors import NoFeasibleMotionError
 from identification.excitation.searches.front import Front
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import Population
-from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.problem import Scores
 from identification.excitation.violation import KINDS, Violation
 
 Array = NDArray[np.float64]

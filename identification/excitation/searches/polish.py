@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from identification.excitation.searches.population import CHUNK
 
 if TYPE_CHECKING:
+    from identification.excitation.searches.problem import Scores
     from identification.excitation.searches.scale import Scale
-    from identification.excitation.searches.scores import Scores
 
 Array = NDArray[np.float64]
 Fitness = Callable[["Scores"], Array]

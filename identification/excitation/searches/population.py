@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
-from identification.excitation.searches.problem import Problem, unplannable
-from identification.excitation.searches.scores import Scores, unplanned
+from identification.excitation.searches.problem import Problem, Scores, unplannable, unplanned
 from identification.excitation.violation import Violation
 from planner import (
     FourierSeries,

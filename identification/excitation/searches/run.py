@@ -32,9 +32,8 @@ from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.ledger import Ledger, Phase, Progress
 from identification.excitation.searches.polish import dominating, polish
 from identification.excitation.searches.population import Population
+from identification.excitation.searches.problem import Scores, SearchSettings
 from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
-from identification.excitation.searches.scores import Scores
-from identification.excitation.searches.settings import SearchSettings
 from identification.excitation.violation import KINDS
 from planner import FourierSeries, PiecewiseCubic
 

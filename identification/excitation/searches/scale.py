@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from identification.excitation.errors import DesignError
 
 if TYPE_CHECKING:
-    from identification.excitation.searches.scores import Scores
+    from identification.excitation.searches.problem import Scores
 
 Array = NDArray[np.float64]
 
