@@ -284,7 +284,9 @@ class MotionExecution(Execution):
             SourceFailed: the source cannot go on from there.
         """
         try:
-            cast(CarriedSource, self._source).go_on_from(position, velocity, cycles)
+            # What the guard checks against is not the source's to change.
+            source = cast(CarriedSource, self._source)
+            source.go_on_from(position.copy(), velocity.copy(), cycles)
         except BaseException as error:
             raise _failed("cannot go on", error, cycle) from error
 

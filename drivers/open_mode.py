@@ -30,6 +30,10 @@ SPREAD: Final = 2
 """Cycles for each step that a controller made by itself in which the motion returns to its path.
 Where the motion accelerates, each step leaves the velocity of one cycle of that acceleration across
 the path; so spread it is half of that acceleration, within the bounds of a stop."""
+RETURN: Final = 0.03
+"""s that this takes at most, and jerk has no bound. A path that the controller left for longer than
+half of it bends so little, at less than 10 rad/s² within 1e-3 rad, that spread no further it is
+well within those bounds; and nothing goes on beside the path for as long as a gap may last."""
 
 
 class OpenMode(ABC):
@@ -282,6 +286,8 @@ class PositionMode(OpenMode):
         if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
+        # One that is reported late is further on by now.
+        target = target + self._history.lag * velocity[0]
         ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
@@ -291,9 +297,10 @@ class PositionMode(OpenMode):
         step = velocity[0] if moves else step
         position = self.held + self._wire.joint_difference(target - self._sent)
         speed = self._wire.joint_difference(step) / self._guard.period
-        execution.go_on_from(position, speed, SPREAD * steps, cycle)
-        self._guard.go_on_from(position, speed, SPREAD * steps)
-        self._history.begin(target)
+        spread = min(SPREAD * steps, round(RETURN / self._guard.period))
+        execution.go_on_from(position, speed, spread, cycle)
+        self._guard.go_on_from(position, speed, spread)
+        self._history.go_on_from(target, step)
         self.held, self._sent = position, target
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:

@@ -44,6 +44,7 @@ class SentSetPoints:
 
     Attributes:
         again: the controller did not accept the last one: it is to be sent once more.
+        lag: cycles that the controller is known to report its target late.
     """
 
     def __init__(self, guard: Guard, depth: int) -> None:
@@ -55,7 +56,7 @@ class SentSetPoints:
         self._back = np.arange(depth + 1)
         self._ahead = np.arange(1.0, depth)[:, None]
         self._newest = 0
-        self._lag = 0
+        self.lag = 0
         self._repeated = 0
         self._unsure = False
         self.again = False
@@ -64,8 +65,15 @@ class SentSetPoints:
     def begin(self, target: Array) -> None:
         """The first set-point (n,) was sent, the target received."""
         self._sent[...] = target
-        self._lag = self._repeated = 0
+        self.lag = self._repeated = 0
         self._unsure = self.again = False
+
+    def go_on_from(self, target: Array, step: Array) -> None:
+        """The controller carried on to this target (n,) by this step (n,); as late as before."""
+        self._sent[(self._newest - self._back) % len(self._sent)] = (
+            target - self._back[:, None] * step
+        )
+        self._repeated, self._unsure, self.again = 0, False, False
 
     def repeat(self) -> None:
         """The last set-point was sent once more."""
@@ -112,8 +120,8 @@ class SentSetPoints:
         if np.abs(target - newest).max() <= standstill:
             # Where hardly anything moves, a target reported late looks the same.
             step = np.abs(newest - sent[self._newest - 1]).max()
-            if self._lag and not self._repeated and step > standstill:
-                self._lag = 0
+            if self.lag and not self._repeated and step > standstill:
+                self.lag = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
         carried = newest + self._ahead[:missed] * (newest - rows[1])
@@ -126,10 +134,10 @@ class SentSetPoints:
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
-        more = max(0, lag - self._lag)
+        more = max(0, lag - self.lag)
         known_late = stopping and self._unsure
         if not more or known_late or np.abs(newest - rows[1]).max() <= SLOW * standstill:
-            self._lag = lag
+            self.lag = lag
             return 0 if known_late else more
         self.again = True
         if self._repeated >= REPETITIONS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from math import ceil, isfinite
+from math import ceil, isfinite, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -325,13 +325,13 @@ class TrajectoryPlayer:
         self._offset = self._offset + self._near(here, point)
         self._last = position
         self._tabled = False
-        rate = max(0.0, float(velocity @ speed) / square)
-        self._law.restart(s, rate)
+        rate, stopping = max(0.0, float(velocity @ speed) / square), self._allowed["stop"]
+        # What slows down goes on so: begun anew after each of many gaps, it would never be at rest.
+        slope = max(min(self._law.slope, 0.0), -sqrt(2.0 * stopping.change * rate))
+        self._law.restart(s, rate, slope)
         shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
         self._across = list(shares * (velocity - rate * speed))
-        self._law.aim(
-            0.0 if self._held or self._stopping else self._override, self._allowed["stop"]
-        )
+        self._law.aim(0.0 if self._held or self._stopping else self._override, stopping)
         self._ramp = self._bounds = "stop"
         self._finished = self._stopping and self._law.settled
 

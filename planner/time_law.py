@@ -128,9 +128,12 @@ class TimeLaw:
         self._period = period
         self.restart(0.0, 1.0)
 
-    def restart(self, motion_time: float, rate: float) -> None:
-        """Go on from a motion time [s] at a constant rate, whatever was before."""
-        self.motion_time, self.rate, self.slope = motion_time, rate, 0.0
+    def restart(self, motion_time: float, rate: float, slope: float = 0.0) -> None:
+        """Go on from a motion time [s] at a constant rate, whatever was before.
+
+        A slope [1/s] is where the next `aim` begins.
+        """
+        self.motion_time, self.rate, self.slope = motion_time, rate, slope
         self._follow(ramp(rate, 0.0, rate, RateBounds(1.0, 1.0)))
 
     def aim(self, target: float, bounds: RateBounds) -> None:

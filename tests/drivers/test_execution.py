@@ -328,6 +328,19 @@ class TestBelief:
         first, second = begun(source).advance(1)[:2]
         assert first.dtype == second.dtype == np.float64
 
+    def test_where_the_controller_carried_it_is_not_its_own_to_change(self):
+        """The guard checks the next set-point against it."""
+        source, position, velocity = Motion(), HERE.copy(), np.ones(N)
+
+        def go_on_from(position, velocity, cycles):
+            position += 1.0
+            velocity *= 2.0
+
+        source.go_on_from = go_on_from
+        begun(source).go_on_from(position, velocity, 6, 1)
+        assert np.array_equal(position, HERE)
+        assert np.array_equal(velocity, np.ones(N))
+
     @pytest.mark.parametrize("kind", [Motion, Correction])
     def test_what_it_raises_is_why_it_failed(self, kind):
         source = kind()

@@ -18,6 +18,7 @@ from drivers import (
     State,
 )
 from drivers.guard import LAG
+from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
     PERIOD,
     START,
@@ -31,6 +32,9 @@ from tests.drivers.rig import (
     still,
 )
 
+PLANNED = {
+    name: getattr(limits(), name) for name in ("lower", "upper", "velocity", "acceleration", "jerk")
+}
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
 
@@ -167,6 +171,50 @@ class TestLongGaps:
         rig, source, _ = self.after_gap(3, change)
         assert rig.state is State.OPEN
         assert source.stops == 1
+
+    @pytest.mark.parametrize(("missed", "cycles"), [(3, 6), (7, 14), (8, 15), (400, 15)])
+    def test_jerk_has_no_bound_for_30_ms_at_most(self, missed, cycles):
+        """However far a controller carried the motion on, by the steps it had."""
+        rig, source = moving_at(0.1)
+        spread = []
+
+        def go_on_from(position, velocity, cycles):
+            source._position = position
+            spread.append(cycles)
+
+        source.go_on_from = go_on_from
+        rig.miss(missed)
+        rig.axes["d"][:, 0] += missed * rig.axes["d"][:, 1]
+        rig.axes["d"][:, 2] = rig.axes["d"][:, 0]
+        rig.cycle()
+        assert spread == [cycles]
+        assert rig.state is State.OPEN
+
+    @pytest.mark.parametrize("late", [0, 1, 2])
+    def test_a_target_reported_late_is_further_on_by_now(self, late):
+        """The set-point after the gap is one step from where the controller has its target."""
+        path = plan([START, START + MOVE * 6.0], JointLimits(**PLANNED))
+        rig = Rig()
+        rig.session.request(TrajectoryPlayer(path, PERIOD, JointLimits(**PLANNED)))
+        rig.open()
+        targets, d = [rig.axes["d"][:, 0].copy()] * 4, rig.axes["d"]
+
+        def report():
+            now, before = targets[-1 - late], targets[-2 - late]
+            d[:, 0], d[:, 1] = now, now - before
+            d[:, 2], d[:, 3] = targets[-1], targets[-1] - targets[-2]
+
+        for _ in range(200):
+            report()
+            targets.append(rig.cycle().axes["d"][:, 0].copy())
+        step = targets[-1] - targets[-2]
+        rig.miss(5)
+        targets += [targets[-1] + ahead * step for ahead in range(1, 6)]
+        for _ in range(3):
+            report()
+            targets.append(rig.cycle().axes["d"][:, 0].copy())
+        np.testing.assert_allclose(np.diff(targets[-5:], axis=0), [step] * 4, rtol=0.02, atol=1e-5)
+        assert rig.state is State.OPEN
 
     def test_a_short_gap_is_bridged_even_so(self):
         rig, source, _ = self.after_gap(2, self.held)

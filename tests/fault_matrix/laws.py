@@ -120,7 +120,7 @@ def _broken_bounds(rows: NDArray[np.void], carried: int) -> Iterator[str]:
     for order, (bound, factor) in enumerate(zip(bounds, _STOP_FACTORS, strict=True), start=1):
         rates = np.abs(np.diff(q, order, axis=0)) / PERIOD**order
         # The controller's own steps have no acceleration: it comes back in a few cycles.
-        free = 2 * carried + 2 if carried and order == 3 else 0
+        free = min(2 * carried, round(0.03 / PERIOD)) + 2 if carried and order == 3 else 0
         rate = rates[free:].max(axis=0, initial=0.0)
         if np.any(rate > bound * factor * (1.0 + 1e-5)):
             yield f"derivative {order} of the set-points is {rate}, allowed is {bound * factor}"

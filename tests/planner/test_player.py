@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -320,6 +321,29 @@ class TestCarriedOn:
         assert np.all(np.abs(acceleration) <= 2.0 * six_axis_limits.acceleration * (1 + 1e-6))
         planned = motions[2].sample(np.arange(0.0, player.duration, 1e-4))[0]
         assert cKDTree(planned).query(given)[0].max() < 2e-3
+
+    @pytest.mark.parametrize("k", [3, 5])
+    def test_gap_after_gap_it_is_at_rest_as_many_set_points_later(self, k, six_axis_limits):
+        """Else somebody's stop would be void on a link that answers every fourth packet."""
+        cruise = replace(six_axis_limits, velocity=np.full(6, 0.5))
+        line = plan([np.zeros(6), np.full(6, 1.8)], cruise)
+
+        def set_points_to_rest(gaps):
+            player = TrajectoryPlayer(line, PERIOD, six_axis_limits)
+            player.begin(player.start)
+            before, last = ([player.advance()[0] for _ in range(int(0.2 / PERIOD))])[-2:]
+            player.stop()
+            count = 0
+            while not player.finished:
+                if gaps:
+                    step = last - before
+                    last = last + k * step
+                    player.go_on_from(last, step / PERIOD, 2 * k)
+                before, last = last, player.advance()[0]
+                count += 1
+            return count
+
+        assert set_points_to_rest(True) <= 2 * set_points_to_rest(False)
 
     def test_brought_to_rest_it_stays_there(self, carried):
         player, last, step = carried

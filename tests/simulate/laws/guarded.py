@@ -42,6 +42,8 @@ _LEAP: Final = 0.25
 """Share that the controller's target may ever be off the set-point sent last."""
 _SPREAD: Final = 2
 """Cycles per packet missed in which a motion comes back to its path (`drivers.open_mode`)."""
+_RETURN: Final = 0.03
+"""s that this takes at most."""
 _ORDERS: Final = ("velocity", "acceleration", "jerk")
 
 
@@ -140,7 +142,7 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
     before = np.zeros((3, 1)) + held[:1]
     if stretch.carried:
         # Steps without acceleration: the motion comes back to its own within a few cycles.
-        factors[: _SPREAD * stretch.carried + 2, 2] = np.inf
+        factors[: min(_SPREAD * stretch.carried, round(_RETURN / period)) + 2, 2] = np.inf
         before = np.arange(2.0, -1.0, -1.0)[:, np.newaxis] * -stretch.received[1, 0]
         before = gears.joint(stretch.received[0, 0] + before)
     yield from _rates(before, held, limits.rates, factors, record_rounding, period, "recorded")
