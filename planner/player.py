@@ -321,7 +321,9 @@ class TrajectoryPlayer:
         for _ in range(_TRIES):
             point, speed = self._path.read(s)
             square = float(speed @ speed) or 1.0
-            s = min(max(s + float((here - point) @ speed) / square, 0.0), self._duration)
+            before, s = s, min(max(s + float((here - point) @ speed) / square, 0.0), self._duration)
+            if abs(s - before) <= _ROUNDING * self._period:
+                break
         self._offset = self._offset + self._near(here, point)
         self._last = position
         self._tabled = False
