@@ -30,7 +30,7 @@ TARGETS: Final[Mapping[str, int | None]] = {
 CEILINGS: Final[Mapping[str, int]] = {
     "product lines": 99_300,
     "product files": 436,
-    "test lines": 93_900,
+    "test lines": 94_000,
     "test files": 476,
     "import circles": 0,
     "imports inside functions": 38,
