@@ -309,7 +309,7 @@ def _with_delay(
     for delay in delays:
         late = _with(first, torque_delay=delay)
         swept, behind = _sweep(trial, late, questions)
-        found = trial.decide(DELAY, [now, swept], share=0.0)
+        found = trial.decide(DELAY, [now, swept], TIE)
         compared.append(found.choice)
         if found.choice.chosen:
             first, now, choices = late, swept, behind
