@@ -117,7 +117,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     elif how.torque_delay != assumed:
         found, notes = None, [compensated]
     elif found is not None and suggested:
-        found, notes = None, [f"{notes[0]}: it does not predict better, and was not applied"]
+        found, notes = None, [f"{notes[0]}: it predicts worse, and was not applied"]
     variance = found.variance if found is not None and notes else 0.0
     return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
 

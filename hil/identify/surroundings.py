@@ -15,7 +15,7 @@ from identification.estimators.nominal_prior import NOMINAL_SHARE
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
 from identification.model.urdf_text import urdf_tree
-from identification.selection.inner_prediction import DELAY, LOW_PASS
+from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
 from identification.validation.evidence import Surroundings
@@ -172,7 +172,7 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     """A delay or a low-pass of the torque that prediction chose, and nobody stated."""
     chosen = [one.name for one in prepared.settings.choices if one.chosen]
     how = prepared.settings.preprocessing
-    if DELAY in chosen and prepared.delays is None:
+    if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
         yield Finding(
             "delay",
             "doubtful",

@@ -245,8 +245,8 @@ def choose_settings(
         start: what is not asked for stays as it is here.
         questions: what is chosen.
         low_passes: looked for where "low-pass" is among them.
-        delays: of the torque that were found [s], of which one is used where "delay" is among them
-            and it predicts better than that of `start`.
+        delays: of the torque that were found to be significant [s], of which one is used where
+            "delay" is among them and it predicts no worse than that of `start`.
         ripples: of which one is added to the model where "ripple" is among them and it helps.
 
     Returns:
@@ -298,7 +298,7 @@ def _with_delay(
     questions: Collection[Question],
     delays: Sequence[float],
 ) -> tuple[Settings, Settings, list[Choice]]:
-    """Compensate a delay that was found, where that predicts better.
+    """Compensate a delay that was found to be significant, unless that predicts worse.
 
     All else is chosen anew beside it: presliding, for one, stands in for a part of a delay.
 
@@ -309,9 +309,9 @@ def _with_delay(
     for delay in delays:
         late = _with(first, torque_delay=delay)
         swept, behind = _sweep(trial, late, questions)
-        found = trial.decide(DELAY, [now, swept], TIE)
+        found = trial.decide(DELAY, [swept, now], TIE)
         compared.append(found.choice)
-        if found.choice.chosen:
+        if not found.choice.chosen:
             first, now, choices = late, swept, behind
     return first, now, [*compared, *choices]
 
