@@ -148,7 +148,7 @@ class MotionChecks:
                 check_smooth(trajectory, self.limits)
         except NotSmooth as error:
             return str(error)
-        # First what is quick to tell: nothing else can be told of a motion that is beyond limits.
+        # First what is quick to check: nothing else can be said of a motion that is beyond limits.
         result = check_motion(trajectory, self.limits)
         if not result.ok:
             return self._sentence(result.violations[0])

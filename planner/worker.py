@@ -93,7 +93,7 @@ def _end_with(descriptor: int) -> None:
     process ends, which is no reason to.
     """
     watched = select.poll()
-    watched.register(descriptor, 0)  # a hang-up is always told
+    watched.register(descriptor, 0)  # a hang-up is always reported
     watched.poll()
     os._exit(0)
 

@@ -253,7 +253,7 @@ class Check:
     Attributes:
         path: the file.
         version: of the profile, as the file says.
-        faults: what is wrong, by aspect; an aspect without entry is kept.
+        faults: what is wrong, by aspect; an aspect without entry is sound.
         samples: samples that can be read.
         repaired: whether the file says that it was repaired.
     """
@@ -266,7 +266,7 @@ class Check:
 
     @property
     def keeps(self) -> bool:
-        """Whether the profile is kept in all aspects."""
+        """Whether all aspects of the profile are sound."""
         return not self.faults
 
 

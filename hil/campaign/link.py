@@ -159,7 +159,7 @@ class Link:
     ) -> MotionEnded:
         """See `MotionLink.run`; while a hold stands, the simulated controller waits too."""
         steering = Steering(watch, override)
-        steering.begin(source, stop)  # so that no archive is kept open while a hold stands
+        steering.begin(source, stop)  # so that no archive stays open while a hold stands
         with self._open(spec) as writer:
             taking = _Taking(self, Recorder(writer, self.session.drive_train))
             watching = _Watching(self, source, watch, steering)
@@ -174,7 +174,7 @@ class Link:
                 self.session.request(source)
             except RequestError as error:
                 raise ControllerFault(str(error)) from error
-            until_drain, patience = 1, AFTERMATH_CYCLES  # a wish counts from the first cycle
+            until_drain, patience = 1, AFTERMATH_CYCLES  # a request counts from the first cycle
             beginning, hopeless = Beginning(self.transport.now), None
 
             def over() -> bool:

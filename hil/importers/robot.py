@@ -79,7 +79,7 @@ class Robot:
         urdf = _urdf_text(path) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
-        except ModelError as error:  # told of this file, and not of a cell that nobody wrote
+        except ModelError as error:  # about this file, and not about a cell that nobody wrote
             raise SourceError(path, str(error), remedy="name a URDF file") from error
         held = _held(urdf, locked or {}, recorded, path)
         law = friction or IMPORTED_LAW

@@ -351,11 +351,11 @@ def test_what_is_longer_than_all_is_in_the_last_which_has_no_end(seconds):
 
 @given(st.lists(latencies, min_size=1), st.floats(0.0, 1.0, exclude_min=True))
 def test_a_quantile_is_not_exceeded_by_its_share_and_by_no_more_than_a_bin_too_long(found, share):
-    told = quantile(counted(found), share)
-    assert told is not None
+    estimated = quantile(counted(found), share)
+    assert estimated is not None
     needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
-    assert needed <= told * (1.0 + 1e-12)
-    assert told <= needed * WIDTH * (1.0 + 1e-12)
+    assert needed <= estimated * (1.0 + 1e-12)
+    assert estimated <= needed * WIDTH * (1.0 + 1e-12)
 
 
 def test_a_share_of_nothing_is_the_shortest_there_was():

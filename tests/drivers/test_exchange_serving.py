@@ -299,5 +299,5 @@ def test_it_tells_the_arm_to_stay_in_the_middle_of_its_range():
     for _ in range(5):
         answer = CyclicPacket.decode(rehearsal.cycle(), N)
     assert (answer.axes["mode"] == Mode.POSITION).all()
-    told = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
-    np.testing.assert_allclose(told, 0.5 * (lower + upper), atol=1e-6)
+    reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
+    np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)

@@ -1,4 +1,4 @@
-"""A screen on a terminal, for a test at the other end of it: prints what it was told to a file.
+"""A screen on a terminal, for a test at the other end of it: writes what it was asked for to a file.
 
 `python screen_rig.py FILE ENDING`: shows a run until it is stopped, then ends in one of several
 ways, among them those that leave a terminal in a bad state. A line of JSON in FILE for each wish.
@@ -38,7 +38,7 @@ def main() -> int:
     """Run it."""
     file, ending = Path(sys.argv[1]), sys.argv[2]
     with stop_on_interrupt() as stop, Screen(NAMES, stop, title="rig") as screen:
-        with file.open("w", buffering=1) as told:
+        with file.open("w", buffering=1) as reported:
             last: OperatorRequest | None = None
             until = time.monotonic() + LONGEST
             if ending in ("question", "contradiction"):
@@ -48,16 +48,16 @@ def main() -> int:
                     against_gravity=NAMES[1:] if ending == "contradiction" else (),
                 )  # fmt: skip
                 for _ in range(3):
-                    told.write(json.dumps({"accepted": screen.accept_dry_run(found)}) + "\n")
+                    reported.write(json.dumps({"accepted": screen.accept_dry_run(found)}) + "\n")
             while not stop.requested and time.monotonic() < until:
                 wish = screen.request()
                 screen.show(status(wish))
                 if wish != last:
                     last = wish
                     said = {"override": round(wish.override, 3), "held": wish.held}
-                    told.write(json.dumps(said) + "\n")
+                    reported.write(json.dumps(said) + "\n")
                 time.sleep(0.01)
-            told.write(json.dumps({"stop": stop.requested}) + "\n")
+            reported.write(json.dumps({"stop": stop.requested}) + "\n")
         screen.say("the last line")
         if ending == "error":
             raise RuntimeError("an error on the way")
