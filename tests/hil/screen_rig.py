@@ -1,4 +1,4 @@
-"""A screen on a terminal, for a test at the other end of it: writes what it was asked for to a file.
+"""A screen on a terminal, for a test at the other end: writes what it was asked for to a file.
 
 `python screen_rig.py FILE ENDING`: shows a run until it is stopped, then ends in one of several
 ways, among them those that leave a terminal in a bad state. A line of JSON in FILE for each wish.
