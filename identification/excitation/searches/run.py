@@ -14,15 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
-from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
-from pymoo.config import Config
-from pymoo.core.problem import Problem
-from pymoo.core.termination import NoTermination
-from pymoo.operators.crossover.sbx import SBX
-from pymoo.operators.mutation.pm import PM
-from pymoo.operators.selection.tournament import TournamentSelection
-from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
 from identification.excitation.criteria import Criteria, fitness_of
 from identification.excitation.errors import DesignError
@@ -102,6 +93,11 @@ class Evolution:
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
+        # Here and below, because pymoo takes longer to load than many a command to run.
+        from pymoo.config import Config
+        from pymoo.core.problem import Problem
+        from pymoo.core.termination import NoTermination
+
         Config.warnings["not_compiled"] = False  # it would be printed
         self._algorithm = _algorithm(settings, first, n_objectives)
         self._algorithm.setup(
@@ -141,6 +137,13 @@ class Evolution:
 
 
 def _algorithm(settings: SearchSettings, first: Array, n_objectives: int) -> Any:
+    from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
+    from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
+    from pymoo.operators.crossover.sbx import SBX
+    from pymoo.operators.mutation.pm import PM
+    from pymoo.operators.selection.tournament import TournamentSelection
+    from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
+
     common = {
         "pop_size": settings.population,
         "sampling": first,
@@ -351,7 +354,6 @@ class _Search:
             raise self._ledger.failure(stopped=False) from None
 
     def _evolve(self, goal: Goal) -> None:
-
         self._phase = "search"
         random = np.random.default_rng((_FIRST, self._settings.seed))
         first = self._genome.sample(random, self._settings.population)
