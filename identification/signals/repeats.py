@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import scipy.signal
+import scipy
 from numpy.typing import NDArray
 
 from identification.signals.recording import Recording

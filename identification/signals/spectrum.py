@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy.signal
+import scipy
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
