@@ -1,40 +1,9 @@
-"""Everything the driver can complain about, as one tree.
+"""Everything the driver can complain about, as one tree below `DriverError`.
 
-::
-
-    DriverError
-    ├── PacketError          bytes that are not the packet they should be
-    ├── DriveTrainError      a drive train that cannot be (zero gear ratio, no wrist to couple)
-    ├── RequestError         a motion asked for at a moment when none can be promised
-    ├── TransportClosed      the link was closed, or its far end is gone for good
-    ├── TransportError       a link that cannot be opened or has broken (`drivers.transports.base`)
-    ├── ExchangeError        the exchange process does not do as asked (`drivers.exchange.process`)
-    └── RefusalError         a set-point that never left, and why
-        ├── SourceFailed     the motion source raised, or gave arrays of the wrong shape
-        ├── AxisLeft         an axis is not in the open mode that the motion needs
-        ├── ModeRefused      an axis is in a mode unknown here, or open before it was seen closed
-        ├── ExitNotGranted   the controller does not leave open mode although asked to
-        ├── SessionFailed    something here raised that must not: a defect, with its cause
-        └── GuardError       a number outside its bound: joint, value, bound, unit, cycle
-            ├── NotFinite
-            │   └── TargetNotFinite    of an axis that is open but no joint of the cell
-            ├── PositionLimit, VelocityLimit, AccelerationLimit, JerkLimit
-            ├── VelocityMismatch   velocity is not the derivative of the positions
-            ├── FollowingError
-            ├── CurrentLimit
-            │   └── CommandedCurrentLimit
-            │       └── CommandedCurrentStep  changes too much from one answer to the next
-            ├── CorrectionNotEnded a correction, or feed-forward, is over but not back at zero
-            ├── FirstSetPoint      away from the arm
-            │   ├── NotAtStandstill
-            │   └── FirstSetPointUnknown  what it is judged by is not of this cycle
-            └── MotionNotCarriedOn the target received is none of the set-points sent last
-                ├── MotionHeld     or has been brought to rest
-                ├── MotionPaused   or its arm has, in a pause by the clock
-                │   └── MotionUnknown     or what it is judged by is not of this cycle
-                └── CorrectionNotCarriedOn  or nothing tells whether a correction was applied
-
-All of them survive pickling with message and attributes, though without their cause.
+A `RefusalError` is a set-point that never left, and why; a `GuardError` among them a number outside
+its bound. Beside them: `drivers.transports.base.TransportError` (a link that cannot be opened) and
+`drivers.exchange.process.ExchangeError`. All survive pickling with message and attributes, though
+without their cause.
 """
 
 # ruff: noqa: N818  the leaves are named for what is wrong; their roots end in Error
@@ -60,36 +29,34 @@ def _restored(
     return error
 
 
-class PacketError(DriverError):
-    """Bytes that are not the packet they should be.
+class _FieldError(DriverError):
+    """A field with a value that it cannot have.
 
     Attributes:
-        field: what is wrong with it ("length", "number", "n_axes", "open_axes_map", ...).
+        field: its name.
         value: what was found.
         expected: what would have been valid, in words.
     """
 
+    what = ""
+
     def __init__(self, field: str, value: object, expected: str) -> None:
-        super().__init__(f"packet {field} is {value!r}; expected {expected}")
+        super().__init__(f"{self.what} {field} is {value!r}; expected {expected}")
         self.field = field
         self.value = value
         self.expected = expected
 
 
-class DriveTrainError(DriverError):
-    """A drive train that cannot be.
+class PacketError(_FieldError):
+    """Bytes that are not the packet they should be."""
 
-    Attributes:
-        field: name of the offending field.
-        value: what was given.
-        expected: what would have been valid, in words.
-    """
+    what = "packet"
 
-    def __init__(self, field: str, value: object, expected: str) -> None:
-        super().__init__(f"drive train {field} is {value!r}; expected {expected}")
-        self.field = field
-        self.value = value
-        self.expected = expected
+
+class DriveTrainError(_FieldError):
+    """A drive train that cannot be: a gear ratio of zero, coupling without a wrist."""
+
+    what = "drive train"
 
 
 class RequestError(DriverError):
@@ -218,6 +185,11 @@ class GuardError(RefusalError):
     check = "guard"
     unit = ""
 
+    def __init_subclass__(cls, *, check: str = "", unit: str = "", remedy: str = "") -> None:
+        cls.check = check or cls.check
+        cls.unit = unit or cls.unit
+        cls.remedy = remedy or cls.remedy
+
     def __init__(
         self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
     ) -> None:
@@ -233,10 +205,8 @@ class GuardError(RefusalError):
         self.bound = bound
 
 
-class NotFinite(GuardError):
+class NotFinite(GuardError, check="finiteness"):
     """NaN or infinity where a number must be."""
-
-    check = "finiteness"
 
     def __init__(
         self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
@@ -259,131 +229,111 @@ class TargetNotFinite(NotFinite):
         self.arm = arm
 
 
-class PositionLimit(GuardError):
+class PositionLimit(GuardError, check="position", unit="rad"):
     """Set-point outside the joint's range."""
 
-    check = "position"
-    unit = "rad"
 
-
-class VelocityLimit(GuardError):
+class VelocityLimit(GuardError, check="velocity", unit="rad/s"):
     """Step between two sent set-points, or the stated velocity, too fast."""
 
-    check = "velocity"
-    unit = "rad/s"
 
-
-class AccelerationLimit(GuardError):
+class AccelerationLimit(GuardError, check="acceleration", unit="rad/s²"):
     """Second difference of the sent set-points too large."""
 
-    check = "acceleration"
-    unit = "rad/s²"
 
-
-class JerkLimit(GuardError):
+class JerkLimit(GuardError, check="jerk", unit="rad/s³"):
     """Third difference of the sent set-points too large."""
 
-    check = "jerk"
-    unit = "rad/s³"
 
-
-class VelocityMismatch(GuardError):
+class VelocityMismatch(
+    GuardError, check="difference between stated velocity and step", unit="rad/s"
+):
     """The source's velocity is not the derivative of its positions."""
 
-    check = "difference between stated velocity and step"
-    unit = "rad/s"
 
-
-class FollowingError(GuardError):
+class FollowingError(
+    GuardError,
+    check="following error",
+    unit="motor revolutions",
+    remedy="see whether the axis is free, then its following_error in [drive_train]",
+):
     """The axis does not follow; the controller is informed by mode 508 in this axis."""
 
-    remedy = "see whether the axis is free, then its following_error in [drive_train]"
 
-    check = "following error"
-    unit = "motor revolutions"
-
-
-class CurrentLimit(GuardError):
+class CurrentLimit(
+    GuardError,
+    check="target current",
+    unit="A",
+    remedy="check that the arm is free, check its payload, then go slower",
+):
     """The servo asks for more current than the narrower of cell and controller allows."""
 
-    remedy = "check that the arm is free, check its payload, then go slower"
 
-    check = "target current"
-    unit = "A"
-
-
-class CommandedCurrentLimit(CurrentLimit):
+class CommandedCurrentLimit(CurrentLimit, check="commanded current"):
     """Fed forward, or together with the servo's own, a current is more than is allowed."""
 
-    check = "commanded current"
 
-
-class CommandedCurrentStep(CommandedCurrentLimit):
+class CommandedCurrentStep(CommandedCurrentLimit, check="change of commanded current in one cycle"):
     """A current fed forward, or added to the servo's own, changes too much in one cycle."""
 
-    check = "change of commanded current in one cycle"
 
-
-class CorrectionNotEnded(GuardError):
+class CorrectionNotEnded(GuardError, check="correction at the end"):
     """A source says that it is finished while a correction of its, or feed-forward, is not zero."""
 
-    check = "correction at the end"
 
-
-class FirstSetPoint(GuardError):
+class FirstSetPoint(
+    GuardError,
+    check="distance between received target and actual position",
+    unit="motor revolutions",
+    remedy="let the arm come to rest before open mode is asked for",
+):
     """The first set-point is not where the arm is, or the arm is not at rest."""
 
-    remedy = "let the arm come to rest before open mode is asked for"
 
-    check = "distance between received target and actual position"
-    unit = "motor revolutions"
-
-
-class NotAtStandstill(FirstSetPoint):
+class NotAtStandstill(
+    FirstSetPoint, check="velocity at the first set-point", unit="motor revolutions per cycle"
+):
     """The axis moves in the cycle in which it would get its first set-point."""
 
-    check = "velocity at the first set-point"
-    unit = "motor revolutions per cycle"
 
-
-class FirstSetPointUnknown(FirstSetPoint):
+class FirstSetPointUnknown(
+    FirstSetPoint,
+    check="age, at the first set-point, of received target, position or velocity",
+    unit="cycles",
+):
     """Target, position or velocity received with it were sent in an earlier cycle."""
 
-    check = "age, at the first set-point, of received target, position or velocity"
-    unit = "cycles"
 
-
-class MotionNotCarriedOn(GuardError):
+class MotionNotCarriedOn(
+    GuardError,
+    check="distance between received target and the set-points sent last",
+    unit="motor revolutions",
+    remedy="look for lost packets: the cable, other traffic, hil doctor",
+):
     """The controller's target is none of the set-points sent last: it does not take them."""
 
-    remedy = "look for lost packets: the cable, other traffic, hil doctor"
 
-    check = "distance between received target and the set-points sent last"
-    unit = "motor revolutions"
-
-
-class MotionHeld(MotionNotCarriedOn):
+class MotionHeld(
+    MotionNotCarriedOn,
+    check="difference, after a gap, between received velocity and the one sent last",
+    unit="motor revolutions per cycle",
+):
     """After a long gap the axis rests, or moves otherwise than the set-point sent last."""
 
-    check = "difference, after a gap, between received velocity and the one sent last"
-    unit = "motor revolutions per cycle"
 
-
-class MotionPaused(MotionNotCarriedOn):
+class MotionPaused(
+    MotionNotCarriedOn,
+    check="difference, after a pause, between the velocity received and the one sent last",
+    unit="rad/s",
+):
     """After a pause by the clock the arm moves otherwise than the set-points sent last."""
 
-    check = "difference, after a pause, between the velocity received and the one sent last"
-    unit = "rad/s"
 
-
-class MotionUnknown(MotionHeld):
+class MotionUnknown(
+    MotionHeld, check="age, after a gap, of received target or velocity", unit="cycles"
+):
     """After a long gap, target or velocity received were sent in an earlier cycle."""
 
-    check = "age, after a gap, of received target or velocity"
-    unit = "cycles"
 
-
-class CorrectionNotCarriedOn(MotionNotCarriedOn):
+class CorrectionNotCarriedOn(MotionNotCarriedOn, check="correction sent last before a gap"):
     """After a long gap nothing tells whether the controller applied the correction sent last."""
-
-    check = "correction sent last before a gap"

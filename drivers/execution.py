@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import SourceFailed, in_words
 from drivers.events import Outcome
-from drivers.guard_limits import RANK
+from drivers.guard import RANK
 from drivers.motion_source import (
     BoundsName,
     CarriedSource,

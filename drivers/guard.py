@@ -14,14 +14,19 @@ All comparisons are written so that NaN fails them.
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.checks import report, require, require_finite
 from drivers.errors import (
     AccelerationLimit,
+    CommandedCurrentLimit,
+    CommandedCurrentStep,
+    CorrectionNotCarriedOn,
+    CorrectionNotEnded,
     CurrentLimit,
     FirstSetPoint,
     FollowingError,
@@ -31,16 +36,190 @@ from drivers.errors import (
     MotionNotCarriedOn,
     MotionPaused,
     NotAtStandstill,
+    NotFinite,
     PositionLimit,
     VelocityLimit,
     VelocityMismatch,
 )
-from drivers.guard_limits import CARRIED_ON, BoundsInForce, GuardLimits
 from drivers.motion_source import BoundsName
+
+Array = NDArray[np.float64]
+
+
+def require_finite(values: Array, where: NDArray[np.bool_], cycle: int) -> None:
+    """Raise `NotFinite` for the first joint of `where` (n,) whose value (n,) is no number."""
+    bad = where & ~np.isfinite(values)
+    if bad.any():
+        joint = int(np.argmax(bad))
+        raise NotFinite(joint, float(values[joint]), np.inf, cycle)
+
+
+def require(
+    where: NDArray[np.bool_],
+    values: Array,
+    bounds: Array,
+    error: type[GuardError],
+    cycle: int,
+    unit: str | None = None,
+) -> None:
+    """Raise `error` for the first joint of `where` (n,) whose value (n,) is above its bound."""
+    bad = where & ~(values <= bounds)
+    if bad.any():
+        joint = int(np.argmax(bad))
+        kind = error if np.isfinite(values[joint]) else NotFinite
+        raise kind(joint, float(values[joint]), float(bounds[joint]), cycle, unit)
+
+
+def report(
+    magnitude: Array,
+    found: Array,
+    allowed: Array,
+    checks: tuple[type[GuardError], ...],
+    cycle: int,
+    position_limits: Callable[[int, float], tuple[float, float]] | None = None,
+) -> NoReturn:
+    """Raise for the first row and joint outside its bound; NaN before everything else.
+
+    Args:
+        magnitude: (k, n) compared with `allowed`.
+        found: (k, n) with its sign, for the error.
+        allowed: (k, n).
+        checks: (k,) error of each row.
+        cycle: for the error.
+        position_limits: turns joint and value of a position into those to be reported.
+    """
+    not_finite = ~np.isfinite(magnitude)
+    bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
+    row, joint = (int(index) for index in np.argwhere(bad)[0])
+    value, bound = float(found[row, joint]), float(allowed[row, joint])
+    kind = NotFinite if not_finite.any() else checks[row]
+    if kind is PositionLimit and position_limits is not None:
+        value, bound = position_limits(joint, value)
+    raise kind(joint, value, bound, cycle)
+
+
+DEFAULT_STANDSTILL: Final = 5e-4
+"""Motor revolutions per cycle below which an axis stands still.
+
+An encoder at rest toggles between two increments, so a velocity formed over one cycle shows one
+increment per cycle at worst and two with a little servo dither. Two increments of a coarse 12-bit
+encoder are 4.9e-4; at 2 ms this is some 0.5 % of a drive's full speed.
+"""
+
+RANK: Final[Mapping[BoundsName, int]] = {"plan": 0, "override": 1, "stop": 2}
+CARRIED_ON: Final = 3
+"""Rank of the bounds of a stop without one on jerk: the steps that a controller made by itself have
+none of the motion's acceleration, so that returning to it is a jump of acceleration."""
+MEMORY: Final = 2
+"""Cycles for which wider bounds stay: a third difference reaches over three cycles."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuardLimits:
+    """What the guard enforces; arrays (n,).
+
+    Attributes:
+        lower: rad, smallest joint position.
+        upper: rad, largest.
+        velocity: rad/s, magnitude, in all three sets of bounds.
+        acceleration: rad/s², of the set "plan".
+        jerk: rad/s³, of the set "plan".
+        following_error: motor revolutions, as the controller states its thresholds.
+        current: A.
+        override_acceleration: factor on acceleration while an override changes.
+        override_jerk: factor on jerk while an override changes.
+        stop_acceleration: factor on acceleration during hold and stop.
+        stop_jerk: factor on jerk during hold and stop.
+        standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
+        current_rise: s that a commanded current takes, at least, from zero to its limit.
+
+    Raises:
+        ValueError: a shape, sign or order is wrong; names the field.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    following_error: Array
+    current: Array
+    override_acceleration: float = 1.3
+    override_jerk: float = 1.7
+    stop_acceleration: float = 2.0
+    stop_jerk: float = 3.0
+    standstill: float = DEFAULT_STANDSTILL
+    current_rise: float = 0.01
+
+    def __post_init__(self) -> None:
+        n = np.size(self.lower)
+        for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
+            self._check(name, n, positive=name not in ("lower", "upper"))
+        self._check("following_error", n, positive=True)
+        self._check("current", n, positive=True)
+        if not np.all(self.lower < self.upper):
+            raise ValueError(f"guard limits: lower {self.lower} is not below upper {self.upper}")
+        for plan, override, stop in (
+            (1.0, self.override_acceleration, self.stop_acceleration),
+            (1.0, self.override_jerk, self.stop_jerk),
+        ):
+            if not plan <= override <= stop:
+                raise ValueError(f"guard limits: factors 1 <= {override} <= {stop} do not hold")
+        for name in ("standstill", "current_rise"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"guard limits: {name} {getattr(self, name)} is not positive")
+
+    def _check(self, name: str, n: int, *, positive: bool) -> None:
+        array = np.array(getattr(self, name), dtype=np.float64)
+        if array.shape != (n,) or not np.all(np.isfinite(array)):
+            raise ValueError(f"guard limits: {name} must be {n} finite numbers, got {array}")
+        if positive and not np.all(array > 0.0):
+            raise ValueError(f"guard limits: {name} must be positive, got {array}")
+        object.__setattr__(self, name, array)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.lower)
+
+    def factors(self, rank: int) -> tuple[float, float]:
+        """Factors on acceleration and jerk of a set of bounds, by its `RANK` or `CARRIED_ON`."""
+        stop = self.stop_acceleration
+        return (
+            (1.0, self.override_acceleration, stop, stop)[rank],
+            (1.0, self.override_jerk, self.stop_jerk, np.inf)[rank],
+        )
+
+
+class BoundsInForce:
+    """Wider bounds stay in force until no difference reaches back to them.
+
+    Attributes:
+        rank: of the set in force.
+    """
+
+    def __init__(self) -> None:
+        self.rank = 0
+        self._age = 0
+
+    def reset(self, rank: int = 0, cycles: int = 0) -> None:
+        """Nothing was sent yet; or a set comes into force that applies for so many cycles more."""
+        self.rank, self._age = rank, -cycles
+
+    def take(self, bounds: BoundsName) -> int:
+        """The set that the next set-point belongs to; returns the rank of the one in force."""
+        rank = RANK[bounds]
+        if rank >= self.rank:
+            self.rank, self._age = rank, 0
+        elif self._age < MEMORY:
+            self._age += 1
+        else:
+            self.rank = rank
+        return self.rank
+
 
 __all__ = ["FIRST_FRACTION", "RELATIVE_TOLERANCE", "Guard", "GuardLimits"]
 
-Array = NDArray[np.float64]
 
 RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
@@ -324,3 +503,168 @@ class Guard:
         """The position meant by `value` off the middle of the range, and the limit nearest it."""
         limit = self.limits.upper if value > 0.0 else self.limits.lower
         return float(self._middle[joint] + value), float(limit[joint])
+
+
+_CHECKS: Final[tuple[type[GuardError], ...]] = (VelocityLimit, AccelerationLimit, JerkLimit)
+_UNIT: Final = {"velocity": "rad/s", "offset": "rad"}
+
+
+class CorrectionGuard:
+    """Checks corrections of one arm, cycle by cycle, from zero to zero.
+
+    A velocity fed forward and an offset from the controller's target are held to the same three
+    sets of bounds as set-points, by their differences from one answer to the next: the differences
+    of a velocity are mean accelerations and jerks, those of an offset one order further up. An
+    offset is held to those of a velocity as well, as if the controller added it up cycle by cycle;
+    so is the target together with it. A current has a limit and, per cycle, a largest step. Nothing
+    is clamped.
+
+    Args:
+        guard: whose limits and period apply.
+        kind: what the motion part is: a "velocity" rad/s, or an "offset" rad of positions.
+    """
+
+    def __init__(self, guard: Guard, kind: Literal["velocity", "offset"]) -> None:
+        self._guard = guard
+        self._is_velocity = kind == "velocity"
+        self._unit = _UNIT[kind]
+        limits, T = guard.limits, guard.period
+        n = limits.n_joints
+        self._every = np.ones(n, dtype=np.bool_)
+        first = np.array([0.0, 0.0, -1.0, 1.0])
+        second = np.array([0.0, 1.0, -2.0, 1.0])
+        third = np.array([-1.0, 3.0, -3.0, 1.0])
+        itself = np.array([0.0, 0.0, 0.0, 1.0])
+        as_velocity = np.array([itself, first / T, second / T**2])
+        as_position = np.array([first / T, second / T**2, third / T**3])
+        self._differences = (
+            as_velocity if kind == "velocity" else np.vstack([as_position, as_velocity / T])
+        )
+        self._checks = _CHECKS * (len(self._differences) // 3)
+        self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
+        self._in_force = BoundsInForce()
+        self._history = np.zeros((4, n))
+        self._quantities = np.zeros((len(self._differences), n))
+        self._current = np.zeros(n)
+        self._target = self._offset = self._sent_in = np.zeros(n)
+        self._rise = T / limits.current_rise
+        # What rounding leaves of a zero: a millionth of a limit, for an offset of one step.
+        step = T if kind == "offset" else 1.0
+        self._nothing = RELATIVE_TOLERANCE * limits.velocity * step
+
+    def _bounds(self, rank: int) -> Array:
+        limits = self._guard.limits
+        factor_a, factor_j = limits.factors(rank)
+        bounds = np.array([limits.velocity, factor_a * limits.acceleration, factor_j * limits.jerk])
+        allowed = np.tile(bounds, (len(self._differences) // 3, 1))
+        return allowed * (1.0 + RELATIVE_TOLERANCE)
+
+    def begin(self) -> None:
+        """Zero was sent."""
+        self._history[...] = 0.0
+        self._current[...] = 0.0
+        self._in_force.reset()
+
+    def check_motion(self, motion: Array, bounds: BoundsName, cycle: int) -> None:
+        """The next velocity or offset (n,); if it passes, it counts as sent.
+
+        Raises:
+            NotFinite, VelocityLimit, AccelerationLimit, JerkLimit: it must not be sent.
+        """
+        history = self._history
+        history[:3] = history[1:]
+        history[3] = motion
+        found = self._quantities
+        np.matmul(self._differences, history, out=found)
+        allowed = self._sets[self._in_force.take(bounds)]
+        magnitude = np.abs(found)
+        if not (magnitude <= allowed).all():
+            report(magnitude, found, allowed, self._checks, cycle)
+
+    @property
+    def resting(self) -> bool:
+        """Whether the velocities sent last are zero, or the offsets the same."""
+        history = self._history
+        rates = history if self._is_velocity else np.diff(history, axis=0)
+        return bool((np.abs(rates) <= self._nothing).all())
+
+    def note_target(self, target: Array, offset: Array, sent_in: Array) -> None:
+        """The controller's target (n,) rad, the offset from it, the cycle each joint's is of."""
+        self._target, self._offset, self._sent_in = target, offset, sent_in
+
+    def check_target(
+        self, target: Array, offset: Array, sent_in: Array, rounding: Array, cycle: int
+    ) -> None:
+        """How fast target and offset move the arm; if they pass, they are noted.
+
+        Args:
+            target: (n,) rad, received.
+            offset: (n,) rad, to be sent.
+            sent_in: (n,) cycle in which each target was sent.
+            rounding: (n,) rad, of a step of the target.
+            cycle: for the error.
+
+        Raises:
+            NotFinite, VelocityLimit: too fast, the offset being a position or a step.
+        """
+        T = self._guard.period
+        elapsed = T * np.maximum(sent_in - self._sent_in, 1.0)
+        speed = (target - self._target) / elapsed
+        bound = self._guard.limits.velocity * (1.0 + RELATIVE_TOLERANCE) + rounding / elapsed
+        for step in (offset - self._offset, offset):
+            require(self._every, np.abs(speed + step / T), bound, VelocityLimit, cycle)
+        self.note_target(target, offset, sent_in)
+
+    def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
+        """The next current (n,) A; if it passes, it counts as sent.
+
+        Args:
+            current: fed forward, or added to the servo's own.
+            servo: (n,) A, the servo's own in the latter case.
+            cycle: for the error.
+
+        Raises:
+            NotFinite, CommandedCurrentLimit, CommandedCurrentStep: it must not be sent.
+        """
+        total = current if servo is None else current + servo
+        bound = self._guard.current * (1.0 + RELATIVE_TOLERANCE)
+        require(self._every, np.abs(total), bound, CommandedCurrentLimit, cycle)
+        step, largest = np.abs(current - self._current), bound * self._rise
+        require(self._every, step, largest, CommandedCurrentStep, cycle)
+        self._current[...] = current
+
+    def check_position(self, q: Array, cycle: int) -> None:
+        """Where the correction leads the arm, (n,) rad.
+
+        Raises:
+            NotFinite, PositionLimit: outside the range of a joint.
+        """
+        limits = self._guard.limits
+        require_finite(q, self._every, cycle)
+        reach = RELATIVE_TOLERANCE * 0.5 * (limits.upper - limits.lower)
+        outside = (q > limits.upper + reach) | (q < limits.lower - reach)
+        if outside.any():
+            joint = int(np.argmax(outside))
+            limit = limits.upper if q[joint] > limits.upper[joint] else limits.lower
+            raise PositionLimit(joint, float(q[joint]), float(limit[joint]), cycle)
+
+    def check_end(self, cycle: int) -> None:
+        """The source says that it is finished.
+
+        Raises:
+            CorrectionNotEnded: what it gave last is not zero.
+        """
+        self._require_zero(CorrectionNotEnded, cycle)
+
+    def check_after_gap(self, cycle: int) -> None:
+        """After a long gap, whether the controller applied a correction cannot be seen.
+
+        Raises:
+            CorrectionNotCarriedOn: the one sent last is not zero.
+        """
+        self._require_zero(CorrectionNotCarriedOn, cycle)
+
+    def _require_zero(self, kind: type[GuardError], cycle: int) -> None:
+        no_current = RELATIVE_TOLERANCE * self._guard.current
+        require(self._every, np.abs(self._history[3]), self._nothing, kind, cycle, self._unit)
+        require(self._every, np.abs(self._current), no_current, kind, cycle, "A")

@@ -8,18 +8,153 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.arm_wire import ArmWire
-from drivers.checks import require
-from drivers.correction_guard import CorrectionGuard
-from drivers.errors import AxisLeft, FirstSetPointUnknown, GuardError, MotionUnknown
-from drivers.execution import Execution, MotionExecution
-from drivers.guard import Guard
-from drivers.packets import Mode
-from drivers.reading import Reading
-from drivers.replies import D1, D2, D4, D5, ReplyFrame
-from drivers.set_points import SentSetPoints
+from drivers.drive_train import ArmWire
+from drivers.errors import (
+    AxisLeft,
+    FirstSetPointUnknown,
+    GuardError,
+    MotionNotCarriedOn,
+    MotionUnknown,
+    SourceFailed,
+)
+from drivers.execution import CorrectionExecution, Execution, MotionExecution
+from drivers.guard import FIRST_FRACTION, CorrectionGuard, Guard, require
+from drivers.packets import MODE_FIELDS, Mode
+from drivers.replies import D1, D2, D4, D5, Reading, ReplyFrame
 
 Array = NDArray[np.float64]
+
+LEAP_FRACTION: Final = 0.25
+"""Share of the following-error threshold allowed between target and set-point sent last."""
+SLOW: Final = 4.0
+"""Times what counts as standstill: some 2 % of full speed. Of such steps several may be made up in
+one cycle."""
+REPETITIONS: Final = 100
+"""Times that a set-point is sent again, at most, to a controller that does not accept it."""
+
+
+class SentSetPoints:
+    """Whether the controller accepts our set-points: its target against those sent last, motor rev.
+
+    While answers are lost the controller holds its target. Were the motion to go on meanwhile, the
+    next set-point that it hears would be as many steps away. So the last one is sent again until
+    the target shows that it was accepted: the motion waits, as it does for packets. A packet that
+    never arrived is no answer either: a controller that carries its target on meanwhile reports one
+    ahead of those sent.
+
+    A controller that reports its target a cycle late looks the same in its first cycle, and to a
+    repetition of the last set-point in every second one. It is known by the first steps of a
+    motion, which are small (`SLOW`): there nothing is sent again, and what the target is behind by
+    then is no loss from then on. A link that becomes so late at speed is a loss in every second
+    cycle, which soon brings the motion to rest; on that way it counts as late.
+
+    Args:
+        guard: whose following-error threshold and standstill apply.
+        depth: how many of them the target received may be.
+
+    Attributes:
+        again: the controller did not accept the last one: it is to be sent once more.
+        lag: cycles that the controller is known to report its target late.
+    """
+
+    def __init__(self, guard: Guard, depth: int) -> None:
+        n = guard.limits.n_joints
+        self._guard = guard
+        self._depth = depth
+        # One more than allowed, so that one too many can be counted.
+        self._sent = np.zeros((depth + 1, n))
+        self._back = np.arange(depth + 1)
+        self._ahead = np.arange(1.0, depth)[:, None]
+        self._newest = 0
+        self.lag = 0
+        self._repeated = 0
+        self._unsure = False
+        self.again = False
+        self._every = np.ones(n, dtype=np.bool_)
+
+    def begin(self, target: Array) -> None:
+        """The first set-point (n,) was sent, the target received."""
+        self._sent[...] = target
+        self.lag = self._repeated = 0
+        self._unsure = self.again = False
+
+    def go_on_from(self, target: Array, step: Array) -> None:
+        """The controller carried on to this target (n,) by this step (n,); as late as before."""
+        self._sent[(self._newest - self._back) % len(self._sent)] = (
+            target - self._back[:, None] * step
+        )
+        self._repeated, self._unsure, self.again = 0, False, False
+
+    def repeat(self) -> None:
+        """The last set-point was sent once more."""
+        self._repeated += 1
+
+    def add(self, target: Array) -> None:
+        """The next set-point (n,) was sent."""
+        self._unsure, self._repeated = self._repeated > 0, 0
+        self._newest = newest = (self._newest + 1) % len(self._sent)
+        self._sent[newest] = target
+
+    def check(
+        self,
+        target: Array,
+        missed: int,
+        cycle: int,
+        where: NDArray[np.bool_] | None = None,
+        *,
+        stopping: bool = False,
+    ) -> int:
+        """Each joint's target has to be one of the set-points sent last, or the last carried on.
+
+        Args:
+            target: (n,) D1 received, motor revolutions.
+            missed: packets before this one that were not answered: for so many steps, but less
+                than `depth`, the controller may have carried on.
+            cycle: for the error.
+            where: (n,) which joints; None for all.
+            stopping: the motion is being brought to rest.
+
+        Returns:
+            How many answers more than in the cycle before were not accepted. What a joint at
+            standstill moves in a cycle hides one.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn: a target further than `FIRST_FRACTION` of the
+                following-error threshold from all of them, or than `LEAP_FRACTION` from the last,
+                or that is not the last one though this was sent `REPETITIONS` times.
+        """
+        sent, standstill = self._sent, self._guard.limits.standstill
+        newest = sent[self._newest]
+        self.again = False
+        # As always: the set-point sent last. All else may take its time.
+        if np.abs(target - newest).max() <= standstill:
+            # Where hardly anything moves, a target reported late looks the same.
+            step = np.abs(newest - sent[self._newest - 1]).max()
+            if self.lag and not self._repeated and step > standstill:
+                self.lag = 0
+            return 0
+        rows = sent[(self._newest - self._back) % len(sent)]
+        carried = newest + self._ahead[:missed] * (newest - rows[1])
+        late, ahead = np.abs(rows - target), np.abs(carried - target)
+        where = self._every if where is None else where
+        nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
+        threshold = self._guard.following_error
+        require(where, nearest, FIRST_FRACTION * threshold, MotionNotCarriedOn, cycle)
+        require(where, late[0], LEAP_FRACTION * threshold, MotionNotCarriedOn, cycle)
+        behind = where & (late[0] > standstill)
+        behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
+        lag = int(late.argmin(axis=0)[behind].max(initial=0))
+        more = max(0, lag - self.lag)
+        known_late = stopping and self._unsure
+        if not more or known_late or np.abs(newest - rows[1]).max() <= SLOW * standstill:
+            self.lag = lag
+            return 0 if known_late else more
+        self.again = True
+        if self._repeated >= REPETITIONS:
+            require(where, late[0], np.full_like(newest, standstill), MotionNotCarriedOn, cycle)
+        return 1 if self._repeated else more
+
+
 Joints = NDArray[np.bool_]
 
 # Rows of `ArmWire.raw`.
@@ -337,3 +472,141 @@ class PositionMode(OpenMode):
         self._wire.write(self._frame.floats, self._sent, self._still)
         commanded[0] = self.held
         commanded[1] = 0.0
+
+
+_CURRENT_FIELD: Final = 5
+
+
+class CorrectionMode(OpenMode):
+    """Zeros, until a source corrects what the controller does.
+
+    ====  ==============================  ===================================================
+    mode  answered                        read as
+    ====  ==============================  ===================================================
+    2     D4 velocity, D5 current         fed forward beside the controller's own loop
+    7     D1 offset                       added to the controller's own target of this cycle
+    8     D4 velocity                     fed forward
+    9     D5 current                      added to the current the servo asks for (D5 received)
+    ====  ==============================  ===================================================
+
+    How the controller uses an offset in mode 7 (for one cycle, or summed up) is documented
+    nowhere. Hence it keeps the bounds under both readings: as a position beside the target, and
+    as a step made anew in every cycle, which allows no more than the way of one cycle at full
+    speed. So does the target with it, of which it is known how fast the controller moves it.
+
+    Following error is |D1 - D3| as received: there is no target of ours to compare with.
+    """
+
+    def __init__(
+        self,
+        guard: Guard,
+        wire: ArmWire,
+        frame: ReplyFrame,
+        mode: int,
+        max_gap: int,  # noqa: ARG002  no target is ours
+    ) -> None:
+        super().__init__(guard, wire, frame)
+        self._mode = mode
+        self._offset = mode == Mode.DELTA_POSITION
+        self._velocity = mode in (Mode.FEED_FORWARD, Mode.VELOCITY)
+        self._current = _CURRENT_FIELD in MODE_FIELDS[mode]
+        self._added_to_servo = mode == Mode.DELTA_CURRENT
+        self._corrections = CorrectionGuard(guard, "offset" if self._offset else "velocity")
+
+    def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
+        """The first answer is zero; the arm has to stand where the controller wants it."""
+        self.require_start(cycle)
+        self._check_arm(cycle)
+        self.held = measured[0].copy()
+        self._corrections.check_position(self.held, cycle)
+        self._corrections.begin()
+        self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
+        self._note(self._still, measured, commanded)
+
+    def next(
+        self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
+    ) -> None:
+        """The next correction, or none."""
+        self._check_arm(cycle)
+        self.held = measured[0].copy()
+        if execution is None:
+            self._corrections.check_position(self.held, cycle)
+            self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
+            self._note(self._still, measured, commanded)
+            return
+        assert isinstance(execution, CorrectionExecution)
+        motion, current = execution.advance(cycle)
+        self._require_fields(motion, current, cycle)
+        guard = self._corrections
+        guard.check_motion(motion, execution.granted, cycle)
+        if execution.granted == "stop" and guard.resting:
+            execution.rested()
+        guard.check_position(self.held + motion if self._offset else self.held, cycle)
+        if self._offset:
+            rounding = self._wire.joint_rounding(self._wire.raw[TARGET])
+            guard.check_target(self.held, motion, self._sent_in(cycle), rounding, cycle)
+        servo = self._wire.raw[CURRENT] if self._added_to_servo else None
+        guard.check_current(current, servo, cycle)
+        if execution.finished:
+            guard.check_end(cycle)
+        self._write(motion, current)
+        self._note(motion, measured, commanded)
+
+    def require_carried_on(
+        self,
+        execution: Execution | None,  # noqa: ARG002  the motion is the controller's
+        reading: Reading,  # noqa: ARG002  zero is zero in every axis
+        cycle: int,
+    ) -> None:
+        """A correction that was not zero may have been applied or dropped: nothing tells."""
+        self._corrections.check_after_gap(cycle)
+
+    def require_no_pause(self, reading: Reading, cycle: int) -> None:
+        """The controller generates the motion: what it should be is not known here."""
+
+    def leaving(
+        self,
+        reading: Reading,
+        measured: Array,
+        commanded: Array,
+        cycle: int,
+    ) -> None:
+        """Zeros, as the safe answer says; an axis in a mode of positions, its target."""
+        held = reading.held
+        if held.any():
+            self.require_holdable(held, held, cycle)
+            commanded[0] = np.where(held, measured[0], np.nan)
+            commanded[1] = np.where(held, 0.0, np.nan)
+        self._check_arm(cycle, where=reading.ready)
+
+    def _sent_in(self, cycle: int) -> Array:
+        """The cycle in which each target received was sent."""
+        age = self._wire.age
+        return self._still + cycle if age is None else cycle - age[TARGET].astype(np.float64)
+
+    def _check_arm(self, cycle: int, where: NDArray[np.bool_] | None = None) -> None:
+        raw = self._wire.raw
+        target = raw[TARGET]
+        self._guard.check_feedback(target, raw[ACTUAL], raw[CURRENT], target, cycle, where)
+
+    def _require_fields(self, motion: Array, current: Array, cycle: int) -> None:
+        """What this mode has no field for is a misunderstanding, not something to drop."""
+        if not (self._offset or self._velocity) and np.any(motion):
+            raise SourceFailed(f"mode {self._mode} has no field for a motion: {motion}", cycle)
+        if not self._current and np.any(current):
+            raise SourceFailed(f"mode {self._mode} has no field for a current: {current}", cycle)
+
+    def _write(self, motion: Array, current: Array) -> None:
+        frame, wire = self._frame.floats, self._wire
+        if self._offset:
+            wire.put(frame, D1, wire.motor_difference(motion))
+        elif self._velocity:
+            wire.put(frame, D4, wire.motor_difference(motion) * self._guard.period)
+        if self._current:
+            wire.put(frame, D5, current)
+
+    def _note(self, motion: Array, measured: Array, commanded: Array) -> None:
+        if self._offset:
+            np.add(measured[0], motion, out=commanded[0])
+        elif self._velocity:
+            commanded[1] = motion

@@ -38,9 +38,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.arm_wire import Ages, ArmWire
-from drivers.correction_mode import CorrectionMode
-from drivers.drive_train import DriveTrain
+from drivers.drive_train import Ages, ArmWire, DriveTrain
 from drivers.errors import (
     ExitNotGranted,
     FollowingError,
@@ -51,11 +49,10 @@ from drivers.errors import (
 )
 from drivers.guard import Guard
 from drivers.init_check import compare
-from drivers.open_mode import OpenMode, PositionMode
+from drivers.open_mode import CorrectionMode, OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
-from drivers.reading import Reader, Reading
 from drivers.record import CycleRecords
-from drivers.replies import D1, ReplyFrame, Words
+from drivers.replies import D1, Reader, Reading, ReplyFrame, Words
 from drivers.state_machine import Machine
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
 

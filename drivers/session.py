@@ -48,8 +48,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.arm_wire import Ages
-from drivers.drive_train import DriveTrain
+from drivers.drive_train import Ages, DriveTrain
 from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
 from drivers.events import Counters, Event, InitReceived, LinkLost, PacketRejected, Refused
 from drivers.execution import execution_of

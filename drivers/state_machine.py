@@ -23,7 +23,7 @@ from drivers.events import (
 from drivers.execution import Execution
 from drivers.motion_source import Array
 from drivers.packets import Mode
-from drivers.reading import Reading
+from drivers.replies import Reading
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
 _LOSS: Final = {

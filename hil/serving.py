@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
-from typing import Final
+from typing import Final, Literal
 
 from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
@@ -80,17 +80,13 @@ def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
             remedy="write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic",
         )
     # python-can is loaded only where a bus is asked for.
+    from drivers.transports.can import CanSpec
     from sim_fixtures.can_end import open_far_end as open_can
 
     moved_by_pc = settings.corrected or not settings.own_motion
-    return open_can(
-        interface,
-        channel,
-        "classic" if profile == "classic" else "fd",
-        period=settings.period,
-        n_axes=n_axes,
-        mode=settings.open_mode if moved_by_pc else None,
-    )
+    kind: Literal["fd", "classic"] = "classic" if profile == "classic" else "fd"
+    spec = CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
+    return open_can(spec, settings.open_mode if moved_by_pc else None)
 
 
 class Buttons:

@@ -23,7 +23,7 @@ from sim_fixtures import (
     SimulatedDrive,
     UnmodelledEffects,
 )
-from sim_fixtures.controller_faults import ControllerFault
+from sim_fixtures.faults import ControllerFault
 
 Array = NDArray[np.float64]
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.controller import SimulatedController
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.elastic_plant import ElasticPlant
 from sim_fixtures.errors import FixtureError, PlantDiverged, SettingError, SimulationError
-from sim_fixtures.plant import Plant
+from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth, standard_parameters
 from sim_fixtures.program import Phase
 from sim_fixtures.settings import ControllerSettings, ServoSettings
-from sim_fixtures.truth import PlantTruth, standard_parameters
 
 __all__ = [
     "SimulatedController",

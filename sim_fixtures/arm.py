@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.elastic_plant import ElasticPlant
 from sim_fixtures.errors import SettingError
-from sim_fixtures.plant import Plant
+from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
 from sim_fixtures.servo import CurrentLoop
 from sim_fixtures.settings import ControllerSettings
-from sim_fixtures.truth import PlantTruth
 
 Array = NDArray[np.float64]
 

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import Any, Final, Literal
+from collections.abc import Callable
+from typing import Final
 
 import can
 
-from drivers.errors import TransportClosed
 from drivers.transports.base import TransportError
-from drivers.transports.can.bus import Port, open_bus
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
-from drivers.transports.can.layout import MAX_AXES
-from drivers.transports.can.transport import CanSpec
+from drivers.transports.can.transport import CanSpec, Port, open_bus
 from sim_fixtures.far_end import FarEndError
 
 START_PATIENCE: Final = 0.25
@@ -93,43 +90,22 @@ class CanFarEnd:
 
 
 def open_far_end(
-    interface: str,
-    channel: str,
-    profile: Literal["fd", "classic"] = "fd",
-    *,
-    period: float,
-    n_axes: int = MAX_AXES,
-    mode: int | None = None,
-    bitrate: int | None = None,
-    data_bitrate: int | None = None,
-    start_patience: float = START_PATIENCE,
-    options: Mapping[str, Any] | None = None,
+    spec: CanSpec, mode: int | None = None, *, start_patience: float = START_PATIENCE
 ) -> CanFarEnd:
     """Open the controller's end on a bus of python-can.
 
     Args:
-        interface: "socketcan", "slcan", "udp_multicast", "virtual", ...
-        channel: "can0", "/dev/ttyACM0", ...
-        profile: "fd" or "classic".
-        period: cycle in s.
-        n_axes: axes of the robot.
+        spec: of the bus.
         mode: open mode of the session; None where no axis is opened.
-        bitrate: bit/s; None for 1 Mbit/s.
-        data_bitrate: bit/s of the data phase on FD; None for 5 Mbit/s.
         start_patience: s that the answer to a start packet is waited for.
-        options: further arguments of the python-can bus.
 
     Raises:
         FarEndError: it cannot be opened, or (`CanError` is its cause) cannot carry the session.
     """
-    spec = CanSpec(interface, channel, profile, bitrate, data_bitrate, period=period, n_axes=n_axes)
     rates = spec.rates
     try:
         spec.check(mode)
-        bus = open_bus(interface, channel, rates, options or {})
+        bus = open_bus(spec.interface, spec.channel, rates, spec.options)
     except TransportError as error:
         raise FarEndError(error.link, f"{error.reason}; {error.remedy}") from error
     return CanFarEnd(bus, rates, start_patience=start_patience)
-
-
-__all__ = ["START_PATIENCE", "CanFarEnd", "TransportClosed", "open_far_end"]

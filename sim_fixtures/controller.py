@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
-from math import copysign, isfinite
+from math import ceil, copysign, isfinite, sqrt
 from operator import gt
 from typing import NamedTuple
 
@@ -30,24 +30,275 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import PacketError
 from drivers.packets import (
+    AXIS_DTYPE,
+    DRIVE_ON,
     EXIT_FROM_OPEN,
     MAX_AXES,
+    MAX_CYCLIC_LENGTH,
+    N_ARMS,
+    NO_SLOT,
     CyclicPacket,
+    InitPacket,
     Mode,
     next_number,
     packet_number,
 )
 from sim_fixtures.arm import Mishap, SimulatedArm, UnmodelledEffects
-from sim_fixtures.controller_faults import ControllerFault
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.errors import SettingError
-from sim_fixtures.layout import Layout
-from sim_fixtures.own_motion import OwnMotion
-from sim_fixtures.plant import Plant
+from sim_fixtures.faults import ControllerFault
+from sim_fixtures.plant import Plant, PlantTruth, standard_parameters
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import NominalModel, Servo
-from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
-from sim_fixtures.truth import PlantTruth, standard_parameters
+from sim_fixtures.settings import AXES_PER_ARM, MAX_SLOTS, ControllerSettings
+
+_LED_BY_THE_PC = (1, 4, 5)
+_FOREIGN = {
+    "calibration": 0.5,
+    "current_limit": 10.0,
+    "gear_ratio": 100.0,
+    "following_error": 2.0,
+}
+"""What the init packet says of every axis of another arm."""
+
+
+class Layout:
+    """Axis blocks of this arm and of the others, and the packets they make.
+
+    Attributes:
+        axes: (n_slots,) the axis blocks of the next packet.
+        own: slot of each axis of this arm.
+        slots: the same as numbers.
+        n_slots: axis blocks in a packet.
+    """
+
+    def __init__(
+        self, n_axes: int, settings: ControllerSettings, tail: np.random.Generator
+    ) -> None:
+        """Distribute the slots.
+
+        Args:
+            n_axes: of this arm.
+            settings: arm, slots, foreign axes, long packets.
+            tail: where the garbage of long packets comes from.
+
+        Raises:
+            SettingError: more axes than a packet has slots or the other arms have axes, or slots
+                that are not distinct numbers below their count.
+        """
+        self.n_slots = n = n_axes + settings.foreign_axes
+        if n > MAX_SLOTS:
+            raise SettingError("foreign_axes", settings.foreign_axes, f"{MAX_SLOTS} axes in all")
+        slots = settings.slots if settings.slots is not None else tuple(range(n_axes))
+        if len(slots) != n_axes or len(set(slots)) != n_axes or not set(slots) <= set(range(n)):
+            raise SettingError("slots", slots, f"{n_axes} different slots of 0..{n - 1}")
+        self.slots = tuple(slots)
+        self.own = np.array(slots, np.intp)
+        self._foreign = np.array([s for s in range(n) if s not in slots], np.intp)
+        self._settings = settings
+        self._tail = tail
+        others = [arm for arm in range(N_ARMS) if arm != settings.arm - 1]
+        self._foreign_arm = [others[i // AXES_PER_ARM] for i in range(settings.foreign_axes)]
+        self.axes: NDArray[np.void] = np.zeros(n, AXIS_DTYPE)
+        # D1..D5, extra1..3 of all slots, (8, n_slots)
+        self._values = self.axes.view(np.float32).reshape(n, -1)[:, 1:].T
+        self._modes: tuple[int | bool | None, ...] = ()
+        # the axes of other arms stand somewhere, each in another place
+        places = np.arange(1.0, 1.0 + settings.foreign_axes) / 4.0
+        self.axes["d"][self._foreign, 0] = self.axes["d"][self._foreign, 2] = places
+        arms = {settings.arm - 1, *self._foreign_arm}
+        self._on = bytes(DRIVE_ON if arm in arms else 0 for arm in range(N_ARMS))
+
+    @property
+    def foreign_targets(self) -> list[float]:
+        """Targets of the axes of other arms [motor rev]."""
+        targets: list[float] = self.axes["d"][self._foreign, 0].tolist()
+        return targets
+
+    def fill(self, values: NDArray[np.float64]) -> None:
+        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite where float32 ends."""
+        with np.errstate(over="ignore"):
+            self._values[:, self.own] = values
+
+    def set_modes(self, common: int | None, open_axes: Sequence[bool]) -> None:
+        """Set all modes to `common`, or each axis to the open mode or to closed."""
+        wanted = (common, *open_axes)
+        if wanted == self._modes:
+            return
+        self._modes = wanted
+        if common is not None:
+            self.axes["mode"] = common
+            return
+        mode = self._settings.open_mode
+        self.axes["mode"][self.own] = [mode if is_open else 0 for is_open in open_axes]
+        opens = self._settings.foreign_open and any(open_axes)
+        self.axes["mode"][self._foreign] = mode if opens else 0
+
+    def packet(self, number: int, powered: bool) -> bytes:
+        """Return the cyclic packet with the present axis blocks."""
+        status = self._on if powered else bytes(N_ARMS)
+        packet = CyclicPacket(number, status, bytes(N_ARMS), self.axes).encode()
+        if self._settings.long_packets:
+            packet += self._tail.bytes(MAX_CYCLIC_LENGTH - len(packet))
+        return packet
+
+    def obey(self, answer: CyclicPacket) -> None:
+        """Let open axes of other arms go where the PC sends them."""
+        mode = self._settings.open_mode
+        if mode not in _LED_BY_THE_PC:
+            return
+        for slot in self._foreign.tolist():
+            if self.axes["mode"][slot] == mode == answer.axes["mode"][slot]:
+                target, delta = answer.axes["d"][slot, :2].tolist()
+                self.axes["d"][slot, :4] = (target, delta, target, delta)
+
+    def init(self, drive: SimulatedDrive, period: float) -> bytes:
+        """Return the 1200 bytes with what the controller announces about its axes."""
+        settings = self._settings
+        row = settings.arm - 1
+        own = (row, slice(drive.n_axes))
+        shape = (N_ARMS, AXES_PER_ARM)
+        tables = {name: np.zeros(shape, np.float32) for name in (*_FOREIGN, "kinematic_influence")}
+        slots = np.full(shape, NO_SLOT, np.int32)
+        modes = np.full(shape, -1, np.int32)
+        for i, (arm, slot) in enumerate(zip(self._foreign_arm, self._foreign, strict=True)):
+            at = (arm, i % AXES_PER_ARM)
+            slots[at], modes[at] = slot, Mode.CLOSED
+            for name, value in _FOREIGN.items():
+                tables[name][at] = value
+        slots[own], modes[own] = self.own, Mode.CLOSED
+        for name in _FOREIGN:
+            tables[name][own] = getattr(drive, name)
+        tables["kinematic_influence"][row, 3:6] = (drive.k54, drive.k64, drive.k65)
+        init = InitPacket.build(
+            min(self.n_slots, AXES_PER_ARM), round(period * 1000.0), {},
+            open_mode=modes, open_axes_map=slots, version=settings.version, **tables,
+        )  # fmt: skip
+        init.record["n_axes"] = self.n_slots
+        return init.encode()
+
+
+Array = NDArray[np.float64]
+
+RUN_UP = 0.4
+"""Time [s] to full speed at the acceleration that these moves keep; a guess."""
+_PEAK_SPEED = 15.0 / 8.0
+_PEAK_ACCELERATION = 10.0 / sqrt(3.0)
+
+
+def quintic(s: float) -> tuple[float, float]:
+    """Return the share of the way at time share s in [0, 1] and its derivative.
+
+    10 s^3 - 15 s^4 + 6 s^5: speed and acceleration are zero at both ends, the jerk is finite.
+    """
+    left = 1.0 - s
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * left * left
+
+
+def duration(distance: Array, speed: Array) -> float:
+    """Return how long [s] a quintic over `distance` [rad] at most at `speed` [rad/s] takes."""
+    reach = np.abs(distance)
+    by_speed = float((_PEAK_SPEED * reach / speed).max())
+    by_acceleration = sqrt(float((_PEAK_ACCELERATION * reach * RUN_UP / speed).max()))
+    return max(by_speed, by_acceleration)
+
+
+class OwnMotion:
+    """Visits postures one after the other; all joints of a move start and stop together.
+
+    Attributes:
+        position, velocity: set-point of the present tick, (n,) [rad], [rad/s].
+        finished: the last posture is reached, or the motion was asked to end.
+        at_rest: no move is under way.
+    """
+
+    def __init__(
+        self,
+        postures: Sequence[Sequence[float]],
+        *,
+        speed: ArrayLike,
+        period: float,
+        dwell: float = 0.2,
+        repeats: bool = False,
+    ) -> None:
+        """Take the list; `begin` says from where.
+
+        Args:
+            postures: joint angles (n,) [rad] each.
+            speed: greatest speed of each joint, (n,) [rad/s].
+            period: cycle [s].
+            dwell: rest in each posture [s].
+            repeats: go back through the list at its end, and forth again, until asked to end.
+
+        Raises:
+            SettingError: a posture of another size, or a speed that is not a finite number above 0.
+        """
+        self._speed: Array = np.array(speed, dtype=np.float64)
+        if not (np.isfinite(self._speed).all() and (self._speed > 0.0).all()):
+            raise SettingError("own_motion", self._speed.tolist(), "velocity limits in the URDF")
+        n = self._speed.size
+        for posture in postures:
+            if len(posture) != n:
+                raise SettingError("own_motion", tuple(posture), f"{n} joint angles")
+        self._postures = [np.array(posture, dtype=np.float64) for posture in postures]
+        self._period = period
+        self._repeats = repeats
+        self._dwell_cycles = max(1, round(dwell / period))
+        self._ending = False
+        self.begin(np.zeros(n))
+
+    def begin(self, position: ArrayLike) -> None:
+        """Start the list from where the arm stands, (n,) [rad]."""
+        self.position: Array = np.array(position, dtype=np.float64)
+        self.velocity: Array = np.zeros_like(self.position)
+        self._next = 0
+        self._stride = 1
+        self._from = self._to = self.position
+        self._cycle = self._cycles = 0
+        self._rested = 0
+        self._ending = False
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether no move is under way."""
+        return self._cycle >= self._cycles
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        done = self._ending or not 0 <= self._next < len(self._postures)
+        return done and self.at_rest
+
+    def end(self) -> None:
+        """Finish the move that is under way and begin no other."""
+        self._ending = True
+
+    def advance(self) -> tuple[Array, Array]:
+        """Return the set-point of the next tick: position [rad] and velocity [rad/s], (n,)."""
+        if self.at_rest and not self.finished:
+            self._rested += 1
+            if self._rested > self._dwell_cycles:
+                self._start_move()
+        if not self.at_rest:
+            self._cycle += 1
+            share, rate = quintic(self._cycle / self._cycles)
+            way = self._to - self._from
+            # at the end exactly where it was to go, not a rounding beside it
+            at_end = self._cycle == self._cycles
+            self.position = self._to if at_end else self._from + share * way
+            self.velocity = rate / (self._cycles * self._period) * way
+        return self.position, self.velocity
+
+    def _start_move(self) -> None:
+        self._from, self._to = self.position, self._postures[self._next]
+        self._next += self._stride
+        at_an_end = not 0 <= self._next < len(self._postures)
+        if self._repeats and len(self._postures) > 1 and at_an_end:
+            self._stride = -self._stride
+            self._next += 2 * self._stride
+        self._cycle = self._rested = 0
+        self._cycles = ceil(duration(self._to - self._from, self._speed) / self._period)
+
 
 Numbers = Sequence[float]
 Wanted = Sequence[Sequence[float] | None]
@@ -210,8 +461,6 @@ class Targets:
             demand.target[i] += self._offset[i]
             demand.delta[i] += self._offset[i] - before
 
-
-Array = NDArray[np.float64]
 
 EARTH = (0.0, 0.0, -9.81)
 NO_EFFECTS = UnmodelledEffects()

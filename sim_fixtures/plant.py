@@ -13,17 +13,105 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from operator import mul
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.errors import PlantDiverged, SettingError
-from sim_fixtures.truth import PlantTruth
 
 Array = NDArray[np.float64]
+_TENSOR_KEYS = ("xx", "xy", "yy", "xz", "yz", "zz")
+
+
+@dataclass(frozen=True, eq=False)
+class PlantTruth:
+    """Rotor inertias, friction and inertias of links; every array (n,), on the joint side.
+
+    Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3).
+
+    Attributes:
+        rotor_inertia: kg m2.
+        coulomb: N m.
+        viscous: N m s/rad.
+        third: N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic").
+        third_law: which of the two.
+        inertia_scale: mass, first moment and tensor of what each joint moves, over those of the
+            URDF; (1,) for the same of all joints. Scaled alike, a possible body stays one.
+
+    Raises:
+        SettingError: arrays of different sizes, non-finite or (all but `third`) negative values,
+            a scale that is not positive.
+    """
+
+    rotor_inertia: Array
+    coulomb: Array
+    viscous: Array
+    third: Array
+    third_law: Literal["quadratic", "cubic"] = "quadratic"
+    inertia_scale: Array = field(default_factory=lambda: np.ones(1))
+    _has_third: bool = field(init=False, repr=False, default=False)
+
+    def __post_init__(self) -> None:
+        n = np.size(self.rotor_inertia)
+        if np.size(self.inertia_scale) == 1:
+            object.__setattr__(self, "inertia_scale", np.full(n, self.inertia_scale))
+        for name in ("rotor_inertia", "coulomb", "viscous", "third", "inertia_scale"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != (n,) or not np.isfinite(values).all():
+                raise SettingError(name, values.tolist(), f"{n} finite numbers, one per joint")
+            if name != "third" and values.min(initial=0.0) < 0.0:
+                raise SettingError(name, values.tolist(), "not negative")
+            if name == "inertia_scale" and not values.all():
+                raise SettingError(name, values.tolist(), "greater than zero")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        object.__setattr__(self, "_has_third", bool(self.third.any()))
+
+    @classmethod
+    def frictionless(cls, rotor_inertia: ArrayLike) -> PlantTruth:
+        """Return a truth without friction."""
+        rotors = np.asarray(rotor_inertia, dtype=np.float64)
+        zero = np.zeros_like(rotors)
+        return cls(rotors, zero, zero, zero)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return self.rotor_inertia.size
+
+    def friction(self, velocity: ArrayLike) -> Array:
+        """Return the friction torque [N m] at joint velocities (..., n); 0 at standstill."""
+        v = np.asarray(velocity, dtype=np.float64)
+        return self.coulomb * np.sign(v) + self.smooth_friction(v)
+
+    def smooth_friction(self, velocity: Array) -> Array:
+        """Return the part of the friction torque that vanishes with the velocity."""
+        factor = self.viscous
+        if self._has_third:
+            shape = np.abs(velocity) if self.third_law == "quadratic" else velocity * velocity
+            factor = factor + self.third * shape
+        smooth: Array = factor * velocity
+        return smooth
+
+
+def standard_parameters(model: pin.Model, rotor_inertia: ArrayLike) -> dict[str, float]:
+    """Return a model's standard parameters by name: m1, mc1x ..., I1xx ... I1zz, then I1m ....
+
+    First moments [kg m] and tensors [kg m2] are about the origin of the joint frame, in its axes.
+    """
+    named: dict[str, float] = {}
+    for i in range(1, model.njoints):
+        values = model.inertias[i].toDynamicParameters()
+        keys = [f"m{i}", *(f"mc{i}{a}" for a in "xyz"), *(f"I{i}{k}" for k in _TENSOR_KEYS)]
+        named |= {key: float(value) for key, value in zip(keys, values, strict=True)}
+    rotors = np.asarray(rotor_inertia, dtype=np.float64)
+    named |= {f"I{i}m": float(value) for i, value in enumerate(rotors, start=1)}
+    return named
+
 
 MAX_SWEEPS = 200
 TOLERANCE = 1e-6
@@ -311,3 +399,113 @@ class Plant:
         self._trend = np.where(after == 0.0, 0.0, self.acceleration)
         self.velocity = after
         self._dry = np.array(result.torque)
+
+
+DAMPING_RATIO = 0.05
+MAX_STEP_ANGLE = 1.0
+"""Largest natural frequency times step [rad] that the integration is trusted with."""
+
+
+class ElasticPlant(Plant):
+    """A plant whose links hang on springs behind the gears of some axes."""
+
+    def __init__(
+        self,
+        urdf: str,
+        truth: PlantTruth,
+        *,
+        elasticity: Sequence[float],
+        step: float,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        position: ArrayLike | None = None,
+        brake_torque: ArrayLike = 0.0,
+    ) -> None:
+        """Put the arm at rest, the springs loaded by gravity.
+
+        Args:
+            urdf: URDF text.
+            truth: rotor inertias, friction, and how far the links are those of the URDF.
+            gravity: m/s2 in the base frame.
+            position: joint angles [rad]; the URDF's zero if not given.
+            brake_torque: dry friction of each joint's closed brake [N m].
+            elasticity: compliance of each gear (n,) [rad/(N m)]; 0 is rigid.
+            step: the step that will be used [s].
+
+        Raises:
+            SettingError: no elastic axis, one without a rotor, or a resonance too fast for `step`.
+        """
+        super().__init__(urdf, truth, gravity=gravity, position=position, brake_torque=brake_torque)
+        compliance = np.asarray(elasticity, dtype=np.float64)
+        if compliance.shape != (self.n_joints,) or not (compliance > 0.0).any():
+            raise SettingError("elasticity", tuple(elasticity), f"{self.n_joints} compliances")
+        soft = compliance > 0.0
+        if (truth.rotor_inertia[soft] <= 0.0).any():
+            raise SettingError("rotor_inertia", truth.rotor_inertia.tolist(), "> 0 if elastic")
+        self._soft = soft
+        self._rigid = ~soft
+        self._stiffness: Array = np.where(soft, 1.0 / np.where(soft, compliance, 1.0), 0.0)
+        self._rotor: Array = np.where(soft, truth.rotor_inertia, 1.0)
+        # the rotors of elastic axes are bodies of their own
+        self.model.armature = np.where(soft, 0.0, truth.rotor_inertia)
+        self._damping: Array = self._damping_within(step)
+        gravity_torque = pin.computeGeneralizedGravity(self.model, self.data, self.position)
+        self._motor: Array = self.position + compliance * gravity_torque
+        self._motor_velocity: Array = np.zeros(self.n_joints)
+        self._motor_trend: Array = np.zeros(self.n_joints)
+
+    def _damping_within(self, step: float) -> Array:
+        """Return each spring's damper [N m s/rad]; SettingError if `step` is too long for one."""
+        inertia = joint_inertia(self.model, self.data, self.position).diagonal()
+        reduced = 1.0 / (1.0 / self._rotor + 1.0 / inertia)
+        fastest = float(np.sqrt(self._stiffness / reduced).max())
+        if fastest * step > MAX_STEP_ANGLE:
+            bound = f"resonances below {MAX_STEP_ANGLE / step:.0f} rad/s"
+            raise SettingError("elasticity", f"one with {fastest:.0f} rad/s", bound)
+        damping: Array = 2.0 * DAMPING_RATIO * np.sqrt(self._stiffness * reduced) * self._soft
+        return damping
+
+    @property
+    def motor_position(self) -> Array:
+        """Where the motors stand, as joint angles (n,) [rad]."""
+        return np.where(self._soft, self._motor, self.position)
+
+    def energy(self) -> float:
+        """Return kinetic, potential and spring energy [J]."""
+        stretch = self._motor - self.position
+        springs = 0.5 * self._stiffness @ stretch**2
+        rotors = 0.5 * (self._rotor * self._soft) @ self._motor_velocity**2
+        return super().energy() + float(springs + rotors)
+
+    def step(self, torque: Array, step: float) -> None:
+        """Advance by `step` [s] under motor torques (n,) [N m] on the joint side."""
+        coulomb = self._coulomb
+        self.time += step
+        half = 0.5 * step
+        middle = self.position + half * self.velocity
+        predicted = self.velocity + half * self._trend
+        motor_middle = self._motor + half * self._motor_velocity
+        motor_predicted = self._motor_velocity + half * self._motor_trend
+        spring = self._stiffness * (motor_middle - middle)
+        spring += self._damping * (motor_predicted - predicted)
+
+        rotor_friction = self._turn_rotors(torque - spring, motor_predicted, coulomb, step)
+        smooth = self._smooth_friction(predicted) * self._rigid
+        load = np.where(self._soft, spring, torque - smooth)
+        self._advance(load, coulomb * self._rigid, middle, predicted, step)
+        self._smooth = smooth + rotor_friction
+        self.position = middle + half * self.velocity
+        self._motor = motor_middle + half * self._motor_velocity
+
+    def _turn_rotors(self, torque: Array, predicted: Array, coulomb: Array, step: float) -> Array:
+        """Accelerate the rotors of the elastic axes and return their friction (n,) [N m]."""
+        smooth = self._smooth_friction(predicted)
+        free = self._motor_velocity + step * (torque - smooth) / self._rotor
+        # alone on its axis, a rotor is stopped by the friction that takes its free speed away
+        momentum = self._rotor / step
+        dry = np.minimum(np.maximum(free * momentum, -coulomb), coulomb)
+        after = np.where(np.abs(dry) < coulomb, 0.0, free - dry / momentum) * self._soft
+        # a rotor that has just been stopped does not go on decelerating
+        self._motor_trend = np.where(after == 0.0, 0.0, (after - self._motor_velocity) / step)
+        self._motor_velocity = after
+        friction: Array = (smooth + dry) * self._soft
+        return friction

@@ -20,9 +20,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.plant import build_model, scale_bodies
+from sim_fixtures.plant import PlantTruth, build_model, scale_bodies
 from sim_fixtures.settings import ServoSettings
-from sim_fixtures.truth import PlantTruth
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.simulation import controller_settings, simulated_controller
 from planner import PiecewiseCubic, plan
-from sim_fixtures.fault_script import parse_fault, split_faults
+from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.ns16 import CELL_PATH
 from tests.fault_matrix.faulty_runs import (
     BEHAVIOURS,

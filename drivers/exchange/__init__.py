@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from drivers.exchange.control import ArchiveState, ControlBlock, Ended
-from drivers.exchange.event_log import EventReader, EventWriter
-from drivers.exchange.loop import exchange
-from drivers.exchange.notices import (
+from drivers.exchange.event_log import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
+    EventReader,
     EventsLost,
+    EventWriter,
     ExchangeEnded,
     ExchangeEvent,
     ExchangeFailed,
@@ -18,9 +18,14 @@ from drivers.exchange.notices import (
     OverrideRefused,
     ResumeRefused,
 )
-from drivers.exchange.process import ExchangeError, ExchangeProcess, WithdrawnError
+from drivers.exchange.loop import exchange
+from drivers.exchange.process import (
+    ExchangeError,
+    ExchangeProcess,
+    ExchangeSettings,
+    WithdrawnError,
+)
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
-from drivers.exchange.settings import ExchangeSettings
 from drivers.exchange.shared_ring import (
     PacketReader,
     RingReader,

@@ -22,18 +22,18 @@ from drivers.exchange.control import (
     Pulse,
     bin_of,
 )
-from drivers.exchange.event_log import EventWriter
-from drivers.exchange.motion_transfer import WITHDRAWN, Inbox
-from drivers.exchange.notices import (
+from drivers.exchange.event_log import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
+    EventWriter,
     ExchangeEvent,
     HoldRefused,
     Leaving,
     OverrideRefused,
     ResumeRefused,
 )
-from drivers.exchange.receive_queue import POLL
+from drivers.exchange.loop import POLL
+from drivers.exchange.motion_transfer import WITHDRAWN, Inbox
 from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket

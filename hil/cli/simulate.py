@@ -21,7 +21,7 @@ from hil.simulation import controller_settings, own_postures, simulated_controll
 from hil.terminal_text import printable
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import SettingError
-from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault, split_faults
+from sim_fixtures.faults import Fault, FaultScriptError, parse_fault, split_faults
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import PATIENCE, Histogram, Tally
 

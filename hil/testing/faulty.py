@@ -16,7 +16,7 @@ from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.progress import Silent
 from hil.simulation import simulated_controller, simulated_link
 from sim_fixtures import SimulatedController
-from sim_fixtures.fault_script import parse_fault, split_faults
+from sim_fixtures.faults import parse_fault, split_faults
 
 SHORT: Final = {
     "repetitions": 2,

@@ -2,22 +2,215 @@
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from math import degrees
 from pathlib import Path
+from types import MappingProxyType
 
-from sim_fixtures.ns16.table2 import (
-    N_ESSENTIAL,
-    TABLE2_PATH,
-    Table2Row,
-    base_from_standard,
-    table2,
-)
-from sim_fixtures.ns16.truth import (
-    TRUTH_PATH,
-    LinkInertia,
-    Ns16Truth,
-    load_truth,
-    standard_parameters,
-)
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_fixtures.ns16 import geometry
+
+TRUTH_PATH = Path(__file__).with_name("truth.json")
+TENSOR_KEYS = ("xx", "xy", "xz", "yy", "yz", "zz")
+
+
+@dataclass(frozen=True)
+class LinkInertia:
+    """Inertial parameters of a link about O_{i-1}, in the axes of link frame i.
+
+    Attributes:
+        mass: kg.
+        first_moment: mass times centre of mass, kg m.
+        tensor: (xx, xy, xz, yy, yz, zz) of the inertia tensor, kg m2; off-diagonal entries are
+            minus the products of inertia.
+    """
+
+    mass: float
+    first_moment: tuple[float, float, float]
+    tensor: tuple[float, float, float, float, float, float]
+
+    @property
+    def centre_of_mass(self) -> tuple[float, float, float]:
+        """Return the centre of mass in the link frame [m]."""
+        x, y, z = self.first_moment
+        return (x / self.mass, y / self.mass, z / self.mass)
+
+    @property
+    def tensor_at_centre(self) -> tuple[float, float, float, float, float, float]:
+        """Return the tensor about the centre of mass (Steiner), same order as `tensor`."""
+        x, y, z = self.centre_of_mass
+        xx, xy, xz, yy, yz, zz = self.tensor
+        m = self.mass
+        return (
+            xx - m * (y * y + z * z),
+            xy + m * x * y,
+            xz + m * x * z,
+            yy - m * (x * x + z * z),
+            yz + m * y * z,
+            zz - m * (x * x + y * y),
+        )
+
+
+@dataclass(frozen=True)
+class Ns16Truth:
+    """What is planted in the simulated NS 16.
+
+    Attributes:
+        links: inertial parameters of links 1 ... 6.
+        rotor_inertia: on the link side, kg m2.
+        coulomb: N m.
+        viscous: N m s/rad; the printed figures read as N m s/deg, which is an assumption.
+        third: factor of sgn(qd) qd^2, N m s2/rad2.
+    """
+
+    links: tuple[LinkInertia, ...]
+    rotor_inertia: tuple[float, ...]
+    coulomb: tuple[float, ...]
+    viscous: tuple[float, ...]
+    third: tuple[float, ...]
+
+
+@cache
+def load_truth() -> Ns16Truth:
+    """Read truth.json."""
+    data = json.loads(TRUTH_PATH.read_text(encoding="utf-8"))
+    links = tuple(
+        LinkInertia(mass, (x, y, z), tuple(tensor[key] for key in TENSOR_KEYS))
+        for mass, (x, y, z), tensor in zip(
+            data["mass"], data["first_moment"], data["inertia"], strict=True
+        )
+    )
+    friction = data["friction"]
+    return Ns16Truth(
+        links=links,
+        rotor_inertia=tuple(data["rotor_inertia"]),
+        coulomb=tuple(friction["coulomb"]),
+        # 1 N m s/deg is 180/pi N m s/rad
+        viscous=tuple(degrees(printed) for printed in friction["viscous_printed"]),
+        third=tuple(friction["third"]),
+    )
+
+
+def standard_parameters() -> dict[str, float]:
+    """Return every standard parameter by name: m1, mc1x, ..., I1xx, ..., I6zz, then I1m ... I6m."""
+    truth = load_truth()
+    named: dict[str, float] = {}
+    for i, link in enumerate(truth.links, start=1):
+        named[f"m{i}"] = link.mass
+        named |= {f"mc{i}{a}": v for a, v in zip("xyz", link.first_moment, strict=True)}
+        named |= {f"I{i}{k}": v for k, v in zip(TENSOR_KEYS, link.tensor, strict=True)}
+    named |= {f"I{i}m": value for i, value in enumerate(truth.rotor_inertia, start=1)}
+    return named
+
+
+Array = NDArray[np.float64]
+Terms = dict[str, float]
+
+TABLE2_PATH = Path(__file__).with_name("table2.csv")
+N_ESSENTIAL = 40
+
+_A1, _A2, _A3 = geometry.A[:3]
+_D4 = -geometry.D[3]
+
+
+@dataclass(frozen=True)
+class Table2Row:
+    """One row of Table 2, SI units.
+
+    Attributes:
+        id: 1 ... 58 as printed.
+        printed_symbol: the symbol in the print.
+        parameter: how it is read; rows 41 ... 52 are interleaved in print.
+        pivot: standard parameter whose regressor column is this row's column ("" for friction).
+        sign: +1 or -1, the factor of that column.
+        terms: standard parameters grouped in this row with their factors, pivot included.
+        pi_a, pi_b, pi_c: estimates of methods A and B, and the manufacturer's value (None where
+            the table has none). Rows f1 are printed in an unstated unit.
+    """
+
+    id: int
+    printed_symbol: str
+    parameter: str
+    pivot: str
+    sign: int
+    terms: Mapping[str, float]
+    pi_a: float
+    pi_b: float
+    pi_c: float | None
+
+
+def _masses(first: int, factor: float) -> Terms:
+    """Return `factor` times the mass of every link from `first` to the last."""
+    return {f"m{i}": factor for i in range(first, 7)}
+
+
+# Rows 23-40; the first term of each is the pivot.
+_GROUPED: dict[int, Terms] = {
+    23: {
+        "I1yy": 1.0, "I1m": 1.0, "m2": _A1**2, "I2yy": 1.0, "m3": _A1**2 + _A2**2, "I3zz": 1.0,
+        **_masses(4, _A1**2 + _A2**2 + _A3**2),
+    },
+    24: {"mc2x": 1.0, **_masses(3, _A2)},
+    25: {"I2xx": 1.0, "I2yy": -1.0, **_masses(3, -(_A2**2))},
+    26: {"I2xz": 1.0, "mc3y": _A2},
+    27: {"I2zz": 1.0, "I2m": 1.0, **_masses(3, _A2**2)},
+    28: {"mc3x": 1.0, **_masses(4, _A3)},
+    29: {"mc3z": -1.0, "mc4y": 1.0, **_masses(5, _D4)},
+    30: {
+        "I3xx": 1.0, "I3zz": -1.0, "m4": -(_A3**2), "I4zz": 1.0,
+        **_masses(5, _D4**2 - _A3**2),
+    },
+    31: {"I3xz": -1.0, "mc4y": -_A3, **_masses(5, -_A3 * _D4)},
+    32: {"I3yy": 1.0, "m4": _A3**2, "I4zz": 1.0, **_masses(5, _A3**2 + _D4**2)},
+    33: {"mc4z": 1.0, "mc5y": -1.0},
+    34: {"I4xx": 1.0, "I4zz": -1.0, "I5zz": 1.0},
+    35: {"I4yy": 1.0, "I5zz": 1.0},
+    36: {"I4yz": 1.0, "mc5y": _D4},
+    37: {"mc5z": 1.0, "mc6z": 1.0},
+    38: {"I5xx": 1.0, "I5zz": -1.0, "I6yy": 1.0},
+    39: {"I5yy": 1.0, "I6yy": 1.0},
+    40: {"I6xx": 1.0, "I6yy": -1.0},
+}  # fmt: skip
+
+
+@cache
+def table2() -> tuple[Table2Row, ...]:
+    """Return the 58 rows in the order of the table."""
+    rows = []
+    with TABLE2_PATH.open(encoding="utf-8", newline="") as stream:
+        for record in csv.DictReader(stream):
+            row_id = int(record["id"])
+            terms: Terms = {}
+            if row_id <= N_ESSENTIAL:
+                terms = _GROUPED.get(row_id, {record["parameter"]: 1.0})
+            pivot = next(iter(terms), "")
+            rows.append(
+                Table2Row(
+                    id=row_id,
+                    printed_symbol=record["printed_symbol"],
+                    parameter=record["parameter"],
+                    pivot=pivot,
+                    sign=int(terms.get(pivot, 1.0)),
+                    terms=MappingProxyType(terms),
+                    pi_a=float(record["pi_a"]),
+                    pi_b=float(record["pi_b"]),
+                    pi_c=float(record["pi_c"]) if record["pi_c"] else None,
+                )
+            )
+    return tuple(rows)
+
+
+def base_from_standard(standard: Mapping[str, float]) -> Array:
+    """Return the 40 essential parameters of Table 2 (rows 1 ... 40) from standard parameters."""
+    rows = table2()[:N_ESSENTIAL]
+    return np.array([sum(f * standard[name] for name, f in row.terms.items()) for row in rows])
+
 
 FOLDER = Path(__file__).parent
 URDF_PATH = FOLDER / "ns16.urdf"

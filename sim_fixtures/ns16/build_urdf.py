@@ -19,8 +19,7 @@ from typing import Literal
 import numpy as np
 
 from sim_fixtures.errors import FixtureError
-from sim_fixtures.ns16 import CELL_PATH, URDF_PATH, geometry
-from sim_fixtures.ns16.truth import LinkInertia, load_truth
+from sim_fixtures.ns16 import CELL_PATH, URDF_PATH, LinkInertia, geometry, load_truth
 
 Axis = Literal["x", "y", "z"]
 

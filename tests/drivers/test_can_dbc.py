@@ -8,16 +8,17 @@ import pytest
 
 from drivers.packets import CyclicPacket
 from drivers.transports.can.bus_load import BusRates
-from drivers.transports.can.dbc import FILES, dbc_text
+from drivers.transports.can.codecs import words_of
 from drivers.transports.can.ends import ControllerEnd
 from drivers.transports.can.layout import (
     CLASSIC_MODE_CODES,
     FD_MODE_CODES,
+    FILES,
     SEGMENT_UP,
     SLOW_FIELDS,
     Frame,
+    dbc_text,
 )
-from drivers.transports.can.reply_fields import words_of
 from tests.drivers.can_bench import PROFILES, N, Wire, decoded, init_packet, random_packet
 
 CODES = {"fd": FD_MODE_CODES, "classic": CLASSIC_MODE_CODES}

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from drivers import CyclicPacket
 from drivers.packets import LAST_NUMBER, next_number
+from drivers.transports.can.codecs import NEVER, words_of
+from drivers.transports.can.ends import LONGEST, SegmentAssembler, Segmenter
 from drivers.transports.can.layout import SEGMENT_UP, Frame
-from drivers.transports.can.reply_fields import words_of
-from drivers.transports.can.segments import LONGEST, SegmentAssembler, Segmenter
-from drivers.transports.can.slow import NEVER
 from tests.drivers.can_bench import PROFILES, N, Wire, random_packet
 
 FRESH = (0, 1, 3, 5)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import can
 import numpy as np
 import pytest
@@ -12,8 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import CycleRing, Guard, Session, exchange
-from drivers.transports.can.bus_load import LOAD_LIMIT, BusRates, classic_bits, fd_bits
-from drivers.transports.can.errors import CanBusLoadError
+from drivers.transports.can.bus_load import (
+    LOAD_LIMIT,
+    BusRates,
+    CanBusLoadError,
+    classic_bits,
+    fd_bits,
+)
 from drivers.transports.can.layout import PAYLOADS_FD, SEGMENT_DOWN, SEGMENT_UP
 from tests.drivers.can_bench import (
     Cycles,
@@ -76,7 +78,7 @@ def test_six_axes_fit_a_classic_bus_at_2_ms_and_not_at_1_ms():
     rates.require_load(6, 0.002)
     with pytest.raises(CanBusLoadError, match=r"10 classic frames for 6 axes fill 135\.0 %") as e:
         rates.require_load(6, 0.001)
-    assert (e.value.load, e.value.limit, e.value.period) == (pytest.approx(1.35), 0.70, 0.001)
+    assert "cycle of 1 ms; allowed is 70 %" in str(e.value)
 
 
 @pytest.mark.parametrize(("n_axes", "fits"), [(1, True), (2, True), (3, False), (6, False)])
@@ -94,8 +96,8 @@ def test_what_is_let_through_is_within_the_limit(n_axes, period, bitrate, profil
     rates = BusRates(profile, bitrate)
     try:
         rates.require_load(n_axes, period)
-    except CanBusLoadError as error:
-        assert error.load > LOAD_LIMIT
+    except CanBusLoadError:
+        assert rates.load(n_axes, period) > LOAD_LIMIT
     else:
         assert rates.load(n_axes, period) <= LOAD_LIMIT
 
@@ -134,10 +136,3 @@ def test_the_load_on_a_log_of_the_bus_is_the_computed_one(profile, period):
     assert busy / (100 * period) == pytest.approx(rates.load(6, period))
     assert plain / (100 * period) == pytest.approx(rates.load(6, period, stuffed=False))
     assert busy / (100 * period) <= (0.50 if profile == "fd" else LOAD_LIMIT)
-
-
-def test_the_table_is_printed():
-    command = [sys.executable, "-W", "error", "-m", "drivers.transports.can.load"]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "47.7 %" in out
-    assert "135.0 %  refused" in out

@@ -80,7 +80,7 @@ def test_a_whole_session_over_two_serial_adapters(profile):
     options = {"sleep_after_open": 0.0}
     ends = (
         CanSpec("slcan", bus.ports[0], profile, period=PERIOD, options=options).open(),
-        open_far_end("slcan", bus.ports[1], profile, period=PERIOD, options=options),
+        open_far_end(CanSpec("slcan", bus.ports[1], profile, period=PERIOD, options=options)),
     )
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     bus.close()

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(params=PROFILES)
 def ends(request):
     near = CanSpec("socketcan", CHANNEL, request.param, period=PERIOD).open()
-    far = open_far_end("socketcan", CHANNEL, request.param, period=PERIOD)
+    far = open_far_end(CanSpec("socketcan", CHANNEL, request.param, period=PERIOD))
     yield near, far
     near.close()
     far.close()
@@ -42,7 +42,7 @@ class TestSocketCan(CanContract):
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_whole_motion_completes(profile):
     near = CanSpec("socketcan", CHANNEL, profile, period=PERIOD).open()
-    ends = near, open_far_end("socketcan", CHANNEL, profile, period=PERIOD)
+    ends = near, open_far_end(CanSpec("socketcan", CHANNEL, profile, period=PERIOD))
     # An emulated machine may stall for longer than a set of frames may take; such a set is torn.
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     (ended,) = run.seen(MotionEnded)

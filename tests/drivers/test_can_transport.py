@@ -71,7 +71,7 @@ class TestUdpMulticast(CanContract):
     def link(self, profile):
         channel = f"{GROUP}/{next(_ports)}"
         near = CanSpec("udp_multicast", channel, profile, period=0.002).open()
-        far = open_far_end("udp_multicast", channel, profile, period=0.002)
+        far = open_far_end(CanSpec("udp_multicast", channel, profile, period=0.002))
         yield near, Far(far)
         near.close()
         far.close()
@@ -85,7 +85,7 @@ class TestSlcan(CanContract):
         bus = SlcanBus()
         options = {"sleep_after_open": 0.0}
         near = CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open()
-        far = open_far_end("slcan", bus.ports[1], profile, period=0.002, options=options)
+        far = open_far_end(CanSpec("slcan", bus.ports[1], profile, period=0.002, options=options))
         far.receive(0.0)
         yield near, Far(far)
         near.close()
@@ -155,7 +155,7 @@ def test_a_target_that_is_no_number_or_out_of_its_field_never_leaves(profile, va
     with pytest.raises(TransportClosed) as caught:
         near.send(reply.encode())
     assert isinstance(caught.value.__cause__, CanValueError)
-    assert caught.value.__cause__.slot == 5
+    assert "slot 5" in str(caught.value.__cause__)
     assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
 
 
@@ -172,8 +172,8 @@ def test_a_session_with_more_axes_is_refused_by_both_ends(profile):
 
 
 def _as_segments(packet):
+    from drivers.transports.can.ends import Segmenter
     from drivers.transports.can.layout import SEGMENT_UP, Frame
-    from drivers.transports.can.segments import Segmenter
 
     return [Frame(SEGMENT_UP, payload) for payload in Segmenter(64).split(packet)]
 
@@ -302,7 +302,7 @@ def test_a_bus_that_is_not_there_is_named_with_its_remedy():
     with pytest.raises(TransportError, match="python-can"):
         CanSpec("no-such-interface", "0", period=0.001).open()
     with pytest.raises(FarEndError, match="vcan77"):
-        open_far_end("socketcan", "vcan77", period=0.002)
+        open_far_end(CanSpec("socketcan", "vcan77", period=0.002))
 
 
 @pytest.mark.parametrize(
@@ -335,13 +335,13 @@ def test_an_adapter_that_refuses_the_bit_rate_is_let_go(monkeypatch, caplog):
 
 def test_the_controllers_end_is_checked_before_the_bus_is_opened():
     with pytest.raises(FarEndError, match=r"135\.0 % of a cycle of 1 ms") as caught:
-        open_far_end("virtual", "0", "classic", period=0.001)
+        open_far_end(CanSpec("virtual", "0", "classic", period=0.001))
     assert isinstance(caught.value.__cause__, CanBusLoadError)
     with pytest.raises(FarEndError, match="mode 8") as caught:
-        open_far_end("virtual", "0", period=0.002, mode=8)
+        open_far_end(CanSpec("virtual", "0", period=0.002), mode=8)
     assert isinstance(caught.value.__cause__, CanModeError)
     with pytest.raises(FarEndError, match="7 axes"):
-        open_far_end("virtual", "0", period=0.002, n_axes=7)
+        open_far_end(CanSpec("virtual", "0", period=0.002, n_axes=7))
 
 
 def test_a_description_is_checked_before_the_bus_is_opened():
@@ -362,7 +362,7 @@ def test_modes_that_do_not_fit_are_refused_by_name(profile, mode):
     spec = CanSpec("virtual", "0", profile, period=0.002)
     with pytest.raises(CanModeError, match=f"mode {mode} ") as caught:
         spec.check(mode=mode)
-    assert caught.value.mode == mode
+    assert f"mode {mode} " in str(caught.value)
 
 
 def test_descriptions_and_errors_pickle():
@@ -370,9 +370,9 @@ def test_descriptions_and_errors_pickle():
     assert pickle.loads(pickle.dumps(spec)) == spec
     for error in (
         CanAxesError("seven"),
-        CanBusLoadError(0.8, 0.7, 0.001, "9 frames"),
-        CanModeError(8, 1, "no room"),
-        CanValueError("D1", 2, 5e4, "little"),
+        CanBusLoadError("full"),
+        CanModeError("no room"),
+        CanValueError("little"),
     ):
         copy = pickle.loads(pickle.dumps(error))
         assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))

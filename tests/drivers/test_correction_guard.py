@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import Guard, GuardError, JerkLimit, NotFinite
-from drivers.correction_guard import CorrectionGuard
 from drivers.errors import CorrectionNotEnded, PositionLimit
+from drivers.guard import CorrectionGuard
 from tests.drivers.rig import PERIOD, N, limits
 
 BOUNDS = limits()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from drivers import Guard, GuardLimits
-from drivers.correction_guard import CorrectionGuard
 from drivers.errors import (
     AccelerationLimit,
     CommandedCurrentLimit,
@@ -17,6 +16,7 @@ from drivers.errors import (
     PositionLimit,
     VelocityLimit,
 )
+from drivers.guard import CorrectionGuard
 from tests.drivers import edges
 from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
 from tests.drivers.rig import PERIOD, N, limits

@@ -21,7 +21,7 @@ from drivers import (
     TransportClosed,
     exchange,
 )
-from drivers.exchange.receive_queue import MOST_KINDS
+from drivers.exchange.loop import MOST_KINDS
 from tests.drivers.rig import PERIOD, START, Cruise, N, Rig, smooth_move
 
 MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])

@@ -23,9 +23,9 @@ from drivers.exchange import (
     control,
     event_log,
 )
+from drivers.exchange.__main__ import Rehearsal, rehearse
 from drivers.exchange.control import PATIENCE, STALE
-from drivers.exchange.receive_queue import POLL
-from drivers.exchange.rehearsal import Rehearsal, rehearse
+from drivers.exchange.loop import POLL
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
 from tests.drivers.rig import PERIOD, N, drive_train, limits
 

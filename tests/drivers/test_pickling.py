@@ -50,7 +50,11 @@ def subclasses(kind):
 
 
 KINDS = sorted(
-    {kind for kind in subclasses(DriverError) if kind.__module__ == errors.__name__},
+    {
+        kind
+        for kind in subclasses(DriverError)
+        if kind in vars(errors).values() and "_" not in kind.__name__
+    },
     key=lambda kind: kind.__name__,
 )
 
@@ -97,12 +101,6 @@ def test_an_error_with_a_unit_of_its_own():
     again = through_pickle(CorrectionNotEnded(1, 2.0, 0.0, 3, "rad/s"))
     assert again.unit == "rad/s"
     assert "2 rad/s" in str(again)
-
-
-def test_every_error_is_drawn_in_the_tree():
-    drawn = {word.strip(",") for word in errors.__doc__.replace("─", " ").split()}
-    for kind in KINDS:
-        assert kind.__name__ in drawn, f"{kind.__name__} is missing in the tree"
 
 
 EVENTS = {

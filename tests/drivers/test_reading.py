@@ -7,8 +7,7 @@ import pytest
 
 from drivers import Mode
 from drivers.packets import DRIVE_ON, LAST_NUMBER
-from drivers.reading import Reader
-from drivers.replies import D1, safe_answer
+from drivers.replies import D1, Reader, safe_answer
 from drivers.session import Sequence
 from tests.drivers.rig import START, Rig, all_drive_off
 

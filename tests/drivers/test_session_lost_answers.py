@@ -7,7 +7,7 @@ import pytest
 
 from drivers import MotionNotCarriedOn, State
 from drivers.events import AnswersLost
-from drivers.set_points import REPETITIONS
+from drivers.open_mode import REPETITIONS
 from tests.drivers.rig import START, Cruise, N, Rig, assert_refused, limits, moving, still
 
 STEP = 1.9 * 0.002 * 120.0 / (2.0 * np.pi)

@@ -10,7 +10,7 @@ import pytest
 
 from drivers import Guard
 from drivers.errors import MotionNotCarriedOn, NotFinite
-from drivers.set_points import REPETITIONS, SentSetPoints
+from drivers.open_mode import REPETITIONS, SentSetPoints
 from tests.drivers.rig import PERIOD, N, limits
 
 TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])

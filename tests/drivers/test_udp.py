@@ -21,7 +21,7 @@ from drivers import (
     State,
     exchange,
 )
-from drivers.exchange import receive_queue
+from drivers.exchange import loop
 from drivers.transports import TransportError, UdpSpec, UdpTransport
 from drivers.transports.udp import MOST_PASSED_OVER
 from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
@@ -429,7 +429,7 @@ class TestSession:
     def test_before_the_init_packet_a_controller_that_was_silent_may_change_its_port(
         self, near, controller, another, session, monkeypatch
     ):
-        monkeypatch.setattr(receive_queue, "FALLEN_SILENT", 0.1)
+        monkeypatch.setattr(loop, "FALLEN_SILENT", 0.1)
         forgotten, forget = [], near.forget_peer
         monkeypatch.setattr(near, "forget_peer", lambda: forgotten.append(forget()))
         controller.send(self.sync(1))
@@ -513,7 +513,7 @@ class TestSession:
     def test_one_that_began_a_start_and_did_not_go_on_does_not_keep_it_out(
         self, near, controller, another, session, monkeypatch
     ):
-        monkeypatch.setattr(receive_queue, "FALLEN_SILENT", 0.2)
+        monkeypatch.setattr(loop, "FALLEN_SILENT", 0.2)
         end = time.monotonic() + 5.0
         another.send(self.sync(1))
 

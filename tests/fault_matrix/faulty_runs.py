@@ -36,7 +36,7 @@ from drivers import (
 from drivers.packets import Mode, cyclic_length
 from planner import TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
-from sim_fixtures.fault_script import parse_fault, split_faults
+from sim_fixtures.faults import parse_fault, split_faults
 from tests.fault_matrix import small_cell
 from tests.fault_matrix.laws import (
     LIMITS,

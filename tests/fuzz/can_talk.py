@@ -11,9 +11,8 @@ import numpy as np
 from drivers import CyclicPacket, InitPacket
 from drivers.errors import PacketError
 from drivers.packets import DRIVE_ON, EXIT_FROM_OPEN, Mode, next_number
-from drivers.transports.can.bus_load import BusRates
+from drivers.transports.can.bus_load import BusRates, CanError
 from drivers.transports.can.ends import ControllerEnd, PcEnd
-from drivers.transports.can.errors import CanError
 from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, Frame
 from tests.fuzz.draw import Draw
 

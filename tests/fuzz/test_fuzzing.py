@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Guard, Session
+from drivers.transports.can import codecs as answers
 from drivers.transports.can import ends
-from drivers.transports.can import reply_fields as answers
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError

@@ -28,8 +28,7 @@ from hil.identify import identify_campaign
 from hil.progress import Silent, Task
 from hil.simulation import simulated_drive
 from planner import Move, plan_moves
-from sim_fixtures.elastic_plant import ElasticPlant
-from sim_fixtures.truth import PlantTruth
+from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
 from tests.hil.new_cells import described_robot, filled_in
 

@@ -66,8 +66,7 @@ from hil.simulation import (
     simulated_drive,
     simulated_link,
 )
-from sim_fixtures.controller_faults import Faultable
-from sim_fixtures.fault_script import parse_fault, split_faults
+from sim_fixtures.faults import Faultable, parse_fault, split_faults
 from tests.hil.batch_workers import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 

@@ -19,9 +19,7 @@ from identification.estimators.consistent import (
 )
 from identification.factor.factor import Estimate, estimate, joint_weights
 from identification.model.pseudo_inertia import pseudo_inertia
-from sim_fixtures.ns16 import urdf_text
-from sim_fixtures.ns16.table2 import table2
-from sim_fixtures.ns16.truth import load_truth, standard_parameters
+from sim_fixtures.ns16 import load_truth, standard_parameters, table2, urdf_text
 
 Array = NDArray[np.float64]
 

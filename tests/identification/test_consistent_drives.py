@@ -13,8 +13,7 @@ from identification.estimators.consistent import ConsistentEstimate, consistent_
 from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
 from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
-from sim_fixtures.ns16 import urdf_text
-from sim_fixtures.ns16.truth import standard_parameters
+from sim_fixtures.ns16 import standard_parameters, urdf_text
 
 Array = NDArray[np.float64]
 

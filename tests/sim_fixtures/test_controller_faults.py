@@ -9,16 +9,7 @@ import pytest
 
 from drivers.packets import CyclicPacket, echo, is_init, next_number, packet_number
 from sim_fixtures import Phase, SettingError, SimulatedController
-from sim_fixtures.controller_faults import (
-    AxisLeaves,
-    ControllerFault,
-    CurrentSaturation,
-    DriveDrop,
-    EmergencyStop,
-    FollowingErrorFault,
-    Pause,
-    Restart,
-)
+from sim_fixtures.faults import parse_fault
 from tests.fault_matrix import small_cell
 
 N = small_cell.N
@@ -54,16 +45,16 @@ class Holding:
         return CyclicPacket.decode(self.packets[index], N)
 
 
-def run(cycles: int, *faults: ControllerFault, step: float = 0.0, **settings: Any) -> Holding:
-    pc = Holding(small_cell.controller(faults=faults, **settings), step)
+def run(cycles: int, *faults: str, step: float = 0.0, **settings: Any) -> Holding:
+    pc = Holding(small_cell.controller(faults=[*map(parse_fault, faults)], **settings), step)
     pc.run(cycles)
     return pc
 
 
 @pytest.mark.parametrize(
-    ("fault", "reason"), [(DriveDrop(100), "dropped"), (EmergencyStop(100), "emergency")]
+    ("fault", "reason"), [("drive-drop@100", "dropped"), ("e-stop@100", "emergency")]
 )
-def test_the_drive_goes_off_in_the_packet_of_that_cycle(fault: Any, reason: str) -> None:
+def test_the_drive_goes_off_in_the_packet_of_that_cycle(fault: str, reason: str) -> None:
     pc = run(300, fault)
     assert [pc.cyclic(k).status[0] for k in (99, 100, 299)] == [5, 0, 0]
     assert reason in pc.controller.reason
@@ -73,7 +64,7 @@ def test_the_drive_goes_off_in_the_packet_of_that_cycle(fault: Any, reason: str)
 
 
 def test_a_cold_restart_is_silence_then_the_whole_start_and_waits_for_the_drive() -> None:
-    pc = run(300, Restart(100), boot_time=0.05)
+    pc = run(300, "restart@100", boot_time=0.05)
     assert pc.packets[100:150] == [b""] * 50
     numbers = [packet_number(packet) for packet in pc.packets[150:163]]
     assert numbers == list(range(1, 14))
@@ -85,35 +76,35 @@ def test_a_cold_restart_is_silence_then_the_whole_start_and_waits_for_the_drive(
 
 
 def test_a_warm_restart_is_the_init_packet_next() -> None:
-    pc = run(120, Restart(100, warm=True))
+    pc = run(120, "restart@100:warm")
     assert is_init(pc.packets[100])
     assert packet_number(pc.packets[101]) == 11
     assert pc.cyclic(101).status[0] == 0
 
 
 def test_one_axis_leaves_and_the_others_stay() -> None:
-    pc = run(110, AxisLeaves(100, 2))
+    pc = run(110, "axis-leaves@100:axis=2")
     assert pc.cyclic(99).axes["mode"].tolist() == [4, 4]
     assert pc.cyclic(100).axes["mode"].tolist() == [4, 0]
     assert pc.cyclic(109).axes["mode"].tolist() == [4, 0]
 
 
 def test_a_pause_shows_for_as_long_as_it_lasts() -> None:
-    pc = run(140, Pause(100, 20, 502))
+    pc = run(140, "pause@100x20")
     assert [pc.cyclic(k).axes["mode"][0] for k in (99, 100, 119, 120)] == [4, 502, 502, 0]
 
 
 def test_a_jam_shows_only_in_motion_and_trips_the_drive_there() -> None:
-    at_rest = run(400, FollowingErrorFault(100, 1))
+    at_rest = run(400, "following-error@100:axis=1")
     assert at_rest.controller.reason == ""
-    moving = run(400, FollowingErrorFault(100, 1), step=0.01)
+    moving = run(400, "following-error@100:axis=1", step=0.01)
     assert "following error of axis 1" in moving.controller.reason
-    clear = run(400, FollowingErrorFault(100, 1, count=5), step=0.002)
+    clear = run(400, "following-error@100x5:axis=1", step=0.002)
     assert clear.controller.reason == ""
 
 
 def test_a_slip_shows_in_what_is_reported_and_nowhere_else() -> None:
-    pc, plain = run(160, FollowingErrorFault(100, 2, "slip", 50)), run(160)
+    pc, plain = run(160, "following-error@100x50:axis=2:slip"), run(160)
     for k, slip in ((99, 0.0), (100, 1.5), (149, 1.5), (150, 0.0)):
         d, expected = pc.cyclic(k).axes["d"].copy(), plain.cyclic(k).axes["d"].copy()
         expected[1, 2] += slip * small_cell.FOLLOWING_ERROR
@@ -121,7 +112,7 @@ def test_a_slip_shows_in_what_is_reported_and_nowhere_else() -> None:
 
 
 def test_a_load_drives_the_current_near_its_limit_and_goes_away_again() -> None:
-    pc = run(700, CurrentSaturation(100, 1, 300))
+    pc = run(700, "saturate@100x300:axis=1")
     current = np.array([pc.cyclic(k).axes["d"][0, 4] for k in range(90, 700)])
     limit = small_cell.TABLE["current_limit"][0]
     assert np.abs(current[:10]).max() < 0.5 * limit
@@ -130,13 +121,13 @@ def test_a_load_drives_the_current_near_its_limit_and_goes_away_again() -> None:
 
 
 def test_closed_brakes_bear_the_load() -> None:
-    pc = run(300, CurrentSaturation(20, 1, 200), drive_off_cycles=250)
+    pc = run(300, "saturate@20x200:axis=1", drive_off_cycles=250)
     np.testing.assert_array_equal(pc.controller.plant.position, small_cell.HOME)
 
 
 def test_an_axis_that_the_arm_has_not_is_refused() -> None:
     with pytest.raises(SettingError, match=r"axes 1\.\.2"):
-        run(1, AxisLeaves(100, 3))
+        run(1, "axis-leaves@100:axis=3")
 
 
 class TestOwnMotion:
@@ -173,7 +164,7 @@ class TestOwnMotion:
         assert last(0.0) == last(0.01)
 
     def test_after_a_trip_it_is_over(self) -> None:
-        pc = run(400, EmergencyStop(300), own_motion=self.POSTURES)
+        pc = run(400, "e-stop@300", own_motion=self.POSTURES)
         pc.run(200)
         np.testing.assert_array_equal(pc.controller.plant.velocity, 0.0)
         pc.controller.drive_on()
@@ -187,7 +178,7 @@ class TestOwnMotion:
         np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
 
     def test_with_open_axes_too_it_is_over_after_a_trip(self) -> None:
-        pc = run(600, EmergencyStop(400), own_motion=self.POSTURES, open_mode=8)
+        pc = run(600, "e-stop@400", own_motion=self.POSTURES, open_mode=8)
         pc.controller.drive_on()
         there = pc.controller.plant.position.copy()
         pc.run(1000)
@@ -209,15 +200,15 @@ class TestOwnMotion:
 
 
 def test_one_seed_is_one_run_with_faults_too() -> None:
-    faults = (FollowingErrorFault(90, 2, "slip", 10), Pause(110, 20), Restart(200, warm=True))
+    faults = ("following-error@90x10:axis=2:slip", "pause@110x20", "restart@200:warm")
     settings = {"encoder_noise": 0.5, "current_noise": 0.02, "foreign_axes": 3}
     assert run(60, **settings).packets == run(60, **settings).packets
     first = _raw(faults, settings)
     assert first == _raw(faults, settings)
 
 
-def _raw(faults: tuple[ControllerFault, ...], settings: dict[str, Any]) -> list[bytes]:
-    controller = small_cell.controller(faults=faults, **settings)
+def _raw(faults: tuple[str, ...], settings: dict[str, Any]) -> list[bytes]:
+    controller = small_cell.controller(faults=[*map(parse_fault, faults)], **settings)
     packets = []
     for _ in range(400):
         packet = controller.next_packet()

@@ -7,17 +7,13 @@ import re
 import pytest
 
 from drivers.transports.faults import Corrupt, Delay, Duplicate, Lose, Reorder
-from sim_fixtures.controller_faults import (
-    AxisLeaves,
-    CurrentSaturation,
-    DriveDrop,
-    EmergencyStop,
-    FollowingErrorFault,
-    Pause,
-    Push,
-    Restart,
+from sim_fixtures.faults import (
+    GRAMMAR,
+    ControllerFault,
+    FaultScriptError,
+    parse_fault,
+    split_faults,
 )
-from sim_fixtures.fault_script import GRAMMAR, FaultScriptError, parse_fault, split_faults
 
 LINES = {
     "lose@1200": Lose(1200),
@@ -31,19 +27,19 @@ LINES = {
     "reorder@1200:to_controller": Reorder(1200, "to_controller"),
     "corrupt@1200:offset=8": Corrupt(1200, 8),
     "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(1200, 8, 0x80, "to_controller"),
-    "restart@5000:cold": Restart(5000, warm=False),
-    "restart@5000": Restart(5000, warm=False),
-    "restart@5000:warm": Restart(5000, warm=True),
-    "drive-drop@7": DriveDrop(7),
-    "e-stop@7": EmergencyStop(7),
-    "axis-leaves@7:axis=3": AxisLeaves(7, 3),
-    "following-error@7:axis=2": FollowingErrorFault(7, 2),
-    "following-error@7x20:axis=2:slip": FollowingErrorFault(7, 2, "slip", 20),
-    "saturate@7x30:axis=1": CurrentSaturation(7, 1, 30),
-    "push@7:axis=2": Push(7, 2),
-    "push@7x30:axis=1": Push(7, 1, 30),
-    "pause@7x50:502": Pause(7, 50, 502),
-    "pause@7:500": Pause(7, 50, 500),
+    "restart@5000:cold": ControllerFault("restart", 5000, word="cold"),
+    "restart@5000": ControllerFault("restart", 5000, word="cold"),
+    "restart@5000:warm": ControllerFault("restart", 5000, word="warm"),
+    "drive-drop@7": ControllerFault("drive-drop", 7),
+    "e-stop@7": ControllerFault("e-stop", 7),
+    "axis-leaves@7:axis=3": ControllerFault("axis-leaves", 7, 3),
+    "following-error@7:axis=2": ControllerFault("following-error", 7, 2, 500, "jam"),
+    "following-error@7x20:axis=2:slip": ControllerFault("following-error", 7, 2, 20, "slip"),
+    "saturate@7x30:axis=1": ControllerFault("saturate", 7, 1, 30),
+    "push@7:axis=2": ControllerFault("push", 7, 2, 50),
+    "push@7x30:axis=1": ControllerFault("push", 7, 1, 30),
+    "pause@7x50:502": ControllerFault("pause", 7, count=50, word="502"),
+    "pause@7:500": ControllerFault("pause", 7, count=50, word="500"),
 }
 
 
@@ -94,4 +90,4 @@ def test_every_example_of_the_grammar_is_a_fault() -> None:
 
 def test_faults_of_link_and_controller_are_told_apart() -> None:
     faults = [parse_fault(line) for line in ("lose@1", "e-stop@2", "reorder@3", "restart@4")]
-    assert split_faults(faults) == ((Lose(1), Reorder(3)), (EmergencyStop(2), Restart(4)))
+    assert split_faults(faults) == ((faults[0], faults[2]), (faults[1], faults[3]))

@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_fixtures import FixtureError, ns16
-from sim_fixtures.ns16 import geometry
+from sim_fixtures.ns16 import LinkInertia, geometry
 from sim_fixtures.ns16.build_urdf import _inertial, nominal_urdf
-from sim_fixtures.ns16.truth import LinkInertia
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_fixtures import SettingError
-from sim_fixtures.own_motion import RUN_UP, OwnMotion
+from sim_fixtures.controller import RUN_UP, OwnMotion
 
 PERIOD = 0.002
 SPEED = np.array([2.0, 3.0])

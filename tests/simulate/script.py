@@ -1,6 +1,6 @@
 """One line of text for one thing that happens in a simulated campaign.
 
-Faults of link, controller and arm are written as everywhere (`sim_fixtures.fault_script`); the
+Faults of link, controller and arm are written as everywhere (`sim_fixtures.faults`); the
 lines here are those of the PC, its disk and the person before it.
 """
 
@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sim_fixtures.fault_script import GRAMMAR as FAULTS
-from sim_fixtures.fault_script import Fault, FaultScriptError, parse_fault
+from sim_fixtures.faults import GRAMMAR as FAULTS
+from sim_fixtures.faults import Fault, FaultScriptError, parse_fault
 
 GRAMMAR: Final = """\
 KIND@AT[xCOUNT][:OPTION]         AT counts the controller's cycles from 0, through all runs of the

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.exchange.receive_queue import Intake
+from drivers.exchange.loop import Intake
 from drivers.guard import Guard
 from drivers.session import Sequence
 from drivers.state_machine import Machine

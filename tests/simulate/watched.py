@@ -16,7 +16,7 @@ from drivers.transports import SimulatedTransport
 from drivers.transports.faults import Fault as LinkFault
 from hil.campaign import Link
 from sim_fixtures import Phase, SimulatedController
-from sim_fixtures.controller_faults import ControllerFault
+from sim_fixtures.faults import ControllerFault
 from tests.simulate.observed import Act, ArmHistory, Exchanged
 from tests.simulate.script import Mishap, Script
 

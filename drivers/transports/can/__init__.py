@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.transports.can.bus_load import LOAD_LIMIT, BusRates
-from drivers.transports.can.errors import (
+from drivers.transports.can.bus_load import (
+    LOAD_LIMIT,
+    BusRates,
     CanAxesError,
     CanBusLoadError,
     CanError,

@@ -10,8 +10,39 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from drivers.transports.can.errors import CanBusLoadError
+from drivers.errors import DriverError
+from drivers.transports.base import TransportError
 from drivers.transports.can.layout import PAYLOADS_FD
+
+
+class CanError(TransportError):
+    """The link as described cannot carry this session: `reason`, and what to do, `remedy`."""
+
+    def __init_subclass__(cls, *, remedy: str) -> None:
+        cls.remedy = remedy
+
+    def __init__(self, reason: str) -> None:
+        DriverError.__init__(self, f"CAN: {reason}; {self.remedy}")
+        self.link, self.reason = "CAN", reason
+
+
+class CanAxesError(CanError, remedy="the profile carries one to six axes of arm 1; use UDP"):
+    """The controller opens axes that the frames have no place for."""
+
+
+class CanBusLoadError(CanError, remedy="use a longer cycle, a faster bus or fewer axes"):
+    """The frames of a cycle would take too large a share of it."""
+
+
+class CanModeError(
+    CanError, remedy="the profile moves axes in modes 4, 5 and 7; use UDP for others"
+):
+    """A mode or an answer that the frames have no room for."""
+
+
+class CanValueError(CanError, remedy="check calibration and gear ratios"):
+    """A number that its field cannot hold."""
+
 
 ProfileName = Literal["fd", "classic"]
 LOAD_LIMIT: Final = 0.70
@@ -95,5 +126,7 @@ class BusRates:
         load = self.load(n_axes, period)
         if load > LOAD_LIMIT:
             count = len(self.cycle_payloads(n_axes))
-            frames = f"{count} {self.profile} frames for {n_axes} axes"
-            raise CanBusLoadError(load, LOAD_LIMIT, period, frames)
+            raise CanBusLoadError(
+                f"{count} {self.profile} frames for {n_axes} axes fill {100.0 * load:.1f} % of a "
+                f"cycle of {1e3 * period:g} ms; allowed is {100.0 * LOAD_LIMIT:.0f} %"
+            )

@@ -6,9 +6,11 @@ packet on, cyclic packets go as cyclic frames, and an answer goes the way its qu
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,27 +25,133 @@ from drivers.packets import (
     is_init,
     next_number,
 )
-from drivers.transports.can.bus_load import BusRates
-from drivers.transports.can.classic import ClassicCodec
-from drivers.transports.can.errors import CanAxesError, CanModeError
-from drivers.transports.can.fd import FdCodec, UpSet
+from drivers.transports.can.bus_load import BusRates, CanAxesError, CanModeError
+from drivers.transports.can.codecs import (
+    NEVER,
+    Ages,
+    ClassicCodec,
+    Codec,
+    FdCodec,
+    Sent,
+    SlowStore,
+    drive_off,
+    read_reply,
+    slow_turns,
+    slow_value,
+    write_reply,
+)
 from drivers.transports.can.layout import (
     COUNTS_PER_REVOLUTION,
     MAX_AXES,
+    PAYLOADS_FD,
     SEGMENT_DOWN,
     SEGMENT_UP,
     Frame,
 )
-from drivers.transports.can.reply_fields import (
-    Mirror,
-    Sent,
-    drive_off,
-    read_reply,
-    words_of,
-    write_reply,
-)
-from drivers.transports.can.segments import SegmentAssembler, Segmenter
-from drivers.transports.can.slow import NEVER, Ages, SlowSender, SlowStore
+
+Floats = NDArray[np.float32]
+
+LONGEST: Final = 1500
+"""Bytes of the longest packet."""
+_HEAD: Final = struct.Struct("<BBHI")
+_PREFIX: Final = 2
+ABANDONED: Final = 1.0
+"""s after which a transfer that stands still is given up."""
+REPEAT: Final = 0.1
+"""s within which a frame of a finished transfer counts as a duplicate."""
+
+
+class Segmenter:
+    """Cuts packets into payloads of at most `size` bytes, 8 or 64.
+
+    Segment 0 is the transfer number, 0, the length (u16) and the CRC-32 of the packet; the others
+    are the transfer number, their index and data.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._transfer = 0
+
+    def split(self, packet: bytes) -> list[bytes]:
+        """The payloads, in order.
+
+        Raises:
+            ValueError: empty, or longer than 1500 bytes.
+        """
+        if not 1 <= len(packet) <= LONGEST:
+            raise ValueError(f"a packet has 1..{LONGEST} bytes, not {len(packet)}")
+        transfer = self._transfer
+        self._transfer = (transfer + 1) % 256
+        payloads = [_HEAD.pack(transfer, 0, len(packet), zlib.crc32(packet))]
+        room = self._size - _PREFIX
+        for index, at in enumerate(range(0, len(packet), room), start=1):
+            payload = bytes((transfer, index)) + packet[at : at + room]
+            length = next(size for size in PAYLOADS_FD if size >= len(payload))
+            payloads.append(payload.ljust(length, b"\0"))
+        return payloads
+
+
+class SegmentAssembler:
+    """Puts packets together: each comes out whole and with the right CRC or not at all.
+
+    Args:
+        size: bytes of a full payload, 8 or 64.
+        discarded: counts "torn" (a segment is missing), "corrupt" (wrong CRC or length) and
+            "malformed" (no segment at all).
+    """
+
+    def __init__(self, size: int, discarded: Counter[str]) -> None:
+        self._room = size - _PREFIX
+        self._discarded = discarded
+        self._transfer = -1
+        self._parts: dict[int, bytes] = {}
+        self._done = True
+        self._seen = 0.0
+        self._finished: dict[int, float] = {}
+
+    def add(self, payload: bytes, time: float) -> bytes | None:
+        """Take one segment, received at `time` (s); the packet, if that completes it."""
+        if len(payload) <= _PREFIX or (payload[1] == 0 and len(payload) != _HEAD.size):
+            self._discarded["malformed"] += 1
+            return None
+        transfer, index = payload[0], payload[1]
+        finished = self._finished.get(transfer)
+        if finished is not None and abs(time - finished) <= REPEAT:
+            return None
+        if not self._belongs(transfer, index, payload, time):
+            if not self._done:
+                self._discarded["torn"] += 1
+            self._transfer, self._parts, self._done = transfer, {}, False
+        self._seen = time
+        self._parts[index] = payload
+        packet = self._complete()
+        if self._done:
+            self._finished[transfer] = time
+        return packet
+
+    def _belongs(self, transfer: int, index: int, payload: bytes, time: float) -> bool:
+        """Whether this is of the transfer under way."""
+        known = self._parts.get(index, payload)
+        recent = abs(time - self._seen) <= ABANDONED
+        return transfer == self._transfer and not self._done and known == payload and recent
+
+    def _complete(self) -> bytes | None:
+        head = self._parts.get(0)
+        if head is None:
+            return None
+        _, _, length, crc = _HEAD.unpack(head)
+        if 1 <= length <= LONGEST:
+            needed = range(1, 1 - (-length // self._room))
+            if not self._parts.keys() >= set(needed):
+                return None
+            data = b"".join(self._parts[i][_PREFIX:] for i in needed)[:length]
+            if len(data) == length and zlib.crc32(data) == crc:
+                self._done = True
+                return data
+        self._done = True
+        self._discarded["corrupt"] += 1
+        return None
+
 
 LATE: Final = 3
 """Cycles by which a frame may come after one of a later cycle without starting a new set."""
@@ -101,18 +209,6 @@ REMEMBERED: Final = 16
 _ARM: Final = 1
 
 
-Codec = FdCodec | ClassicCodec
-
-
-def segment_size(rates: BusRates) -> int:
-    """Bytes of a full frame."""
-    return 64 if rates.profile == "fd" else 8
-
-
-def _codec(rates: BusRates, n_axes: int) -> Codec:
-    return FdCodec(n_axes) if rates.profile == "fd" else ClassicCodec(n_axes)
-
-
 def require_carried(init: InitPacket, rates: BusRates) -> None:
     """See that the session this init packet begins fits the profile.
 
@@ -131,53 +227,55 @@ def require_carried(init: InitPacket, rates: BusRates) -> None:
     rates.require_load(init.n_axes, init.period)
 
 
-def _cyclic_session(packet: bytes, rates: BusRates) -> InitPacket | None:
-    """The init packet, if cyclic frames follow it; None for any other packet.
-
-    An init packet that cannot be understood is for the session to judge; no cyclic frames follow.
-    """
-    if not is_init(packet):
-        return None
-    try:
-        init = InitPacket.decode(packet)
-        require_carried(init, rates)
-    except PacketError:
-        return None
-    return init
-
-
-class PcEnd:
-    """The PC's end: frames of the controller to packets, replies to frames.
+class End:
+    """What both ends have in common.
 
     Attributes:
         discarded: frames, sets and packets thrown away, by kind: "foreign", "malformed", "torn",
-            "corrupt", "unannounced" (cyclic frames without an init packet).
+            "corrupt", "unannounced" (cyclic frames without an init packet), "stale" (answers to
+            packets too long ago).
     """
+
+    _upwards: ClassVar[bool]
+    """Whether this end receives what the controller sends."""
 
     def __init__(self, rates: BusRates) -> None:
         self.discarded: Counter[str] = Counter()
         self._rates = rates
-        self._segmenter = Segmenter(segment_size(rates))
-        self._segments = SegmentAssembler(segment_size(rates), self.discarded)
-        self._codecs = {n: _codec(rates, n) for n in range(1, MAX_AXES + 1)}
-        self._up_ids = frozenset(self._codecs[MAX_AXES].up_ids)
+        self._kind = FdCodec if rates.profile == "fd" else ClassicCodec
+        size = 64 if rates.profile == "fd" else 8
+        self._segmenter = Segmenter(size)
+        self._segments = SegmentAssembler(size, self.discarded)
+        self._profile_ids = self._ids(self._kind(MAX_AXES))
         self._codec: Codec | None = None
         self._sets: SetAssembler | None = None
-        self._slow = SlowStore(1)
-        self._before: NDArray[np.float64] | None = None
-        self._mirror = Mirror()
         self._sent: deque[Sent] = deque(maxlen=REMEMBERED)
-        self._ages: Ages | None = None
 
-    @property
-    def ages(self) -> Ages | None:
-        """(n_axes, 8) of the packet that came out last; None for one that came as segments."""
-        return self._ages
+    def _ids(self, codec: Codec) -> tuple[int, ...]:
+        return codec.up_ids if self._upwards else codec.down_ids
 
-    def forget(self) -> None:
-        """The controller was silent for so long that nothing slow is known any more."""
-        self._slow.forget()
-        self._before = None
+    def _cyclic_session(self, packet: bytes) -> InitPacket | None:
+        """The init packet, if cyclic frames follow it; None for any other packet.
+
+        An init packet that cannot be understood is for the session to judge; no cyclic frames
+        follow it.
+        """
+        if not is_init(packet):
+            return None
+        try:
+            init = InitPacket.decode(packet)
+            require_carried(init, self._rates)
+        except PacketError:
+            return None
+        return init
+
+    def _start(self, init: InitPacket) -> None:
+        """Cyclic frames of the session that this packet begins."""
+        self._codec = codec = self._kind(init.n_axes)
+        modulus = codec.up_modulus if self._upwards else codec.down_modulus
+        span = codec.span_cycles * init.period
+        self._sets = SetAssembler(self._ids(codec), modulus, span, self.discarded)
+        self._sent.clear()
 
     def receive(self, frame: Frame, time: float) -> bytes | None:
         """Take a frame that arrived at `time` (s); the packet, if that completes one.
@@ -185,64 +283,85 @@ class PcEnd:
         Raises:
             CanError: an init packet of a session that this bus cannot carry.
         """
-        if frame.id == SEGMENT_UP:
+        if frame.id == (SEGMENT_UP if self._upwards else SEGMENT_DOWN):
             packet = self._segments.add(frame.data, time)
             if packet is not None:
-                self._begin(packet)
+                self._whole(packet)
             return packet
-        if frame.id not in self._up_ids:
-            self.discarded["foreign"] += 1
-            return None
         codec, sets = self._codec, self._sets
-        if codec is None or sets is None or frame.id not in codec.up_ids:
-            self.discarded["unannounced"] += 1
-            return None
-        if len(frame.data) != codec.lengths[frame.id]:
+        if frame.id not in self._profile_ids:
+            self.discarded["foreign"] += 1
+        elif codec is None or sets is None or frame.id not in self._ids(codec):
+            self.discarded["unannounced" if self._upwards else "foreign"] += 1
+        elif len(frame.data) != codec.lengths[frame.id]:
             self.discarded["malformed"] += 1
-            return None
-        payloads = sets.add(frame.id, codec.number(frame), frame.data, time)
-        return None if payloads is None else self._packet(codec, payloads)
+        else:
+            payloads = sets.add(frame.id, codec.number(frame), frame.data, time)
+            try:
+                return None if payloads is None else self._packet(codec, frame, payloads)
+            except PacketError:
+                self.discarded["malformed"] += 1
+        return None
 
-    def _begin(self, packet: bytes) -> None:
-        self._ages = None
+    def _whole(self, packet: bytes) -> None:
+        """A packet came as segments."""
+
+    def _packet(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
+        """The packet of a set that its last frame completes; PacketError for one without sense."""
+        raise NotImplementedError
+
+    def _as_segments(self, packet: bytes) -> list[Frame]:
+        frame_id = SEGMENT_DOWN if self._upwards else SEGMENT_UP
+        return [Frame(frame_id, payload) for payload in self._segmenter.split(packet)]
+
+
+class PcEnd(End):
+    """The PC's end: frames of the controller to packets, replies to frames.
+
+    Attributes:
+        ages: (n_axes, 8) of the packet that came out last; None for one that came as segments.
+    """
+
+    _upwards = True
+
+    def __init__(self, rates: BusRates) -> None:
+        super().__init__(rates)
+        self._slow = SlowStore(1)
+        self._before: NDArray[np.float64] | None = None
+        self.ages: Ages | None = None
+
+    def forget(self) -> None:
+        """The controller was silent for so long that nothing slow is known any more."""
+        self._slow.forget()
+        self._before = None
+
+    def _whole(self, packet: bytes) -> None:
+        self.ages = None
         if not is_init(packet):
             return
         self._codec = self._sets = None
         self._sent.clear()
-        init = _cyclic_session(packet, self._rates)
-        if init is None:
-            return
-        codec = self._codecs[init.n_axes]
-        span = codec.span_cycles * init.period
-        self._codec = codec
-        self._sets = SetAssembler(codec.up_ids, codec.up_modulus, span, self.discarded)
-        self._slow = SlowStore(init.n_axes)
-        self._before = None
+        init = self._cyclic_session(packet)
+        if init is not None:
+            self._start(init)
+            self._slow = SlowStore(init.n_axes)
+            self._before = None
 
-    def _packet(self, codec: Codec, payloads: Sequence[bytes]) -> bytes | None:
-        try:
-            cycle = codec.read_up(payloads)
-        except PacketError:
-            self.discarded["malformed"] += 1
-            return None
+    def _packet(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes:  # noqa: ARG002
+        cycle = codec.read_up(payloads)
         ahead = self._slow.update(cycle.number, *cycle.slow, cycle.words)
         if cycle.counts is not None:
-            self._form_velocity(cycle, ahead)
-        packet = CyclicPacket(
-            cycle.number,
-            bytes((cycle.status, 0, 0, 0)),
-            self._slow.functionality,
-            cycle.words.view(AXIS_DTYPE).reshape(-1),
-        ).encode()
-        self._sent.append(self._mirror.sent(packet, codec.n_axes))
-        self._ages = self._slow.ages
+            self._form_velocity(cycle.counts, cycle.words.view(np.float32), ahead)
+        status = bytes((cycle.status, 0, 0, 0))
+        axes = cycle.words.view(AXIS_DTYPE).reshape(-1)
+        packet = CyclicPacket(cycle.number, status, self._slow.functionality, axes).encode()
+        self._sent.append(Sent.of(packet, codec.n_axes))
+        self.ages = self._slow.ages
         return packet
 
-    def _form_velocity(self, cycle: UpSet, ahead: int) -> None:
+    def _form_velocity(self, counts: NDArray[np.float64], floats: Floats, ahead: int) -> None:
         """D4 as the mean over the cycles since the last set, which is how old it is."""
-        counts = cycle.counts
-        floats = cycle.words.view(np.float32)
-        if counts is None or self._before is None or ahead < 1:
+        if self._before is None or ahead < 1:
             floats[:, 4] = np.nan
             self._slow.ages[:, 3] = NEVER
         else:
@@ -258,20 +377,13 @@ class PcEnd:
             CanModeError, CanValueError: the frames cannot carry it.
             ValueError: neither cyclic nor 1..1500 bytes.
         """
-        sent = self._answered(packet)
-        if sent is not None and self._codec is not None:
-            return self._codec.down(read_reply(packet, sent), sent)
-        return [Frame(SEGMENT_DOWN, payload) for payload in self._segmenter.split(packet)]
-
-    def _answered(self, reply: bytes) -> Sent | None:
-        """The packet with cyclic frames that this answers, if there is one."""
-        if self._codec is None or len(reply) != cyclic_length(self._codec.n_axes):
-            return None
-        number = int.from_bytes(reply[:4], "little", signed=True)
-        for sent in reversed(self._sent):
-            if next_number(sent.number) == number:
-                return sent
-        return None
+        codec = self._codec
+        if codec is not None and len(packet) == cyclic_length(codec.n_axes):
+            number = int.from_bytes(packet[:4], "little", signed=True)
+            for sent in reversed(self._sent):
+                if next_number(sent.number) == number:
+                    return codec.down(read_reply(packet, sent), sent)
+        return self._as_segments(packet)
 
     def drive_off(self) -> list[Frame]:
         """Frames that ask for drive-off in answer to the newest cyclic packet, if there is one."""
@@ -280,25 +392,19 @@ class PcEnd:
         return self._codec.down(drive_off(self._sent[-1]), self._sent[-1])
 
 
-class ControllerEnd:
+class ControllerEnd(End):
     """The controller's end: its packets to frames, frames of the PC to replies.
 
     Attributes:
-        discarded: as of `PcEnd`; "stale" are answers to packets too long ago.
+        segmented: whether the packet sent last went as segments.
     """
 
+    _upwards = False
+
     def __init__(self, rates: BusRates) -> None:
-        self.discarded: Counter[str] = Counter()
-        self._rates = rates
-        self._segmenter = Segmenter(segment_size(rates))
-        self._segments = SegmentAssembler(segment_size(rates), self.discarded)
-        self._codec: Codec | None = None
-        self._sets: SetAssembler | None = None
-        self._slow = SlowSender(1)
-        self._mirror = Mirror()
-        self._sent: deque[Sent] = deque(maxlen=REMEMBERED)
+        super().__init__(rates)
+        self._turns = slow_turns(1)
         self.segmented = False
-        """Whether the packet sent last went as segments."""
 
     def packet(self, packet: bytes) -> list[Frame]:
         """Frames of a packet of the controller, whatever it is.
@@ -307,62 +413,34 @@ class ControllerEnd:
             CanError: an init packet of a session that this bus cannot carry.
             ValueError: not 1..1500 bytes.
         """
-        init = _cyclic_session(packet, self._rates)
+        init = self._cyclic_session(packet)
         if init is not None:
             self._start(init)
+            self._turns = slow_turns(init.n_axes)
         frames = self._cyclic(packet)
         self.segmented = frames is None
-        if frames is None:
-            frames = [Frame(SEGMENT_UP, payload) for payload in self._segmenter.split(packet)]
-        return frames
-
-    def _start(self, init: InitPacket) -> None:
-        codec = _codec(self._rates, init.n_axes)
-        span = codec.span_cycles * init.period
-        self._codec = codec
-        self._sets = SetAssembler(codec.down_ids, codec.down_modulus, span, self.discarded)
-        self._slow = SlowSender(init.n_axes)
-        self._sent.clear()
+        return self._as_segments(packet) if frames is None else frames
 
     def _cyclic(self, packet: bytes) -> list[Frame] | None:
         """Cyclic frames, if they can carry this packet."""
         codec = self._codec
         if codec is None or len(packet) != cyclic_length(codec.n_axes):
             return None
-        number = int.from_bytes(packet[:4], "little", signed=True)
-        if not 1 <= number <= LAST_NUMBER:
+        sent = Sent.of(packet, codec.n_axes)
+        if not 1 <= sent.number <= LAST_NUMBER:
             return None
-        words = words_of(packet, codec.n_axes)
+        index = next(self._turns)
+        slow = (index, slow_value(index, sent.words, packet[8:12]))
         try:
-            frames = codec.up(number, packet[4], words, self._slow.next(words, packet[8:12]))
+            frames = codec.up(sent.number, sent.status, sent.words, slow)
         except CanModeError:
             return None
-        self._sent.append(self._mirror.sent(packet, codec.n_axes))
+        self._sent.append(sent)
         return frames
 
-    def receive(self, frame: Frame, time: float) -> bytes | None:
-        """Take a frame that arrived at `time` (s); the reply, if that completes one."""
-        if frame.id == SEGMENT_DOWN:
-            return self._segments.add(frame.data, time)
-        codec, sets = self._codec, self._sets
-        if codec is None or sets is None or frame.id not in codec.down_ids:
-            self.discarded["foreign"] += 1
-            return None
-        if len(frame.data) != codec.lengths[frame.id]:
-            self.discarded["malformed"] += 1
-            return None
-        payloads = sets.add(frame.id, codec.number(frame), frame.data, time)
-        return None if payloads is None else self._reply(codec, frame, payloads)
-
-    def _reply(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
+    def _packet(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
         for sent in reversed(self._sent):
             if codec.is_reply_to(frame, sent.number):
-                break
-        else:
-            self.discarded["stale"] += 1
-            return None
-        try:
-            return write_reply(codec.read_down(payloads, sent), sent)
-        except PacketError:
-            self.discarded["malformed"] += 1
-            return None
+                return write_reply(codec.read_down(payloads, sent), sent)
+        self.discarded["stale"] += 1
+        return None

@@ -31,11 +31,11 @@ _TOLERANCE: Final = 1e-6
 """Relative: how well planners keep their limits (`docs/interpolator.md`, `drivers.guard`)."""
 _EPS: Final = float(np.finfo(np.float64).eps)
 _STANDSTILL: Final = 5e-4
-"""Motor revolutions per cycle: two increments of a 12-bit encoder (`drivers.guard_limits`)."""
+"""Motor revolutions per cycle: two increments of a 12-bit encoder (`drivers.guard`)."""
 _FLOAT32: Final = float(np.finfo(np.float32).eps)
 """Motor revolutions per cycle: more than float32 leaves open of a step, which is far below 1."""
 _SLOW: Final = 4.0 * _STANDSTILL
-"""Steps of which several may be made up in one cycle (`drivers.set_points`)."""
+"""Steps of which several may be made up in one cycle (`drivers.open_mode`)."""
 _FIRST: Final = 0.1
 """Share of the following-error threshold that target and arm may differ by at first."""
 _LEAP: Final = 0.25

@@ -23,7 +23,7 @@ from .wire import Array, Gears
 
 LAW: Final = "rest"
 _STANDSTILL: Final = 5e-4
-"""Motor revolutions per cycle below which an axis stands (`drivers.guard_limits`)."""
+"""Motor revolutions per cycle below which an axis stands (`drivers.guard`)."""
 
 
 def rest(observed: Observed) -> Iterator[Broken]:

@@ -1,0 +1,603 @@
+"""Cyclic frames of both profiles: packets to numbers in frames, and replies to words in frames.
+
+FD: two frames up, one down, numbers as they are on the C4G wire. Classic: packed integers in frames
+of eight bytes. Positions are rounded to 2^-16 motor revolutions. A number outside its field is sent
+as the most negative value of the field and read as NaN, which no guard lets pass. D4 is formed from
+consecutive D3, and the D2 of an answer from consecutive D1.
+
+Most replies give back what the controller sent (the drive is off, the axes are closed). The PC has
+some of that only as aged or rounded values, so such an axis is not sent at all: it is *mirrored*,
+and the controller's end fills in what it sent itself, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import cycle
+from typing import ClassVar, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import PacketError
+from drivers.packets import (
+    AXIS_DTYPE,
+    DRIVE_ON,
+    EXIT_FROM_OPEN,
+    HEADER_LENGTH,
+    LAST_NUMBER,
+    N_ARMS,
+    CyclicPacket,
+    Mode,
+    next_number,
+)
+from drivers.transports.can.bus_load import CanModeError, CanValueError
+from drivers.transports.can.layout import (
+    CLASSIC_DOWN,
+    CLASSIC_MODE_CODES,
+    CLASSIC_UP_AXIS,
+    CLASSIC_UP_HEADER,
+    COUNTS_PER_AMPERE,
+    COUNTS_PER_REVOLUTION,
+    CURRENT_BITS,
+    DIFFERENCE_BITS,
+    DOWN_COUNTER_BITS,
+    FD_DOWN,
+    FD_MODE_CODES,
+    FD_UP_A,
+    FD_UP_B,
+    FUNCTIONALITY,
+    MAX_AXES,
+    REVOLUTION_BITS,
+    UP_COUNTER_BITS,
+    Action,
+    Frame,
+    Word,
+)
+
+Words = NDArray[np.int32]
+Ages = NDArray[np.uint16]
+Array = NDArray[np.float64]
+
+WORDS_PER_AXIS: Final = 9
+NEVER: Final = 0xFFFF
+"""Age of a value that was never received, and of one older than can be said."""
+_D1, _D2, _D3, _D4, _D5 = range(1, 6)
+_SLOW: Final = (2, 6, 7, 8)
+"""Columns of D2, extra1..3 in an axis block of nine words (mode first)."""
+_UNKNOWN: Final = int(np.float32(np.nan).view(np.int32))
+
+
+def slow_turns(n_axes: int) -> Iterator[int]:
+    """Indices of the slow values of `n_axes` axes, one a cycle, for ever."""
+    values = [MAX_AXES * field + axis for field in range(len(_SLOW)) for axis in range(n_axes)]
+    return cycle([*values, FUNCTIONALITY])
+
+
+def slow_value(index: int, words: Words, functionality: bytes) -> bytes:
+    """Four bytes of the slow value of this index in a packet's words (n, 9)."""
+    if index == FUNCTIONALITY:
+        return functionality
+    field, axis = divmod(index, MAX_AXES)
+    value: bytes = words[axis, _SLOW[field]].tobytes()
+    return value
+
+
+class SlowStore:
+    """The last of each value that goes up one per cycle, in turn, and its age.
+
+    Attributes:
+        ages: (n, 8) cycles since each of D1..D5, extra1..3 was sent, `NEVER` before the first.
+        functionality: four bytes, zero before the first.
+    """
+
+    def __init__(self, n_axes: int) -> None:
+        self._shape = (n_axes, len(_SLOW))
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is known."""
+        self.functionality = bytes(4)
+        self._values: Words = np.full(self._shape, _UNKNOWN, np.int32)
+        self._elapsed = np.full(self._shape, NEVER, np.int64)
+        self.ages = self._as_ages(self._elapsed)
+        self._last: int | None = None
+
+    def update(self, number: int, index: int, value: bytes, words: Words) -> int:
+        """Take the slow value of a cycle and fill all of them into its words, (n, 9).
+
+        Returns:
+            Cycles since the last one taken, 0 for the first; negative where this cycle is older
+            than that one. Of such a cycle nothing slow is known.
+        """
+        ahead = 0 if self._last is None else (number - self._last) % LAST_NUMBER
+        if ahead > LAST_NUMBER // 2 or (ahead == 0 and self._last is not None):
+            words[:, _SLOW] = _UNKNOWN
+            self.ages = self._as_ages(np.full_like(self._elapsed, NEVER))
+            return -1
+        self._last = number
+        np.minimum(self._elapsed + ahead, NEVER, out=self._elapsed)
+        field, axis = divmod(index, MAX_AXES)
+        if index == FUNCTIONALITY:
+            self.functionality = value
+        elif field < len(_SLOW) and axis < self._shape[0]:
+            self._values[axis, field] = np.frombuffer(value, np.int32)[0]
+            self._elapsed[axis, field] = 0
+        self._values[self._elapsed == NEVER] = _UNKNOWN
+        words[:, _SLOW] = self._values
+        self.ages = self._as_ages(self._elapsed)
+        return ahead
+
+    def _as_ages(self, elapsed: NDArray[np.int64]) -> Ages:
+        ages: Ages = np.zeros((self._shape[0], WORDS_PER_AXIS - 1), np.uint16)
+        ages[:, [column - 1 for column in _SLOW]] = elapsed
+        return ages
+
+
+class AxisAnswer(NamedTuple):
+    """The answer for one axis; `d1` and `d2` mean nothing where it is mirrored."""
+
+    mirrored: bool
+    mode: int
+    d1: float = 0.0
+    d2: float = 0.0
+
+
+class Answer(NamedTuple):
+    """One reply. `status` is the status byte of the arm."""
+
+    number: int
+    status: int
+    axes: tuple[AxisAnswer, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sent:
+    """The cyclic packet that is answered, as one end knows it.
+
+    Attributes:
+        number: its number.
+        status: status byte of arm 1.
+        words: (n, 9) its axis blocks.
+        modes: mode of each slot.
+        mask: (n, 9) all bits set in what a mirrored axis gives back; none if it cannot be.
+    """
+
+    number: int
+    status: int
+    words: Words
+    modes: list[int]
+    mask: Words
+
+    @classmethod
+    def of(cls, packet: bytes, n_axes: int) -> Sent:
+        """Understand the packet that is answered."""
+        words = words_of(packet, n_axes)
+        modes: list[int] = words[:, 0].tolist()
+        mask = _mirrored(packet[4], tuple(modes))
+        return cls(int.from_bytes(packet[:4], "little", signed=True), packet[4], words, modes, mask)
+
+
+def words_of(packet: bytes, n_axes: int) -> Words:
+    """The axis blocks of a cyclic packet as (n, 9) words; a read-only view."""
+    count = n_axes * AXIS_DTYPE.itemsize // 4
+    return np.frombuffer(packet, np.int32, count, HEADER_LENGTH).reshape(n_axes, WORDS_PER_AXIS)
+
+
+_GIVEN_BACK: Final[Mapping[int, int]] = {
+    Mode.CLOSED: _D2 + 1,
+    Mode.DRIVING_ON: _D2 + 1,
+    Mode.CLOSED_MIRRORED: _D5 + 1,
+}
+"""Words that a mirrored axis gives back with its drive on; all of them with the drive off."""
+
+
+@lru_cache(maxsize=256)
+def _mirrored(status: int, modes: tuple[int, ...]) -> Words:
+    mask = np.zeros((len(modes), WORDS_PER_AXIS), np.int32)
+    for slot, mode in enumerate(modes):
+        words = _GIVEN_BACK.get(mode, 0) if status == DRIVE_ON else WORDS_PER_AXIS
+        mask[slot, :words] = -1
+    return mask
+
+
+def read_reply(reply: bytes, sent: Sent) -> Answer:
+    """Put a reply into words.
+
+    Raises:
+        CanModeError: it carries what the frames have no room for.
+        CanValueError: a target is not finite.
+    """
+    words = words_of(reply, len(sent.words))
+    mirrored = (sent.mask[:, 0] != 0) & (words == (sent.words & sent.mask)).all(axis=1)
+    floats = words.view(np.float32)
+    modes: list[int] = words[:, 0].tolist()
+    surplus = np.flatnonzero((floats[:, _D2 + 1 :] != 0.0).any(axis=1) & ~mirrored)
+    if surplus.size:
+        slot = int(surplus[0])
+        raise CanModeError(
+            f"the answer in mode {modes[slot]} (slot {slot}) needs more than D1 and D2"
+        )
+    targets = floats[:, _D1 : _D2 + 1]
+    for slot, field in np.argwhere(~np.isfinite(targets) & ~mirrored[:, None]):
+        raise _no_room(f"D{field + 1}", slot, targets[slot, field], "finite numbers")
+    axes = zip(mirrored.tolist(), modes, *targets.T.tolist(), strict=True)
+    number = int.from_bytes(reply[:4], "little", signed=True)
+    return Answer(number, reply[4], tuple(AxisAnswer(*axis) for axis in axes))
+
+
+def _no_room(field: str, slot: int, value: float, holds: str) -> CanValueError:
+    return CanValueError(f"{field} of slot {slot} is {value:.9g}; its field holds {holds}")
+
+
+def write_reply(answer: Answer, sent: Sent) -> bytes:
+    """The reply itself, at the controller's end: 12 + 36 n bytes."""
+    axes = CyclicPacket.zeros(answer.number, len(answer.axes)).axes
+    words = axes.view(np.int32).reshape(-1, WORDS_PER_AXIS)
+    floats = words.view(np.float32)
+    for slot, axis in enumerate(answer.axes):
+        if axis.mirrored:
+            words[slot] = sent.words[slot] & sent.mask[slot]
+        else:
+            words[slot, 0] = axis.mode
+            floats[slot, [_D1, _D2]] = axis.d1, axis.d2
+    status = bytes((answer.status, *bytes(N_ARMS - 1)))
+    return CyclicPacket(answer.number, status, bytes(N_ARMS), axes).encode()
+
+
+def drive_off(sent: Sent) -> Answer:
+    """Mode 505 in every axis: what is sent where an answer cannot be."""
+    axis = AxisAnswer(False, int(Mode.DRIVE_OFF_REQUEST))
+    return Answer(next_number(sent.number), 0, (axis,) * len(sent.words))
+
+
+class UpSet(NamedTuple):
+    """The frames of one cycle, read.
+
+    Attributes:
+        number, status: of the packet.
+        words: (n, 9) modes and numbers, the slow ones zero.
+        slow: index and four bytes of the slow value.
+        counts: (n,) D3 in counts, NaN out of range, where D4 has to be formed from them; None
+            where D4 was sent.
+    """
+
+    number: int
+    status: int
+    words: Words
+    slow: tuple[int, bytes]
+    counts: Array | None = None
+
+
+class Codec:
+    """Frames of one profile for 1..6 axes.
+
+    Attributes:
+        up_ids, down_ids: identifiers of the frames of a cycle.
+        lengths: bytes of each.
+        up_modulus, down_modulus: numbers in the frames count up modulo this.
+        span_cycles: within which a set must be complete, for its number repeats.
+    """
+
+    up_ids: tuple[int, ...]
+    down_ids: tuple[int, ...]
+    lengths: Mapping[int, int]
+    up_modulus: ClassVar[int]
+    down_modulus: ClassVar[int]
+    span_cycles: ClassVar[int]
+    _up_mask: ClassVar[int]
+    _down_mask: ClassVar[int]
+    _codes: ClassVar[Mapping[int, int]]
+
+    def __init__(self, n_axes: int) -> None:
+        self.n_axes = n_axes
+
+    def number(self, frame: Frame) -> int:
+        """What tells the frames of one cycle from those of another."""
+        mask = self._down_mask if frame.id in self.down_ids else self._up_mask
+        return int.from_bytes(frame.data[:2], "little") & mask
+
+    def is_reply_to(self, frame: Frame, sent_number: int) -> bool:
+        """Whether a frame down belongs to the answer to that packet."""
+        return self.number(frame) == next_number(sent_number) & self._down_mask
+
+    def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
+        """Frames of a packet; CanModeError for a mode without a code."""
+        raise NotImplementedError
+
+    def read_up(self, payloads: Sequence[bytes]) -> UpSet:
+        """Read the frames of one cycle; PacketError for a mode code without a meaning."""
+        raise NotImplementedError
+
+    def down(self, answer: Answer, sent: Sent) -> list[Frame]:
+        """Frames of an answer; CanModeError, CanValueError where they cannot carry it."""
+        raise NotImplementedError
+
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:
+        """Read an answer; PacketError for what has no meaning."""
+        raise NotImplementedError
+
+    def _code(self, mode: int, slot: int) -> int:
+        code = self._codes.get(mode)
+        if code is None:
+            raise CanModeError(f"mode {mode} (slot {slot}) has no code")
+        return code
+
+
+_UP_A: Final = np.dtype(
+    [("number", "<u2"), ("mode", "u1", (6,)), ("d1", "<f4", (6,)), ("d3", "<f4", (6,)),
+     ("d4", "<f4", (2,))]
+)  # fmt: skip
+_UP_B: Final = np.dtype(
+    [("number", "<u2"), ("status", "u1"), ("slow", "u1"), ("value", "V4"), ("d4", "<f4", (4,)),
+     ("d5", "<f4", (6,))]
+)  # fmt: skip
+_DOWN: Final = struct.Struct("<HBB6B2x6f6f4x")
+"""number, status, mirrored axes (a bit each), modes, D1, D2"""
+_FD_MODES: Final = {code: mode for mode, code in FD_MODE_CODES.items()}
+
+
+class FdCodec(Codec):
+    """Frames of the FD profile."""
+
+    up_ids = (FD_UP_A, FD_UP_B)
+    down_ids = (FD_DOWN,)
+    lengths: Mapping[int, int] = {
+        FD_UP_A: _UP_A.itemsize,
+        FD_UP_B: _UP_B.itemsize,
+        FD_DOWN: _DOWN.size,
+    }
+    up_modulus = down_modulus = LAST_NUMBER
+    span_cycles = 1000
+    _up_mask = _down_mask = 0xFFFF
+    _codes = FD_MODE_CODES
+
+    def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
+        """Frames of a packet; CanModeError for a mode without a code."""
+        modes = [self._code(mode, slot) for slot, mode in enumerate(words[:, 0].tolist())]
+        values = np.zeros((MAX_AXES, WORDS_PER_AXIS), np.int32)
+        values[: self.n_axes] = words
+        floats = values.view(np.float32)
+        a, b = np.zeros((), _UP_A), np.zeros((), _UP_B)
+        a["number"] = b["number"] = number
+        a["mode"][: self.n_axes] = modes
+        a["d1"], a["d3"], a["d4"] = floats[:, _D1], floats[:, _D3], floats[:2, _D4]
+        b["status"], b["slow"], b["value"] = status, slow[0], np.void(slow[1])
+        b["d4"], b["d5"] = floats[2:, _D4], floats[:, _D5]
+        return [Frame(FD_UP_A, a.tobytes()), Frame(FD_UP_B, b.tobytes())]
+
+    def read_up(self, payloads: Sequence[bytes]) -> UpSet:
+        """Read the frames of one cycle; PacketError for a mode code without a meaning."""
+        n = self.n_axes
+        first, second = payloads
+        a, b = np.frombuffer(first, _UP_A)[0], np.frombuffer(second, _UP_B)[0]
+        words = np.zeros((MAX_AXES, WORDS_PER_AXIS), np.int32)
+        floats = words.view(np.float32)
+        words[:n, 0] = [_fd_mode(code) for code in first[2 : 2 + n]]
+        floats[:, _D1], floats[:, _D3], floats[:, _D5] = a["d1"], a["d3"], b["d5"]
+        floats[:2, _D4], floats[2:, _D4] = a["d4"], b["d4"]
+        return UpSet(int(a["number"]), second[2], words[:n], (second[3], second[4:8]))
+
+    def down(self, answer: Answer, sent: Sent) -> list[Frame]:  # noqa: ARG002 - as classic frames
+        """The frame of an answer; CanModeError for a mode without a code."""
+        axes = (*answer.axes, *(AxisAnswer(False, 0),) * (MAX_AXES - self.n_axes))
+        payload = _DOWN.pack(
+            answer.number,
+            answer.status,
+            sum(axis.mirrored << slot for slot, axis in enumerate(axes)),
+            *(self._code(axis.mode, slot) for slot, axis in enumerate(axes)),
+            *(0.0 if axis.mirrored else axis.d1 for axis in axes),
+            *(0.0 if axis.mirrored else axis.d2 for axis in axes),
+        )
+        return [Frame(FD_DOWN, payload)]
+
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:  # noqa: ARG002
+        """Read an answer; PacketError for a mode code without a meaning."""
+        number, status, mirrored, *fields = _DOWN.unpack(payloads[0])
+        codes, d1, d2 = (fields[at : at + self.n_axes] for at in range(0, 3 * MAX_AXES, MAX_AXES))
+        axes = tuple(
+            AxisAnswer(bool(mirrored >> slot & 1), _fd_mode(codes[slot]), d1[slot], d2[slot])
+            for slot in range(self.n_axes)
+        )
+        return Answer(number, status, axes)
+
+
+def _fd_mode(code: int) -> int:
+    mode = _FD_MODES.get(code)
+    if mode is None:
+        raise PacketError("mode code", code, "one of the CAN FD profile")
+    return mode
+
+
+_ABSOLUTE: Final = (Mode.POSITION_FEED_FORWARD, Mode.POSITION, Mode.POSITION_RELATIVE)
+"""Modes whose D1 is a position."""
+_CLASSIC_MODES: Final = np.array(list(CLASSIC_MODE_CODES), np.int32)
+"""(16,) mode of each code, in order."""
+_WORDS: Final[Mapping[int, int]] = {
+    Mode.DRIVE_OFF_REQUEST: Word.DRIVE_OFF,
+    Mode.FOLLOWING_ERROR: Word.FOLLOWING_ERROR,
+}
+_D1_MASK: Final = (1 << REVOLUTION_BITS) - 1
+_D1_MOST: Final = _D1_MASK >> 1
+_MODE_AT, _D3_AT, _DIFFERENCE_AT, _CURRENT_AT = 4, 8, 35, 52
+_ACTION_AT: Final = (6, 35)
+_D1_AT: Final = (8, 37)
+FORGOTTEN: Final = 16
+"""Cycles between two set-points after which no velocity is formed from them."""
+
+
+class ClassicCodec(Codec):
+    """Frames of the classic profile.
+
+    The instance at the controller's end remembers the last set-points, to form their step.
+    """
+
+    up_modulus = 1 << UP_COUNTER_BITS
+    down_modulus = 1 << DOWN_COUNTER_BITS
+    span_cycles = 12
+    _up_mask = up_modulus - 1
+    _down_mask = down_modulus - 1
+    _codes = CLASSIC_MODE_CODES
+
+    def __init__(self, n_axes: int) -> None:
+        super().__init__(n_axes)
+        self.up_ids = (CLASSIC_UP_HEADER, *CLASSIC_UP_AXIS[:n_axes])
+        self.down_ids = CLASSIC_DOWN[: (n_axes + 1) // 2]
+        self.lengths = dict.fromkeys((*self.up_ids, *self.down_ids), 8)
+        self._set_points: dict[int, tuple[int, int]] = {}
+
+    def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
+        """Frames of a packet; CanModeError for a mode without a code."""
+        codes = [self._code(mode, slot) for slot, mode in enumerate(words[:, 0].tolist())]
+        with np.errstate(invalid="ignore"):  # a signalling NaN is one like any other
+            numbers = words.view(np.float32).astype(np.float64)
+        target = _counts(numbers[:, _D1], COUNTS_PER_REVOLUTION)
+        actual = _counts(numbers[:, _D3], COUNTS_PER_REVOLUTION)
+        current = _counts(numbers[:, _D5], COUNTS_PER_AMPERE)
+        packed = np.array(codes, np.uint64) << np.uint64(_MODE_AT)
+        packed |= np.uint64(number & self._up_mask)
+        packed |= _packed(actual, REVOLUTION_BITS, _D3_AT)
+        packed |= _packed(target - actual, DIFFERENCE_BITS, _DIFFERENCE_AT)
+        packed |= _packed(current, CURRENT_BITS, _CURRENT_AT)
+        data = packed.astype("<u8").tobytes()
+        header = number.to_bytes(2, "little") + bytes((status, slow[0])) + slow[1]
+        axes = [data[at : at + 8] for at in range(0, len(data), 8)]
+        return [Frame(*frame) for frame in zip(self.up_ids, (header, *axes), strict=True)]
+
+    def read_up(self, payloads: Sequence[bytes]) -> UpSet:
+        """Read the frames of one cycle."""
+        header = payloads[0]
+        packed = np.frombuffer(b"".join(payloads[1:]), "<u8")
+        actual = _unpacked(packed, REVOLUTION_BITS, _D3_AT)
+        difference = _unpacked(packed, DIFFERENCE_BITS, _DIFFERENCE_AT)
+        words = np.zeros((self.n_axes, WORDS_PER_AXIS), np.int32)
+        floats = words.view(np.float32)
+        words[:, 0] = _CLASSIC_MODES[(packed >> np.uint64(_MODE_AT)).astype(np.intp) & 0xF]
+        floats[:, _D1] = (actual + difference) / COUNTS_PER_REVOLUTION
+        floats[:, _D3] = actual / COUNTS_PER_REVOLUTION
+        floats[:, _D5] = _unpacked(packed, CURRENT_BITS, _CURRENT_AT) / COUNTS_PER_AMPERE
+        number = int.from_bytes(header[:2], "little")
+        return UpSet(number, header[2], words, (header[3], header[4:8]), actual)
+
+    def down(self, answer: Answer, sent: Sent) -> list[Frame]:
+        """Frames of an answer; CanModeError, CanValueError where they cannot carry it."""
+        leaving = answer.status == EXIT_FROM_OPEN and sent.status == DRIVE_ON
+        expected = 0 if sent.status == DRIVE_ON else sent.status
+        if not leaving and answer.status not in (0, expected):
+            raise CanModeError(
+                f"status {answer.status} in answer to status {sent.status} has no code"
+            )
+        frames = []
+        for pair, frame_id in enumerate(self.down_ids):
+            packed = answer.number & self._down_mask
+            for side, slot in enumerate(range(2 * pair, min(2 * pair + 2, self.n_axes))):
+                action, field = _act(answer.axes[slot], sent.modes[slot], slot, leaving=leaving)
+                packed |= action << _ACTION_AT[side] | (field & _D1_MASK) << _D1_AT[side]
+            frames.append(Frame(frame_id, packed.to_bytes(8, "little")))
+        return frames
+
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:
+        """Read an answer; the step of a set-point is that from the one before.
+
+        Raises:
+            PacketError: a word without a meaning, or a set-point out of range.
+        """
+        number = next_number(sent.number)
+        leaving = False
+        axes = []
+        for slot, received in enumerate(sent.modes):
+            pair, side = divmod(slot, 2)
+            packed = int.from_bytes(payloads[pair], "little")
+            action = packed >> _ACTION_AT[side] & 3
+            field = packed >> _D1_AT[side] & _D1_MASK
+            if action in (Action.SET, Action.SET_AND_EXIT):
+                axes.append(self._set_point(slot, number, received, field))
+                leaving |= action == Action.SET_AND_EXIT
+                continue
+            self._set_points.pop(slot, None)
+            word = field if action == Action.WORD else Word.MIRROR
+            leaving |= bool(word & Word.EXIT)
+            axes.append(_understood(word & ~Word.EXIT, received))
+        status = 0 if sent.status == DRIVE_ON else sent.status
+        return Answer(number, EXIT_FROM_OPEN if leaving else status, tuple(axes))
+
+    def _set_point(self, slot: int, number: int, mode: int, field: int) -> AxisAnswer:
+        counts = field - (1 << REVOLUTION_BITS) if field > _D1_MOST else field
+        if abs(counts) > _D1_MOST:
+            raise PacketError("set-point", counts, "a number within its field")
+        step = 0.0
+        before = self._set_points.get(slot)
+        if mode in _ABSOLUTE and before is not None:
+            ahead = (number - before[0]) % LAST_NUMBER
+            if 1 <= ahead <= FORGOTTEN:
+                step = (counts - before[1]) / ahead / COUNTS_PER_REVOLUTION
+        self._set_points[slot] = (number, counts)
+        return AxisAnswer(False, mode, counts / COUNTS_PER_REVOLUTION, step)
+
+
+def _act(axis: AxisAnswer, received: int, slot: int, *, leaving: bool) -> tuple[int, int]:
+    """Action and D1 field of one axis; CanModeError, CanValueError where there is none."""
+    still = axis.d1 == 0.0 and axis.d2 == 0.0
+    if axis.mirrored:
+        word = Word.MIRROR
+    elif axis.mode in _WORDS:
+        word = _WORDS[axis.mode]
+    elif axis.mode == received and (axis.mode in _ABSOLUTE or not still):
+        if axis.mode not in _ABSOLUTE and axis.mode != Mode.DELTA_POSITION:
+            raise CanModeError(f"targets in mode {axis.mode} (slot {slot}) have no code")
+        return (Action.SET_AND_EXIT if leaving else Action.SET), _target(axis.d1, slot)
+    elif axis.mode == received:
+        word = Word.ZERO
+    elif axis.mode == Mode.CLOSED and still:
+        word = Word.CLOSED_ZERO
+    else:
+        raise CanModeError(f"mode {axis.mode} in answer to {received} (slot {slot}) has no code")
+    if leaving:
+        return Action.WORD, word | Word.EXIT
+    return (Action.MIRROR, 0) if word == Word.MIRROR else (Action.WORD, word)
+
+
+def _target(d1: float, slot: int) -> int:
+    counts = round(d1 * COUNTS_PER_REVOLUTION) if math.isfinite(d1) else None
+    if counts is None or abs(counts) > _D1_MOST:
+        most = _D1_MOST / COUNTS_PER_REVOLUTION
+        raise _no_room("D1", slot, d1, f"{-most:.2f}..{most:.2f} motor revolutions")
+    return counts
+
+
+def _understood(word: int, received: int) -> AxisAnswer:
+    """What a word says; PacketError if nothing that is known."""
+    modes = {
+        Word.MIRROR: received,
+        Word.CLOSED_ZERO: int(Mode.CLOSED),
+        Word.ZERO: received,
+        Word.DRIVE_OFF: int(Mode.DRIVE_OFF_REQUEST),
+        Word.FOLLOWING_ERROR: int(Mode.FOLLOWING_ERROR),
+    }
+    if word not in modes:
+        raise PacketError("word", word, "one of the classic CAN profile")
+    return AxisAnswer(word == Word.MIRROR, modes[word])
+
+
+def _counts(values: Array, per_unit: int) -> Array:
+    """Rounded; NaN for what is not finite."""
+    return np.where(np.isfinite(values), np.rint(values * per_unit), np.nan)
+
+
+def _packed(counts: Array, bits: int, at: int) -> NDArray[np.uint64]:
+    """Two's complement in place; the most negative value where it does not fit."""
+    lowest = -(1 << bits - 1)
+    whole = np.where(np.abs(counts) < -lowest, counts, lowest).astype(np.int64)
+    field = whole.astype(np.uint64) & np.uint64((1 << bits) - 1)
+    return field << np.uint64(at)
+
+
+def _unpacked(packed: NDArray[np.uint64], bits: int, at: int) -> Array:
+    """Signed numbers; NaN for the most negative value."""
+    left = np.uint64(64 - bits - at)
+    signed = (packed << left).view(np.int64) >> np.int64(64 - bits)
+    return np.where(signed == -(1 << bits - 1), np.nan, signed.astype(np.float64))

@@ -1,0 +1,254 @@
+"""Faults of the simulated controller and its robot, and one line of text for any fault.
+
+Cycles count the controller's packets from 0, as those of `drivers.transports.faults` do. Axes count
+from 1, as they are printed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from drivers.transports import faults as link
+from sim_fixtures.arm import Mishap
+from sim_fixtures.errors import SimulationError
+
+GRAMMAR: Final = """\
+KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
+
+lose@1200x3                      packets to the PC never arrive; :to_controller the PC's answers
+delay@1200:5ms                   they arrive later, by ms, us, s or cycles (:1.5cycles)
+duplicate@1200                   they arrive twice
+reorder@1200                     the packet is overtaken by the next one
+corrupt@1200:offset=8            the byte at that offset is changed; :mask=0x80 says which bits
+    all five: to_pc (the default) or to_controller
+restart@5000:cold                the controller starts anew; :warm with the init packet at once
+drive-drop@2000                  the drive goes off by itself
+e-stop@2000                      the emergency stop is pressed
+axis-leaves@2000:axis=3          one axis leaves open mode
+following-error@2000x500:axis=2  the axis is stuck; :slip its encoder is read wrongly
+saturate@2000x500:axis=1         a load drives the current near its limit
+push@2000x50:axis=1              somebody leans against the axis; nothing trips
+pause@2000x50:502                the controller pauses; :500 for the other kind"""
+
+
+SLIP = 1.5
+"""Size of an encoder's slip, as a multiple of the axis's following-error threshold."""
+LOAD = 0.9
+"""Size of a load, as a share of what the axis's motor can muster."""
+PUSH = 0.15
+"""Size of a push, likewise: nothing trips, and the repetition is another one than its fellows."""
+
+
+class Faultable(Protocol):
+    """What faults are inflicted on: `SimulatedController`."""
+
+    def lose_drive(self, reason: str) -> None:
+        """The drive goes off and the brakes close."""
+
+    def restart(self, *, warm: bool) -> None:
+        """The controller begins anew."""
+
+    def axis_leaves(self, axis: int) -> None:
+        """One axis (from 1) leaves open mode by itself."""
+
+    def pause(self, mode: int, cycles: int) -> None:
+        """The controller reports a pause."""
+
+    def suffer(self, kind: Mishap, axis: int, size: float, cycles: int) -> None:
+        """Something befalls the mechanics of one axis (from 1)."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What a kind of fault takes: an axis, a count (0: none), words (the default first)."""
+
+    axis: bool = False
+    count: int = 0
+    words: tuple[str, ...] = ("",)
+
+
+_OF_CONTROLLER: Final[Mapping[str, _Kind]] = {
+    "restart": _Kind(words=("cold", "warm")),
+    "drive-drop": _Kind(),
+    "e-stop": _Kind(),
+    "axis-leaves": _Kind(axis=True),
+    "following-error": _Kind(axis=True, count=500, words=("jam", "slip")),
+    "saturate": _Kind(axis=True, count=500),
+    "push": _Kind(axis=True, count=50),
+    "pause": _Kind(count=50, words=("502", "500")),
+}
+_OF_LINK: Final = ("lose", "delay", "duplicate", "reorder", "corrupt")
+
+
+@dataclass(frozen=True)
+class ControllerFault:
+    """One fault of the controller or its robot; see `GRAMMAR` for what each kind is.
+
+    Attributes:
+        kind: as in a line of text.
+        cycle: in which it happens.
+        axis: from 1; 1 for kinds that have none.
+        count: cycles that it lasts; 0 for kinds that have none.
+        word: option of its kind, "" for kinds that have none.
+    """
+
+    kind: str
+    cycle: int
+    axis: int = 1
+    count: int = 0
+    word: str = ""
+
+    def inflict(self, on: Faultable) -> None:
+        """Let it happen."""
+        match self.kind:
+            case "restart":
+                on.restart(warm=self.word == "warm")
+            case "drive-drop":
+                on.lose_drive("the drive dropped out")
+            case "e-stop":
+                on.lose_drive("emergency stop")
+            case "axis-leaves":
+                on.axis_leaves(self.axis)
+            case "following-error":
+                on.suffer("slip" if self.word == "slip" else "jam", self.axis, SLIP, self.count)
+            case "pause":
+                on.pause(int(self.word), self.count)
+            case _:
+                size = LOAD if self.kind == "saturate" else PUSH
+                on.suffer("load", self.axis, size, self.count)
+
+
+Fault = link.Fault | ControllerFault
+
+_HEAD: Final = re.compile(r"(?P<kind>[a-z-]+)@(?P<cycle>\d+)(?:x(?P<count>\d+))?")
+_TIME: Final = re.compile(r"(?P<value>\d+(?:\.\d+)?)(?P<unit>us|ms|s|cycles?)")
+_SECONDS: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+
+
+class FaultScriptError(SimulationError, ValueError):
+    """A line that describes no fault.
+
+    Attributes:
+        text: the line.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, text: str, reason: str) -> None:
+        self.text = text
+        self.reason = reason
+        super().__init__(f"{text!r} is not a fault: {reason}. A fault is written\n\n{GRAMMAR}")
+
+
+class _Line:
+    """The parts of a line; every option has to be asked for."""
+
+    def __init__(self, text: str) -> None:
+        head, *self.options = text.strip().split(":")
+        match = _HEAD.fullmatch(head)
+        if match is None:
+            raise ValueError(f"{head!r} is not KIND@CYCLE or KIND@CYCLExCOUNT")
+        self.kind: str = match["kind"]
+        self.cycle = self._cycles("cycle", match["cycle"])
+        self.count = None if match["count"] is None else self._cycles("count", match["count"])
+
+    @staticmethod
+    def _cycles(what: str, digits: str) -> int:
+        # Compared by length first: Python refuses to read thousands of digits.
+        if len(digits.lstrip("0")) > len(str(link.MOST_CYCLES)) or int(digits) > link.MOST_CYCLES:
+            raise ValueError(f"the {what} is more than {link.MOST_CYCLES}")
+        return int(digits)
+
+    def word(self, *words: str) -> str:
+        """The one of `words` that is an option; the first if none is."""
+        found = next((option for option in self.options if option in words), None)
+        if found is None:
+            return words[0]
+        self.options.remove(found)
+        return found
+
+    def number(self, name: str, default: int | None = None) -> int:
+        """The value of option NAME=..., decimal or with 0x."""
+        found = next((option for option in self.options if option.startswith(f"{name}=")), None)
+        if found is None:
+            if default is None:
+                raise ValueError(f"{name}=NUMBER is missing")
+            return default
+        self.options.remove(found)
+        try:
+            return int(found.partition("=")[2], 0)
+        except ValueError:
+            raise ValueError(f"{found!r} is not {name}=NUMBER") from None
+
+    def time(self) -> dict[str, float]:
+        """The duration as keyword arguments of `Delay`."""
+        for option in self.options:
+            match = _TIME.fullmatch(option)
+            if match is not None:
+                self.options.remove(option)
+                value = float(match["value"])
+                if match["unit"].startswith("cycle"):
+                    return {"cycles": value}
+                return {"seconds": value * _SECONDS[match["unit"]]}
+        raise ValueError("a time such as 5ms or 2cycles is missing")
+
+
+def parse_fault(text: str) -> Fault:
+    """Return the fault that a line describes; see `GRAMMAR`.
+
+    Raises:
+        FaultScriptError: it describes none.
+    """
+    try:
+        line = _Line(text)
+        kind = _OF_CONTROLLER.get(line.kind)
+        takes_count = line.kind != "reorder" if kind is None else kind.count > 0
+        if line.kind not in _OF_LINK and kind is None:
+            kinds = ", ".join((*_OF_LINK, *_OF_CONTROLLER))
+            raise ValueError(f"{line.kind!r} is none of {kinds}")
+        if line.count is not None and not takes_count:
+            raise ValueError(f"{line.kind} takes no count")
+        if line.count == 0:
+            raise ValueError("the count is not positive")
+        fault = _of_link(line) if kind is None else _of_controller(line, kind)
+        if line.options:
+            raise ValueError(f"{line.kind} has no option {line.options[0]!r}")
+    except ValueError as error:
+        raise FaultScriptError(text, str(error)) from error
+    return fault
+
+
+def _of_controller(line: _Line, kind: _Kind) -> ControllerFault:
+    axis = line.number("axis") if kind.axis else 1
+    if axis < 1:
+        raise ValueError("axes count from 1")
+    count = kind.count if line.count is None else line.count
+    return ControllerFault(line.kind, line.cycle, axis, count, line.word(*kind.words))
+
+
+def _of_link(line: _Line) -> link.Fault:
+    to: link.Direction = (
+        "to_pc" if line.word("to_pc", "to_controller") == "to_pc" else "to_controller"
+    )
+    at, count = line.cycle, 1 if line.count is None else line.count
+    match line.kind:
+        case "lose":
+            return link.Lose(at, to, count)
+        case "delay":
+            return link.Delay(at, **line.time(), direction=to, count=count)
+        case "duplicate":
+            return link.Duplicate(at, to, count)
+        case "reorder":
+            return link.Reorder(at, to)
+    return link.Corrupt(at, line.number("offset"), line.number("mask", 0xFF), to, count)
+
+
+def split_faults(
+    faults: Iterable[Fault],
+) -> tuple[tuple[link.Fault, ...], tuple[ControllerFault, ...]]:
+    """Return the faults of the link and those of the controller."""
+    every = tuple(faults)
+    of_controller = tuple(fault for fault in every if isinstance(fault, ControllerFault))
+    return tuple(fault for fault in every if not isinstance(fault, ControllerFault)), of_controller
