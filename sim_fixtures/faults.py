@@ -91,14 +91,14 @@ class ControllerFault:
         kind: as in a line of text.
         cycle: in which it happens.
         axis: from 1; 1 for kinds that have none.
-        count: cycles that it lasts; 0 for kinds that have none.
+        count: cycles that it lasts; 1 for kinds that have none.
         word: option of its kind, "" for kinds that have none.
     """
 
     kind: str
     cycle: int
     axis: int = 1
-    count: int = 0
+    count: int = 1
     word: str = ""
 
     def inflict(self, on: Faultable) -> None:
@@ -224,7 +224,7 @@ def _of_controller(line: _Line, kind: _Kind) -> ControllerFault:
     axis = line.number("axis") if kind.axis else 1
     if axis < 1:
         raise ValueError("axes count from 1")
-    count = kind.count if line.count is None else line.count
+    count = max(1, kind.count) if line.count is None else line.count
     return ControllerFault(line.kind, line.cycle, axis, count, line.word(*kind.words))
 
 

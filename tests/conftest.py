@@ -31,7 +31,7 @@ _LONGEST = (
     "test_cli.py",
     "test_process_death.py",
     "test_one_sided_errors.py",
-    "test_session_machine.py",
+    "test_conversations.py",
     "test_record_command.py",
     "test_run_kills.py",
     "test_design_command.py",

@@ -6,29 +6,6 @@ import numpy as np
 
 from tests.drivers import oracle
 from tests.drivers.judge import POSITION_MODES
-from tests.drivers.rig import START, drive_train, init_packet
-
-PERIOD = 0.002
-N = 6
-# Two slots of axes that are not the cell's: axis 7 of the same arm, axis 1 of arm 2.
-AXES = ((1, 2), (1, 0), (2, 0), (1, 5), (1, 3), (1, 6), (1, 1), (1, 4))
-ARMS = tuple(arm for arm, _ in AXES)
-OTHER_AXES = {(1, 7), (2, 1)}
-SLOTS = tuple(AXES.index((1, joint)) for joint in range(N))
-
-
-def init_bytes(**arm_1) -> bytes:
-    init = init_packet(arm_1=arm_1)
-    init.record["n_axes"] = len(AXES)
-    table = np.full((4, 10), 0xFF)
-    for slot, (arm, axis) in enumerate(AXES):
-        table[arm - 1, axis] = slot
-    init.record["open_axes_map"] = table
-    return init.encode()
-
-
-GOOD_INIT = init_bytes()
-OTHER_ARM = init_bytes(gear_ratio=np.full(N, 99.0))
 
 
 class Controller:
@@ -42,10 +19,8 @@ class Controller:
         slots: slot of each joint.
     """
 
-    def __init__(
-        self, train=None, start=START, *, arm: int = 1, n_axes: int = len(AXES), slots=SLOTS
-    ) -> None:
-        self._train = drive_train() if train is None else train
+    def __init__(self, train, start, *, arm: int, n_axes: int, slots) -> None:
+        self._train = train
         self._arm, self._n_axes, self._slots = arm, n_axes, slots
         self.number = 0
         self.status = [0, 0, 0, 0]

@@ -84,18 +84,22 @@ class Conversation(Judged):
         self.sent += 1
         return super().deliver(packet, elapsed)
 
+    def begin(self) -> None:
+        """The start of the session, cold or warm."""
+        if self._draw.chance(64):
+            for number in range(1, 10):
+                self.deliver(number.to_bytes(4, "little") + bytes(728))
+        self._init()
+        self.run(1)
+
     def play(self) -> None:
-        """Start, then step by step until the bytes run out.
+        """Begin, then step by step until the bytes run out.
 
         Raises:
             AssertionError: a law is broken.
         """
         draw = self._draw
-        if draw.chance(64):
-            for number in range(1, 10):
-                self.deliver(number.to_bytes(4, "little") + bytes(728))
-        self._init()
-        self.run(1)
+        self.begin()
         for _ in range(STEPS):
             if not draw.left or self.sent > CYCLES:
                 return
@@ -166,7 +170,7 @@ class Conversation(Judged):
         self.controller.d[slot, column] = kept
 
     def miss(self) -> None:
-        count = self._draw.between(1, 8)
+        count = self._draw.choice((1, 2, 3, 4, 5, 6, 8, 400))
         for _ in range(count):
             self.controller.packet()
         self.now += count * self.arm.period
@@ -226,7 +230,10 @@ class Conversation(Judged):
     # What the user does -------------------------------------------------------------------
 
     def request(self) -> None:
-        source = self._motion(other_kind=self._draw.chance(8))
+        self.ask_for(self._motion(other_kind=self._draw.chance(8)))
+
+    def ask_for(self, source: ScriptedMotion | ScriptedCorrection) -> None:
+        """Request a motion or correction."""
         try:
             self.session.request(source)
         except RequestError:

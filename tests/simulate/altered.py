@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from tests.simulate.judging import LAWS
-from tests.simulate.laws.judged import judged_whole
 from tests.simulate.observed import Broken, Observed
 from tests.simulate.playing import NEIGHBOURS, play, twin_of
 from tests.simulate.script import parse_script
@@ -22,7 +21,7 @@ FAULTS = (
     "override@520:100",
     "kill@900",
 )
-ALL = {**LAWS, "judge": judged_whole}
+ALL = LAWS
 
 
 def played(root: Path) -> Observed:

@@ -296,12 +296,6 @@ def test_nothing_moves_that_was_not_requested_or_has_ended(observed: Observed) -
     assert "after the motion had ended" in found(ended, "guard")
 
 
-def test_the_judge_of_single_packets_finds_the_same(observed: Observed) -> None:
-    leapt = with_set_points(observed, bump(0.2, middle(observed)))
-    assert found(leapt, "judge")
-    assert "safe answer" in found(with_answer(observed, at_rest(observed), 17), "judge")
-
-
 # The arm ------------------------------------------------------------------------------------
 
 
