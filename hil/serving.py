@@ -80,13 +80,12 @@ def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
             remedy="write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic",
         )
     # python-can is loaded only where a bus is asked for.
-    from drivers.transports.can import CanSpec
-    from sim_fixtures.can_end import open_far_end as open_can
+    from sim_fixtures import can_end
 
     moved_by_pc = settings.corrected or not settings.own_motion
     kind: Literal["fd", "classic"] = "classic" if profile == "classic" else "fd"
-    spec = CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
-    return open_can(spec, settings.open_mode if moved_by_pc else None)
+    spec = can_end.CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
+    return can_end.open_far_end(spec, settings.open_mode if moved_by_pc else None)
 
 
 class Buttons:

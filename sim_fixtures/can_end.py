@@ -109,3 +109,6 @@ def open_far_end(
     except TransportError as error:
         raise FarEndError(error.link, f"{error.reason}; {error.remedy}") from error
     return CanFarEnd(bus, rates, start_patience=start_patience)
+
+
+__all__ = ["START_PATIENCE", "CanFarEnd", "CanSpec", "open_far_end"]
