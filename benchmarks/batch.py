@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -36,21 +36,12 @@ from typing import Any, TypeVar
 
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.run import Plan, reidentify
-from hil.batch.types import BatchResult
-from hil.batch.workers import (
-    ArchiveTask,
-    Done,
-    LocalWorkers,
-    Summed,
-    Workers,
-    run_task,
-    summed,
-)
+from hil.batch.types import BatchResult, Broken
+from hil.batch.workers import ArchiveTask, Done, LocalWorkers, Workers, run_task
 from hil.identify.options import FIXED
 from hil.progress import Silent
 
 T = TypeVar("T")
-S = TypeVar("S")
 
 _CAMPAIGN = 25  # repetitions
 
@@ -59,17 +50,14 @@ class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
     near = True
+    count = 1
 
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Done | None = None,
-    ) -> Iterator[Summed[T, S]]:
+    def results(
+        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
+    ) -> Iterator[T | Broken]:
         """See `hil.batch.workers.Workers`."""
         del done
-        return (summed([run_task(task) for task in group], add) for group in groups)
+        return map(run_task, tasks)
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:

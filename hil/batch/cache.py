@@ -16,18 +16,18 @@ import json
 import math
 import os
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from sys import intern
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 import drivers
 import hil
@@ -38,19 +38,31 @@ from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.io import digest, json_digest
 from hil.reading import opened
+from identification.estimators.shrinkage import Shrinkage
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
+from identification.selection.inner_prediction import Choice
+from identification.signals.low_passes import LowPassShape
+from identification.signals.samples import Preprocessing
 from planner.checked_data import DAMAGED
 
-from .factors import reduce_bundle
-from .types import ArchiveRef, Broken, Bundle, CacheError, Fit, Summary
+from .types import ArchiveRef, CacheError, Fit, Summary
+
+T = TypeVar("T")
 
 BESIDE: Final = ".hil-cache"
 """Name of the folder beside the archives."""
 
-_MAGIC: Final = b"HILCACH2"
+_MAGIC: Final = b"HILCACH3"
 _HEAD: Final = struct.Struct("<8sII")  # magic, length of the JSON text, checksum of what follows
 _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
+_TYPES: Final[dict[str, type[Any]]] = {
+    kind.__name__: kind
+    for kind in (
+        *(ArchiveRef, Summary, Fit, Estimate, PhaseFactor),
+        *(Settings, Preprocessing, LowPassShape, Shrinkage, Choice),
+    )
+}
 
 # What stands between the bytes of an archive and its cache entries.
 _PROGRAMS: Final = (
@@ -99,22 +111,23 @@ class Store:
 
     folder: Path | None
 
-    def get(self, key: str) -> Any:
-        """The content under a key; None if there is none, or none that is whole."""
+    def get(self, key: str, kind: type[T]) -> T | None:
+        """The content under a key; None if there is none of this type, or none that is whole."""
         if self.folder is None:
             return None
         try:
             with opened(self._path(key)) as file:
-                return decoded(file.read(), key)
+                found = decoded(file.read(), key)
         except OSError:
             return None
+        return found if isinstance(found, kind) else None
 
     def has(self, key: str) -> bool:
         """Whether there is a file for the key, whole or not."""
         return self.folder is not None and self._path(key).is_file()
 
     def put(self, key: str, content: Any) -> None:
-        """Write JSON with arrays of numbers in it.
+        """Write JSON with arrays of numbers, and dataclasses of `_TYPES`, in it.
 
         Raises:
             CacheError: the disk refuses.
@@ -136,11 +149,9 @@ class Store:
 
     def remove(self, key: str) -> None:
         """Remove an entry, if it is there and can be removed."""
-        if self.has(key):
-            try:
+        if self.folder is not None:
+            with suppress(OSError):
                 self._path(key).unlink(missing_ok=True)
-            except OSError:
-                return
 
     def _path(self, key: str) -> Path:
         assert self.folder is not None
@@ -148,15 +159,26 @@ class Store:
 
 
 def encoded(key: str, content: Any) -> bytes:
-    """An entry as its file has it: JSON, and behind it the arrays."""
+    """An entry as its file has it: JSON, and behind it the arrays.
+
+    Of symmetric matrices (..., k, k) the lower triangles (..., k (k + 1) / 2) are written.
+    """
     arrays: list[NDArray[Any]] = []
     size = 0
 
-    def place(array: NDArray[Any]) -> dict[str, Any]:
+    def place(value: Any) -> dict[str, Any]:
         nonlocal size
-        arrays.append(np.ascontiguousarray(array))
-        at, size = size, size + array.nbytes
-        return {"array": array.dtype.kind, "shape": array.shape, "at": at}
+        if is_dataclass(value) and not isinstance(value, type):
+            own = {one.name: getattr(value, one.name) for one in fields(value)}
+            return own | {"type": type(value).__name__}
+        width = value.shape[-1] if value.ndim > 1 and value.shape[-1] == value.shape[-2] else 0
+        if width and np.array_equal(value, value.swapaxes(-1, -2)):
+            value = value[(..., *_triangle(width))]
+        else:
+            width = 0
+        arrays.append(np.ascontiguousarray(value))
+        at, size = size, size + value.nbytes
+        return {"array": value.dtype.kind, "shape": value.shape, "at": at, "square": width}
 
     text = json.dumps({"key": key, "content": content}, default=place).encode()
     text += b" " * (-(len(text) + _HEAD.size) % 8)
@@ -165,7 +187,7 @@ def encoded(key: str, content: Any) -> bytes:
 
 
 def decoded(data: bytes, key: str) -> Any:
-    """The content of an entry, with read-only arrays; None if it is damaged or of another key."""
+    """The content of an entry; None if it is damaged or of another key."""
     if len(data) < _HEAD.size:
         return None
     magic, size, checksum = _HEAD.unpack_from(data)
@@ -174,16 +196,38 @@ def decoded(data: bytes, key: str) -> Any:
         return None
 
     def restored(found: dict[str, Any]) -> Any:
+        if "type" in found:
+            return _TYPES[found.pop("type")](**{name: _fixed(one) for name, one in found.items()})
         if "array" not in found:
             return found
         kind, count = _KINDS[found["array"]], math.prod(found["shape"])
-        return np.frombuffer(body, kind, count, size + found["at"]).reshape(found["shape"])
+        values = np.frombuffer(body, kind, count, size + found["at"]).reshape(found["shape"])
+        if not found["square"]:
+            return values
+        row, column = _triangle(found["square"])
+        square = np.empty((*values.shape[:-1], found["square"], found["square"]), kind)
+        square[..., row, column] = square[..., column, row] = values
+        return square
 
     try:
         entry = json.loads(bytes(body[:size]), object_hook=restored)
         return entry["content"] if entry["key"] == key else None
     except DAMAGED:  # a checksum that is right, and none of our entries
         return None
+
+
+def _fixed(value: Any) -> Any:
+    """Lists as tuples; words, which many archives share, are held once."""
+    if isinstance(value, list):
+        return tuple(map(_fixed, value))
+    return intern(value) if isinstance(value, str) else value
+
+
+@lru_cache(maxsize=64)
+def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the lower triangle of a square."""
+    row, column = np.tril_indices(width)
+    return row, column
 
 
 @lru_cache(maxsize=1024)
@@ -239,12 +283,6 @@ def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False
     return digest(json.dumps(parts, sort_keys=True, separators=(",", ":")))
 
 
-def belief_digest(cell: Cell) -> str:
-    """Digest of what the maker's figures are, "" without any; the URDF counts to the arm."""
-    nominal = cell.file.nominal
-    return "" if nominal is None else json_digest(nominal.model_dump(mode="json"))
-
-
 def settings_digest(settings: Settings) -> str:
     """Digest of all that, beside its bytes, decides about the factor of an archive."""
     entries = asdict(settings)
@@ -263,172 +301,6 @@ def decision_digest(options: Options, arms: Settings | None, refs: Sequence[Arch
     return json_digest([asked, known, [ref.sha256 for ref in refs], code_digest()])
 
 
-def summary_key(ref: ArchiveRef, settings: str) -> str:
-    """Key of the summary of an archive; settings by their digest."""
-    return json_digest(["summary", ref.sha256, settings])
-
-
 def sum_key(refs: Sequence[ArchiveRef], settings: str) -> str:
-    """Key of the sum over archives, added from first to last."""
+    """Key of the sum over archives, added from first to last; settings by their digest."""
     return json_digest(["sum", [ref.sha256 for ref in refs], settings])
-
-
-# Settings and bundles
-
-
-def put_settings(store: Store, key: str, settings: Settings) -> None:
-    """Cache settings; every figure to the last bit.
-
-    Raises:
-        CacheError: the disk refuses.
-    """
-    store.put(key, asdict(settings))
-
-
-def cached_settings(store: Store, key: str) -> Settings | None:
-    """The settings under a key; None if there are none."""
-    found = store.get(key)
-    try:
-        return None if found is None else TypeAdapter(Settings).validate_python(found)
-    except ValueError:
-        return None
-
-
-def is_cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> bool:
-    """Whether there is an entry of the sum of these archives; it may turn out to be damaged."""
-    return where.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))
-
-
-def cached_bundle(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle | None:
-    """Archives reduced earlier; None unless all of them are in the cache."""
-    store, used = where.store(refs[0].location), settings_digest(settings)
-    found = store.get(sum_key(refs, used))
-    if found is None:
-        return None
-    summaries, broken = [], []
-    try:
-        for ref in refs:
-            one = store.get(summary_key(ref, used))
-            if one is None:
-                return None
-            if "broken" in one:
-                broken.append(Broken(ref.location, str(one["broken"])))
-            else:
-                summaries.append(_summary(one, ref))
-        phase = _phase(found["sum"])
-    except DAMAGED:  # a checksum that is right, and none of our entries
-        return None
-    return Bundle(tuple(refs), tuple(summaries), phase, tuple(broken))
-
-
-def bundle_with_cache(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle:
-    """Reduce archives, or those of them that are not in the cache, and cache what was found.
-
-    Raises:
-        CacheError: the disk refuses.
-    """
-    store, used = where.store(refs[0].location), settings_digest(settings)
-    for known in range(len(refs), 0, -1):
-        begin = cached_bundle(refs[:known], settings, where)
-        if begin is not None:
-            break
-    else:
-        begin, known = None, 0
-    if begin is not None and known == len(refs):
-        return begin
-    bundle = replace(reduce_bundle(refs, settings, begin), read=len(refs) - known)
-    if not bundle.lasting:
-        return bundle
-    reasons = dict(bundle.broken)
-    summaries = {one.ref: one for one in bundle.summaries}
-    for ref in bundle.refs:
-        found = summaries.get(ref)
-        content = {"broken": reasons[ref.location]} if found is None else _summary_content(found)
-        store.put(summary_key(ref, used), content)
-    store.put(sum_key(refs, used), {"sum": _phase_content(bundle.phase)})
-    if known:
-        store.remove(sum_key(refs[:known], used))  # part of a longer one now
-    return bundle
-
-
-def _phase_content(phase: PhaseFactor | None) -> dict[str, Any] | None:
-    if phase is None:
-        return None
-    return {
-        "names": phase.parameter_names,
-        "samples": phase.samples,
-        "columns": phase.columns,
-        "gram": [_triangle(gram) for gram in phase.gram],
-    }
-
-
-def _phase(content: Mapping[str, Any] | None) -> PhaseFactor | None:
-    if content is None:
-        return None
-    return PhaseFactor(
-        tuple(_square(one) for one in content["gram"]),
-        tuple(content["columns"]),
-        content["samples"],
-        tuple(content["names"]),
-    )
-
-
-def _summary_content(summary: Summary) -> dict[str, Any]:
-    return {
-        "total": _phase_content(summary.total),
-        "warnings": summary.warnings,
-        "products": summary.products,
-        "fits": {
-            name: {each.name: getattr(fit.estimate, each.name) for each in fields(Estimate)}
-            | {"covariance": _triangle(fit.estimate.covariance), "effect": fit.design_effect}
-            for name, fit in summary.fits.items()
-        },
-    }
-
-
-def _summary(content: Mapping[str, Any], ref: ArchiveRef) -> Summary:
-    """The summary of an archive that may lie elsewhere by now."""
-    total = _phase(content["total"])
-    assert total is not None
-    fits = {name: _fit(dict(one), total) for name, one in content["fits"].items()}
-    return Summary(ref, total, fits, _interned(content["warnings"]), content["products"])
-
-
-def _fit(content: dict[str, Any], total: PhaseFactor) -> Fit:
-    """Words that most archives share are held once."""
-    effect = content.pop("effect")
-    content |= {
-        "names": total.parameter_names,
-        "units": tuple(content["units"]),
-        "undetermined": _interned(content["undetermined"]),
-        "method": intern(content["method"]),
-        "covariance": _square(content["covariance"]),
-    }
-    return Fit(Estimate(**content), effect)
-
-
-def _interned(words: Sequence[str]) -> tuple[str, ...]:
-    return tuple(map(intern, words))
-
-
-def _triangle(squares: NDArray[Any]) -> NDArray[Any]:
-    """Lower triangles (..., k (k + 1) / 2) of symmetric matrices (..., k, k)."""
-    row, column = _places(squares.shape[-1])
-    return np.asarray(squares[..., row, column])
-
-
-def _square(triangles: NDArray[Any]) -> NDArray[Any]:
-    """The matrices of `_triangle`."""
-    width = round((math.sqrt(8.0 * triangles.shape[-1] + 1.0) - 1.0) / 2.0)
-    row, column = _places(width)
-    found = np.empty((*triangles.shape[:-1], width, width))
-    found[..., row, column] = triangles
-    found[..., column, row] = triangles
-    return found
-
-
-@lru_cache(maxsize=64)
-def _places(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the lower triangle of a square."""
-    row, column = np.tril_indices(width)
-    return row, column

@@ -1,10 +1,7 @@
 """Re-identification on a Dask cluster: archives are read, and runs of them added up, on workers.
 
-What comes back are the sums of runs and a summary of each archive; they are added up here in the
-tree of `hil.batch.workers`, so the result has the same bits as on one machine. Workers may join,
-leave and die: what a dead worker held is made anew, as Dask does from the tasks it holds.
-
-Dask is imported here, and only when it is called.
+Workers may join, leave and die: what a dead worker held is made anew, as Dask does from the tasks
+it holds. Dask is imported here, and only when it is called.
 """
 
 from __future__ import annotations
@@ -29,31 +26,25 @@ from hil.version import install_command
 from .cache import LIBRARIES
 from .types import Broken
 from .workers import (
-    FAN_IN,
     TIMEOUT,
     ArchiveTask,
     Done,
     LocalWorkers,
-    Part,
-    Summed,
     Workers,
     WorkerSoftwareError,
-    joined,
     run_task,
 )
 
 T = TypeVar("T")
-S = TypeVar("S")
 Identity = Callable[[], str]
 
 _LOOK: Final = 2.0
 """s between looks at the cluster while nothing comes from it."""
-
 _RETRIES: Final = 3
 """How often a task is given out anew for reasons that are not its own."""
-
 _AHEAD: Final = 4
-"""Runs given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
+"""Tasks given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
+_LOST: Final = Broken("", "ended every worker that read it")
 
 
 class ClusterError(HilError):
@@ -80,14 +71,15 @@ class DaskWorkers(Workers):
         self, address: str, *, identity: Identity, timeout: float = TIMEOUT, patience: float = 30.0
     ) -> None:
         self._patience = patience
-        self._last_seen, self._last_look, self._threads = monotonic(), -_LOOK, 1
+        self._last_seen, self._last_look, self.count = monotonic(), -_LOOK, 1
         self._work = partial(
-            sum_archives, timeout=timeout, identity=identity, expected=software(identity)
+            perform, timeout=timeout, identity=identity, expected=software(identity)
         )
         self._client = _connected(address, patience)
         try:
             self._client.wait_for_workers(1, timeout=patience)
             self._require_software(identity)
+            self._ahead()
         except TimeoutError:
             self._client.close()
             raise ClusterError(
@@ -123,67 +115,41 @@ class DaskWorkers(Workers):
                         "workers under the same name, or name an address such as s3://..."
                     )
 
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Done | None = None,
-    ) -> Iterator[Summed[T, S]]:
+    def results(
+        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
+    ) -> Iterator[T | Broken]:
         """See :class:`Workers`.
 
         Raises:
             ClusterError: all workers, or the scheduler, are gone for longer than the patience.
             WorkerSoftwareError: a worker that joined later runs other software.
         """
-        # Whole runs at once where there is work for all: less is sent, and less is asked.
-        size = FAN_IN if sum(map(len, groups)) >= FAN_IN * self._ahead() else 1
-        runs = [tasks[k : k + size] for tasks in groups for k in range(0, len(tasks), size)]
-        waiting = iter(range(len(runs)))
-        found: dict[int, Summed[T, S]] = {}
-        suspects: list[int] = []
-        busy: dict[int, Any] = {}
-        ended: SimpleQueue[int] = SimpleQueue()
+        waiting, found = iter(range(len(tasks))), dict[int, Any]()
+        busy, ended = dict[int, Any](), SimpleQueue[int]()
+        suspects: list[int] = []  # begun when workers died: again one by one, with nothing beside
 
-        def begin(k: int, tasks: Sequence[ArchiveTask[T, S]]) -> None:
-            busy[k] = self._client.submit(self._work, tasks, add, pure=False, retries=_RETRIES)
+        def begin(k: int) -> None:
+            busy[k] = self._client.submit(self._work, tasks[k], pure=False, retries=_RETRIES)
             busy[k].add_done_callback(lambda _: ended.put(k))
 
-        def next_result() -> tuple[int, Summed[T, S] | None]:
-            """A run that ended, and its sum; None if its workers died."""
-            k = self._next(ended)
-            return k, _result(busy.pop(k))
-
-        def alone(k: int) -> Summed[T, S]:
-            """Do tasks that were there when workers died one by one, with nothing beside them."""
-            parts: list[Summed[T, S]] = []
-            for task in runs[k]:
-                begin(k, [task])
-                lost = Summed[T, S](None, (Broken(task.path, "ended every worker that read it"),))
-                parts.append(next_result()[1] or lost)
-            return joined(parts, add)
-
         try:
-            first = 0
-            for tasks in groups:
-                own = range(first, first + -(-len(tasks) // size))
-                first = own.stop
-                while not all(k in found for k in own):
-                    ahead = max(self._ahead(), FAN_IN, len(own)) - len(busy) - len(found)
-                    for k in islice(waiting, max(0, ahead)):
-                        begin(k, runs[k])
-                    if busy:
-                        k, result = next_result()
-                        if result is None:
-                            suspects.append(k)
-                            continue
-                    else:
-                        k = suspects.pop(0)
-                        result = alone(k)
-                    found[k] = result
+            for k, task in enumerate(tasks):
+                while k not in found:
+                    for another in islice(waiting, max(0, self._ahead() - len(busy) - len(found))):
+                        begin(another)
+                    alone = not busy
+                    if alone:
+                        begin(suspects.pop(0))
+                    other = self._next(ended)
+                    result = _result(busy.pop(other))
+                    if result is _LOST and not alone:
+                        suspects.append(other)
+                        continue
+                    found[other] = result
                     if done is not None:
-                        done(len(runs[k]))
-                yield joined([found.pop(k) for k in own], add)
+                        done(1)
+                result = found.pop(k)
+                yield Broken(task.path, _LOST.reason) if result is _LOST else result
         finally:
             if self._connected:
                 self._client.cancel(list(busy.values()))
@@ -193,11 +159,11 @@ class DaskWorkers(Workers):
         return bool(self._client.status == "running")
 
     def _ahead(self) -> int:
-        """How many runs to give out to the workers there were a moment ago."""
+        """How many tasks to give out to the workers there were a moment ago."""
         if monotonic() - self._last_look > _LOOK:
             self._last_look = monotonic()
-            self._threads = sum(self._client.nthreads().values())
-        return _AHEAD * max(1, self._threads)
+            self.count = max(1, sum(self._client.nthreads().values()))
+        return _AHEAD * self.count
 
     def _on_all(self, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
         """What a function returns or raises, by worker."""
@@ -237,7 +203,7 @@ class DaskWorkers(Workers):
 
 
 def _result(future: Any) -> Any:
-    """What came of a call; None if every worker that took it up died.
+    """What came of a call; `_LOST` if every worker that took it up died.
 
     Raises:
         ClusterError: the call was dropped.
@@ -251,7 +217,7 @@ def _result(future: Any) -> Any:
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
-        return None
+        return _LOST
     raise error
 
 
@@ -298,20 +264,14 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     )
 
 
-def sum_archives(
-    tasks: Sequence[ArchiveTask[T, S]],
-    add: Callable[[T, T], T],
-    *,
-    timeout: float,
-    identity: Identity,
-    expected: Mapping[str, str],
-) -> Summed[T, S]:
-    """Do the work on a run of archives in a child process, and add up what came of them.
+def perform(
+    task: ArchiveTask[T], *, timeout: float, identity: Identity, expected: Mapping[str, str]
+) -> T | Broken:
+    """Do a task in a child process.
 
     Args:
-        tasks: at most as many as the tree adds at once.
-        add: sum of two totals.
-        timeout: longest time for one archive [s].
+        task: the work.
+        timeout: longest time for a task of size 1 [s].
         identity: digest of the code that runs.
         expected: `software` of whoever asks.
 
@@ -319,16 +279,14 @@ def sum_archives(
         WorkerSoftwareError: other software runs here.
         PlannerNotStarted: no child process can be started here.
     """
-    checked: list[ArchiveTask[T, S]] = [
-        ArchiveTask(task.path, _checked, (task, identity, expected)) for task in tasks
-    ]
+    arguments = task, identity, expected
+    checked = ArchiveTask[T | Broken](task.path, _checked, arguments, task.size)
     with _borrowed(timeout) as child:
-        return child.sums([checked], add)[0]
+        (found,) = child.results([checked])
+        return found
 
 
-def _checked(
-    task: ArchiveTask[T, S], identity: Identity, expected: Mapping[str, str]
-) -> Part[T, S] | Broken:
+def _checked(task: ArchiveTask[T], identity: Identity, expected: Mapping[str, str]) -> T | Broken:
     """In the child: what comes of a task, by the same code as the caller's."""
     other = differences(expected, _software_once(identity))
     if other:

@@ -10,28 +10,27 @@ import os
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from stat import S_ISREG
 from sys import intern
 from typing import Any, Final, NamedTuple
 
-from hil.archive import Archive, ArchiveHeader, ArchiveName, ArchiveOutcome, open_archive
+from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.header import KINDS
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
-from hil.cell.schema import PayloadTable
 from hil.errors import ArchiveError, InputError
 from hil.identify.settings import stated_delay
 from hil.io import digest, json_digest
 from hil.progress import Reporter, Silent
 
-from .cache import BESIDE, Store, Where, arm_digest, belief_digest, code_digest
+from .cache import BESIDE, Store, Where, arm_digest, code_digest
 from .factors import cell_in, digest_of, stamp_of
 from .remote import archives_below, is_url, local_file
 from .types import ArchiveRef, Broken, ChangedError, FileStamp, NothingToFitError, TornError
-from .workers import ArchiveTask, Part, Workers
+from .workers import ArchiveTask, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
 """What archives are used for; those of other kinds are left alone."""
@@ -104,13 +103,10 @@ def discover(
                     known[place] = Broken(place.location, str(error))
             task.advance(len(known))
         unknown = [place for place in places if place not in known]
-        tasks: list[ArchiveTask[None, ArchiveRef]] = [
-            ArchiveTask(place.location, examined, (place, where)) for place in unknown
-        ]
-        notes = workers.notes(tasks, done=task.advance)
-        known.update(zip(unknown, notes, strict=True))
-    found_in = _sorted_out([(place, known[place]) for place in places])
-    return Discovery(found_in.refs, (*refused, *found_in.broken), (*left, *found_in.skipped))
+        tasks = [ArchiveTask(place.location, examined, (place, where)) for place in unknown]
+        known.update(zip(unknown, workers.results(tasks, task.advance), strict=True))
+    found = _sorted_out([(place, known[place]) for place in places])
+    return Discovery(found.refs, (*refused, *found.broken), (*left, *found.skipped))
 
 
 # Where archives lie
@@ -142,6 +138,15 @@ class Place(NamedTuple):
         """The campaign's folder: that of the archives, or the one above."""
         above, _, name = self.folder.rpartition("/")
         return above if name == _ARCHIVES and above else self.folder
+
+    @property
+    def stamp(self) -> FileStamp | None:
+        """Of the file as it is now; None of a remote one.
+
+        Raises:
+            ArchiveError: there is no such file.
+        """
+        return None if is_url(self.location) else stamp_of(Path(self.location))
 
 
 def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[Broken]]:
@@ -208,24 +213,20 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
 
 def setup_of(cell: Cell) -> str:
     """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
-    delay = stated_delay(cell)
-    lag = f"torque lags by {1e3 * delay:.12g} ms" if delay else ""
-    return ", ".join(filter(None, (lag, _load(cell.file.robot.payload))))
-
-
-def _load(payload: PayloadTable | None) -> str:
-    if payload is None or not (payload.mass or any(payload.inertia)):
-        return ""
-    frame = f" in {payload.frame}" if payload.frame else ""
-    words = f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}"
-    return words + (f", {_row(payload.inertia)} kg·m²" if any(payload.inertia) else "")
+    delay, payload = stated_delay(cell), cell.file.robot.payload
+    words = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
+    if payload is not None and (payload.mass or any(payload.inertia)):
+        frame = f" in {payload.frame}" if payload.frame else ""
+        words.append(f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}")
+        words += [f"{_row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
+    return ", ".join(words)
 
 
 def _row(figures: Iterable[float]) -> str:
     return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
 
 
-def examined(place: Place, where: Where) -> Part[None, ArchiveRef]:
+def examined(place: Place, where: Where) -> ArchiveRef:
     """Find out what an archive is, and cache it.
 
     Raises:
@@ -234,20 +235,17 @@ def examined(place: Place, where: Where) -> Part[None, ArchiveRef]:
     """
     known = _known(place, where)
     if known is not None:
-        return Part(None, known)
-    begun, stamp = time.time_ns(), _stamp(place)
+        return known
+    begun, stamp = time.time_ns(), place.stamp
     store = where.store(place.location)
     with local_file(place.location) as path:
-        ref = replace(_inspected(place, path, store), stamp=stamp)
+        ref = _inspected(place, path, store)
         if stamp is not None and stamp_of(path) != stamp:
             raise ChangedError(place.location)
     untouched = stamp is None or begun - max(stamp.mtime_ns, stamp.ctime_ns) > _UNTOUCHED
-    if _shows_changes(place, stamp) and untouched:
-        facts = asdict(ref)
-        for own in ("location", "campaign", "stamp"):
-            del facts[own]
-        store.put(_key(place), {"token": _token(place, stamp), "facts": facts})
-    return Part(None, ref)
+    if (stamp is not None or place.version) and untouched:
+        store.put(_key(place), {"token": _token(place, stamp), "ref": ref})
+    return replace(ref, stamp=stamp)
 
 
 def _known(place: Place, where: Where) -> ArchiveRef | None:
@@ -256,24 +254,14 @@ def _known(place: Place, where: Where) -> ArchiveRef | None:
     Raises:
         ArchiveError: there is no such file.
     """
-    stamp = _stamp(place)
-    if not _shows_changes(place, stamp):
+    stamp = place.stamp
+    if stamp is None and not place.version:  # only its bytes show a change
         return None
-    note = where.store(place.location).get(_key(place))
+    note = where.store(place.location).get(_key(place), dict)
     if note is None or note.get("token") != _token(place, stamp):
         return None
-    return ArchiveRef(
-        location=place.location, campaign=place.campaign, stamp=stamp, **note["facts"]
-    )
-
-
-def _stamp(place: Place) -> FileStamp | None:
-    return None if is_url(place.location) else stamp_of(Path(place.location))
-
-
-def _shows_changes(place: Place, stamp: FileStamp | None) -> bool:
-    """Whether a change of the file would show; of other remote objects only their bytes tell."""
-    return stamp is not None or bool(place.version)
+    ref: ArchiveRef = note["ref"]
+    return replace(ref, location=place.location, campaign=place.campaign, stamp=stamp)
 
 
 def _key(place: Place) -> str:
@@ -291,13 +279,15 @@ def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
     archive = open_archive(path, fields=(), stop=-1.0)
     if archive.damage is not None:
         raise TornError(place.location, str(archive.damage))
-    header, use = archive.header, archive.header.serves_as
-    index, attempt = _interval(header, place.name)
-    plan = archive.attachments.get("plan.json")
+    header, plan = archive.header, archive.attachments.get("plan.json")
+    index, attempt = header.index, header.attempt
+    if index is None or attempt is None:  # else as the archive says, whatever its name is now
+        name = ArchiveName.parse(place.name)
+        index, attempt = (0, 0) if name is None else (name.index, name.attempt)
     ref = ArchiveRef(
         location=place.location,
         sha256=sha256,
-        use=use,
+        use=header.serves_as,
         arm="",
         campaign=place.campaign,
         index=index,
@@ -310,13 +300,10 @@ def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
         record=json_digest(dict(header.entries)),
         simulated=header.only_simulated,
     )
-    return _with_cell(ref, archive, store) if use in USES else ref
-
-
-def _with_cell(ref: ArchiveRef, archive: Archive, store: Store) -> ArchiveRef:
-    """The reference with what the archive's cell says; its texts go into the cache."""
+    if ref.use not in USES:
+        return ref
     cell = cell_in(archive)
-    key = json_digest([cell.text, cell.urdf])
+    key, nominal = json_digest([cell.text, cell.urdf]), cell.file.nominal
     if not store.has(key):
         store.put(key, [cell.text, cell.urdf])
     drives = archive.attachments.get("drive_train.json")
@@ -325,19 +312,57 @@ def _with_cell(ref: ArchiveRef, archive: Archive, store: Store) -> ArchiveRef:
         arm=arm_digest(cell, drives, simulated=ref.simulated),
         cell=key,
         setup=setup_of(cell),
-        belief=belief_digest(cell),
+        belief="" if nominal is None else json_digest(nominal.model_dump(mode="json")),
     )
 
 
-def _interval(header: ArchiveHeader, name: str) -> tuple[int, int]:
-    """Index and attempt: as the archive says, whatever its file is called now; else by its name."""
-    if header.index is not None and header.attempt is not None:
-        return header.index, header.attempt
-    parsed = ArchiveName.parse(name)
-    return (0, 0) if parsed is None else (parsed.index, parsed.attempt)
-
-
 # Which archives are meant to be fitted
+
+
+def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery:
+    """Tell archives that are meant to be fitted from copies, failures and earlier attempts."""
+    manifests = _Manifests()
+    read: list[ArchiveRef] = []
+    harmed: list[tuple[Place, Broken]] = []
+    skipped: list[Broken] = []
+    for place, one in found:
+        entries = manifests.entries(place)
+        entry = None if entries is None else entries.get(place.name)
+        if isinstance(one, Broken):
+            harmed.append((place, one))
+        elif entry is not None and entry.sha256 != one.sha256:
+            reason = "is not what its campaign's manifest.json says"
+            harmed.append((place, Broken(place.location, reason)))
+        elif entry is not None and entry.outcome not in ("", _COMPLETED):
+            read.append(replace(one, outcome=entry.outcome))
+        elif (
+            entry is None
+            and entries is not None
+            and one.use in USES
+            and ArchiveName.parse(place.name)
+        ):
+            # A run that was killed may have closed it and not lived to judge it.
+            skipped.append(Broken(place.location, _NOT_ENTERED))
+        else:
+            read.append(one)
+    latest: dict[tuple[str, str, int], int] = {}
+    for ref in read:
+        if ref.attempt and ref.outcome == _COMPLETED:
+            key = (Place(ref.location).folder, ref.kind, ref.index)
+            latest[key] = max(latest.get(key, 0), ref.attempt)
+    broken = list(manifests.broken)
+    for place, harm in harmed:
+        reason = _replaced(place, latest)
+        (skipped if reason else broken).append(Broken(harm.path, reason or harm.reason))
+    refs: list[ArchiveRef] = []
+    seen: dict[str, str] = {}
+    for ref in read:
+        if reason := _objection(ref, latest, seen):
+            skipped.append(Broken(ref.location, reason))
+        else:
+            refs.append(_small(ref))
+    refs.sort(key=lambda ref: ref.order)
+    return Discovery(tuple(refs), tuple(broken), tuple(skipped))
 
 
 class _Manifests:
@@ -368,94 +393,47 @@ class _Manifests:
             return None
 
 
-def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery:
-    manifests = _Manifests()
-    read: list[ArchiveRef] = []
-    harmed: list[tuple[Place, Broken]] = []
-    skipped: list[Broken] = []
-    for place, one in found:
-        entries = manifests.entries(place)
-        entry = None if entries is None else entries.get(place.name)
-        if isinstance(one, Broken):
-            harmed.append((place, one))
-        elif entry is not None and entry.sha256 != one.sha256:
-            reason = "is not what its campaign's manifest.json says"
-            harmed.append((place, Broken(place.location, reason)))
-        elif entry is not None and entry.outcome not in ("", _COMPLETED):
-            read.append(replace(one, outcome=entry.outcome))
-        elif entry is None and entries is not None and _is_motion(place) and one.use in USES:
-            # A run that was killed may have closed it and not lived to judge it.
-            skipped.append(Broken(place.location, _NOT_ENTERED))
-        else:
-            read.append(one)
-    sieve = _Sieve(read)
-    broken: list[Broken] = []
-    for place, harm in harmed:
-        reason = sieve.replacement(place)
-        skipped += [Broken(harm.path, reason)] if reason else []
-        broken += [] if reason else [harm]
-    refs: list[ArchiveRef] = []
-    for ref in read:
-        reason = sieve.objection(ref)
-        skipped += [Broken(ref.location, reason)] if reason else []
-        refs += [] if reason else [_small(ref)]
-    refs.sort(key=lambda ref: ref.order)
-    return Discovery(tuple(refs), (*manifests.broken, *broken), tuple(skipped))
+def _replaced(place: Place, latest: dict[tuple[str, str, int], int]) -> str:
+    """Why nothing is missing with an archive that cannot be used; "" if something is.
 
-
-def _is_motion(place: Place) -> bool:
-    return ArchiveName.parse(place.name) is not None
-
-
-class _Sieve:
-    """Tells archives that are meant to be fitted from copies, failures and earlier attempts."""
-
-    def __init__(self, read: Iterable[ArchiveRef]) -> None:
-        self._latest: dict[tuple[str, str, int], int] = {}
-        self._seen: dict[str, str] = {}
-        for ref in read:
-            if ref.attempt and ref.outcome == _COMPLETED:
-                key = (Place(ref.location).folder, ref.kind, ref.index)
-                self._latest[key] = max(self._latest.get(key, 0), ref.attempt)
-
-    def replacement(self, place: Place) -> str:
-        """Why nothing is missing with an archive that cannot be used; "" if something is.
-
-        A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
-        motion again.
-        """
-        name = ArchiveName.parse(place.name)
-        if place.folder.endswith(f"/{_FOR_VIEWERS}"):
-            return "is a copy for viewers"
-        if name is None:
-            return ""
-        if name.kind in _NEVER_FITTED:
-            return f"is a {name.kind}"
-        last = self._latest.get((place.folder, name.kind, name.index), 0)
-        return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
-
-    def objection(self, ref: ArchiveRef) -> str:
-        """Why an archive is not meant to be fitted; "" if it is."""
-        if ref.use not in USES:
-            return f"is a {ref.use}"
-        if ref.simulated and _REHEARSAL in ref.location:
-            return "belongs to a rehearsal"
-        if _LOADED.search(ref.location):
-            return "carries a payload that its cell does not state"
-        if ref.outcome != _COMPLETED:
-            return f"ended {ref.outcome}"
-        folder = Place(ref.location).folder
-        last = self._latest.get((folder, ref.kind, ref.index), ref.attempt)
-        if ref.attempt and ref.attempt < last:
-            return f"attempt {last} took its place"
-        if ref.sha256 in self._seen and ref.use != "standstill":
-            return f"holds the same as {self._seen[ref.sha256]}"
-        if ref.attempt:
-            first = self._seen.setdefault(f"{folder} {ref.record}", ref.name)
-            if first != ref.name:
-                return f"is a copy of {first}, or was repaired from it"
-        self._seen[ref.sha256] = ref.location
+    A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
+    motion again.
+    """
+    name = ArchiveName.parse(place.name)
+    if place.folder.endswith(f"/{_FOR_VIEWERS}"):
+        return "is a copy for viewers"
+    if name is None:
         return ""
+    if name.kind in _NEVER_FITTED:
+        return f"is a {name.kind}"
+    last = latest.get((place.folder, name.kind, name.index), 0)
+    return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
+
+
+def _objection(
+    ref: ArchiveRef, latest: dict[tuple[str, str, int], int], seen: dict[str, str]
+) -> str:
+    """Why an archive is not meant to be fitted; "" if it is, and then it was seen."""
+    if ref.use not in USES:
+        return f"is a {ref.use}"
+    if ref.simulated and _REHEARSAL in ref.location:
+        return "belongs to a rehearsal"
+    if _LOADED.search(ref.location):
+        return "carries a payload that its cell does not state"
+    if ref.outcome != _COMPLETED:
+        return f"ended {ref.outcome}"
+    folder = Place(ref.location).folder
+    last = latest.get((folder, ref.kind, ref.index), ref.attempt)
+    if ref.attempt and ref.attempt < last:
+        return f"attempt {last} took its place"
+    if ref.sha256 in seen and ref.use != "standstill":
+        return f"holds the same as {seen[ref.sha256]}"
+    if ref.attempt:
+        first = seen.setdefault(f"{folder} {ref.record}", ref.name)
+        if first != ref.name:
+            return f"is a copy of {first}, or was repaired from it"
+    seen[ref.sha256] = ref.location
+    return ""
 
 
 _SHARED: Final = ("use", "arm", "campaign", "cell", "motion", "when", "setup", "belief", "kind")

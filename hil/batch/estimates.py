@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -141,45 +142,6 @@ class Estimator:
         return joint_weights(total)
 
 
-class WarningCounts:
-    """In how many archives there is reason for which warning."""
-
-    def __init__(self) -> None:
-        self._archives = 0
-        self._found: dict[str, tuple[int, str]] = {}  # count, and the first archive
-
-    def count(self, summary: Summary) -> None:
-        """Add those of an archive."""
-        self._archives += 1
-        name = f"{summary.ref.campaign.rsplit('/', 1)[-1]}/{summary.ref.name}"
-        self._add((text, 1, name) for text in summary.warnings)
-
-    def add(self, other: WarningCounts) -> None:
-        """Add those of other archives."""
-        self._archives += other._archives
-        self._add((text, count, name) for text, (count, name) in other._found.items())
-
-    def lines(self) -> tuple[str, ...]:
-        """In sentences, each with what it concerns; most archives first."""
-        ordered = sorted(self._found.items(), key=lambda item: -item[1][0])
-        found = [self._line(text, count, name) for text, (count, name) in ordered[:_NAMED]]
-        if len(ordered) > _NAMED:
-            found.append(f"{len(ordered) - _NAMED} more warnings stand with the repetitions")
-        return tuple(found)
-
-    def _add(self, found: Iterable[tuple[str, int, str]]) -> None:
-        for text, count, name in found:
-            known, first = self._found.get(text, (0, name))
-            self._found[text] = (known + count, first)
-
-    def _line(self, text: str, count: int, name: str) -> str:
-        if count == self._archives:
-            return text
-        if count == 1:
-            return f"{name}: {text}"
-        return f"{count} of {self._archives} archives, such as {name}: {text}"
-
-
 @dataclass(eq=False)
 class Group:
     """What is fitted together and what is predicted by it, beside the sum of the factors.
@@ -189,7 +151,7 @@ class Group:
         repetitions: the estimate of each.
         unseen: sum of the totals of what is predicted; None if nothing is.
         products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
-        warnings: about all archives.
+        warned: every archive, with the warnings about it.
         settings: digests.
     """
 
@@ -197,12 +159,12 @@ class Group:
     repetitions: list[LevelEstimate] = field(default_factory=list)
     unseen: PhaseFactor | None = None
     products: Array | None = None
-    warnings: WarningCounts = field(default_factory=WarningCounts)
+    warned: list[tuple[ArchiveRef, tuple[str, ...]]] = field(default_factory=list)
     settings: set[str] = field(default_factory=set)
 
     def add_archive(self, summary: Summary) -> None:
         """Add an archive; its estimate is added apart."""
-        self.warnings.count(summary)
+        self.warned.append((summary.ref, summary.warnings))
         if summary.ref.use == "excitation":
             self.refs.append(summary.ref)
             self.products = plus(self.products, summary.products)
@@ -215,8 +177,26 @@ class Group:
         self.repetitions += other.repetitions
         self.unseen = plus(self.unseen, other.unseen)
         self.products = plus(self.products, other.products)
-        self.warnings.add(other.warnings)
+        self.warned += other.warned
         self.settings |= other.settings
+
+
+def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
+    """Warnings about archives in sentences, each with what it concerns; most archives first."""
+    counts: Counter[str] = Counter()
+    first: dict[str, ArchiveRef] = {}
+    for ref, warnings in warned:
+        for text in warnings:
+            counts[text] += 1
+            first.setdefault(text, ref)
+    found = []
+    for text, count in counts.most_common(_NAMED):
+        name = f"{first[text].campaign.rsplit('/', 1)[-1]}/{first[text].name}"
+        some = f"{name}: " if count == 1 else f"{count} of {len(warned)} archives, such as {name}: "
+        found.append(text if count == len(warned) else some + text)
+    if len(counts) > _NAMED:
+        found.append(f"{len(counts) - _NAMED} more warnings stand with the repetitions")
+    return tuple(found)
 
 
 def repetition_level(
@@ -298,7 +278,7 @@ def sum_level(
         unseen_rms=left,
         unseen_torque_rms=torque,
         settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
-        warnings=(*_conditioning(found), *warnings, *group.warnings.lines()),
+        warnings=(*_conditioning(found), *warnings, *warning_lines(group.warned)),
         speed_rms=speed_rms(model, total),
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +20,7 @@ from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, known_warnings, source_of
-from hil.io import file_digest
+from hil.io import file_digest, json_digest
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay_compensation import rate_products
@@ -29,6 +30,7 @@ from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
+from .cache import Where, settings_digest, sum_key
 from .remote import local_file
 from .types import ArchiveRef, Broken, Bundle, ChangedError, FileStamp, Fit, Summary, TornError
 
@@ -95,41 +97,83 @@ def bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
     return [tuple(ordered[k : k + BUNDLE]) for k in range(0, len(ordered), BUNDLE)]
 
 
-def reduce_bundle(
-    refs: Sequence[ArchiveRef], settings: Settings, begin: Bundle | None = None
-) -> Bundle:
-    """Reduce archives of one campaign one after the other, and add up what is fitted.
+def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle:
+    """Reduce archives of one campaign, or those that are not in the cache, and cache the result.
 
     The sum goes from first to last, so that one that is known of the first ones can be continued.
 
     Args:
         refs: in their canonical order.
         settings: of the campaign.
-        begin: what is known of the first of them, if anything.
+        where: what is known of them is cached.
 
     Returns:
         With a reason for each archive that could not be used; nothing of it is in the sum.
+
+    Raises:
+        CacheError: the disk refuses.
     """
-    summaries, broken, phase = [], [], None
-    known, lasting = 0, True
-    if begin is not None:
-        summaries, broken = list(begin.summaries), list(begin.broken)
-        phase, known, lasting = begin.phase, len(begin.refs), begin.lasting
+    store, used = where.store(refs[0].location), settings_digest(settings)
+    counts = range(len(refs), 0, -1)
+    begun = next(filter(None, (cached(refs[:count], settings, where) for count in counts)), None)
+    known = 0 if begun is None else len(begun.refs)
+    if begun is not None and known == len(refs):
+        return begun
+    found = begun or Bundle(())
+    summaries, broken, phase, lasting = list(found.summaries), list(found.broken), found.phase, True
     for ref in refs[known:]:
         try:
             summary, own = archive_factor(ref, settings)
         except (HilError, IdentificationError) as error:
             broken.append(Broken(ref.location, str(error)))
             lasting &= _of_the_bytes(error)
-            continue
         except Exception as error:  # a fault of ours: it costs this archive, not the batch
             broken.append(Broken(ref.location, f"{type(error).__name__}: {error}"))
             lasting = False
-            continue
-        summaries.append(summary)
-        if ref.use == "excitation":
-            phase = own if phase is None else phase + own
-    return Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting)
+        else:
+            summaries.append(summary)
+            if ref.use == "excitation":
+                phase = own if phase is None else phase + own
+    read = len(refs) - known
+    bundle = Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting, read)
+    if lasting:
+        for one in summaries:
+            store.put(_summary_key(one.ref, used), one)
+        reasons = dict(broken)
+        for ref in refs:
+            if ref.location in reasons:
+                store.put(_summary_key(ref, used), reasons[ref.location])
+        store.put(sum_key(refs, used), [phase])
+        if known:
+            store.remove(sum_key(refs[:known], used))  # part of a longer one now
+    return bundle
+
+
+def cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle | None:
+    """Archives reduced earlier; None unless all of them are in the cache."""
+    store, used = where.store(refs[0].location), settings_digest(settings)
+    found = store.get(sum_key(refs, used), list)
+    if found is None or len(found) != 1 or not isinstance(found[0], PhaseFactor | None):
+        return None
+    summaries, broken = [], []
+    for ref in refs:
+        match store.get(_summary_key(ref, used), object):
+            case Summary() as one:  # of an archive that may lie elsewhere by now
+                summaries.append(replace(one, ref=ref))
+            case str() as reason:
+                broken.append(Broken(ref.location, reason))
+            case _:
+                return None
+    return Bundle(tuple(refs), tuple(summaries), found[0], tuple(broken))
+
+
+def is_cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> bool:
+    """Whether there is an entry of the sum of these archives; it may turn out to be damaged."""
+    return where.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))
+
+
+def _summary_key(ref: ArchiveRef, settings: str) -> str:
+    return json_digest(["summary", ref.sha256, settings])
 
 
 def _of_the_bytes(error: HilError | IdentificationError) -> bool:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import operator
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from hil.archive import Archive
 from hil.cell import Cell
@@ -23,22 +22,11 @@ from hil.progress import Reporter, Silent, Task
 from hil.terminal_text import plural
 from identification import IdentificationError
 from identification.factor.phases import PhaseFactor
-from identification.model.payload import Payload
 
-from .cache import (
-    Where,
-    bundle_with_cache,
-    cached_bundle,
-    cached_settings,
-    code_digest,
-    decision_digest,
-    is_cached,
-    put_settings,
-    settings_digest,
-)
+from .cache import Where, code_digest, decision_digest, settings_digest
 from .discovery import discover
 from .estimates import Estimator, Group, repetition_level, sum_level
-from .factors import bundles, cell_from, cell_in, opened, source_in
+from .factors import bundles, cached, cell_from, cell_in, is_cached, opened, reduced, source_in
 from .types import (
     ESTIMATORS,
     ArchiveRef,
@@ -52,10 +40,16 @@ from .types import (
     NothingToFitError,
     Summary,
 )
-from .workers import ArchiveTask, Part, Summed, TreeSum, Workers
+from .workers import FAN_IN, ArchiveTask, TreeSum, Workers
+
+T = TypeVar("T")
+Run = list[tuple[ArchiveRef, ...]]
+"""Bundles that are reduced and added up together: one, or up to `FAN_IN` far away."""
 
 _ROUNDS: Final = 3
 """How often archives are reduced again without those that end their process."""
+_MANY: Final = 4
+"""Runs per worker from which on whole runs are added up far away, so that less is sent."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +132,7 @@ class Decision(NamedTuple):
 
 def decided(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
-) -> Part[None, Decision]:
+) -> Decision:
     """Decide a campaign's settings from some of its archives, and cache them.
 
     Args:
@@ -153,7 +147,7 @@ def decided(
     """
     known = _known_settings(refs, options, arms, where)
     if known is not None:
-        return Part(None, Decision(known, ()))
+        return Decision(known, ())
     broken: list[Broken] = []
     rest: Source | None = None
     fitted: list[tuple[Archive, Source]] = []
@@ -166,7 +160,7 @@ def decided(
         except (HilError, IdentificationError) as error:
             broken.append(Broken(ref.location, str(error)))
     if not fitted:
-        return Part(None, Decision(None, tuple(broken)))
+        return Decision(None, tuple(broken))
     sources, _ = with_noise(
         all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
     )
@@ -175,9 +169,8 @@ def decided(
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
-        key = decision_digest(options, arms, refs)
-        put_settings(where.store(refs[0].location), key, settings)
-    return Part(None, Decision(settings, tuple(broken)))
+        where.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
+    return Decision(settings, tuple(broken))
 
 
 def _known_settings(
@@ -185,21 +178,22 @@ def _known_settings(
 ) -> Settings | None:
     if not refs:
         return None
-    return cached_settings(where.store(refs[0].location), decision_digest(options, arms, refs))
+    return where.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
 
 
-def reduced(
-    refs: Sequence[ArchiveRef], settings: Settings, where: Where
-) -> Part[PhaseFactor, Bundle]:
-    """Reduce a bundle: its sum, and the rest of it."""
-    bundle = bundle_with_cache(refs, settings, where)
-    return Part(bundle.phase, replace(bundle, phase=None))
-
-
-def opened_alone(ref: ArchiveRef) -> Part[None, None]:
+def opened_alone(ref: ArchiveRef) -> None:
     """Open an archive, to see whether that fails, or ends this process."""
     with opened(ref):
-        return Part(None, None)
+        pass
+
+
+def added_up(
+    run: Run, settings: Settings, where: Where
+) -> tuple[PhaseFactor | None, tuple[Bundle, ...]]:
+    """Reduce bundles: their sum, and the rest of each."""
+    found = [reduced(refs, settings, where) for refs in run]
+    total = TreeSum[PhaseFactor](bundle.phase for bundle in found).result()
+    return total, tuple(replace(bundle, phase=None) for bundle in found)
 
 
 # In the process that gives work out
@@ -214,14 +208,14 @@ class Campaign:
         refs: archives, without those found to be broken.
         arms: settings of its arm; None where it decides on them.
         settings: None until they are decided.
-        jobs: bundles that are reduced and added up together, and whether they are in the cache.
+        runs: what is reduced and added up together, and whether it is in the cache.
     """
 
     key: GroupKey
     refs: tuple[ArchiveRef, ...]
     arms: Settings | None = None
     settings: Settings | None = None
-    jobs: list[tuple[list[tuple[ArchiveRef, ...]], bool]] = field(default_factory=list)
+    runs: list[tuple[Run, bool]] = field(default_factory=list)
 
     @property
     def consulted(self) -> tuple[ArchiveRef, ...]:
@@ -250,7 +244,7 @@ class _Batch:
         self._plan, self._options, self._where = plan, plan.options, where
         self._workers, self._reporter = workers, reporter
         self._task: Task | None = None
-        self._stream: Iterator[Summed[PhaseFactor, Bundle]] = iter(())
+        self._stream: Iterator[Any] = iter(())
         self.broken: list[Broken] = []
         self._read = self._cached = 0
         self._arms: dict[str, Arm] = {}
@@ -268,7 +262,12 @@ class _Batch:
             for digest, members in groupby(campaigns, lambda one: one.key.arm):
                 self._arm(digest, list(members))
         self._task = None
-        broken = tuple(dict.fromkeys(map(_without_path, self.broken)))
+        # The path stands in the reason of some as well.
+        broken = tuple(
+            dict.fromkeys(
+                Broken(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
+            )
+        )
         if not self._repetitions:
             raise _nothing_to_fit(broken)
         return BatchResult(
@@ -291,8 +290,7 @@ class _Batch:
 
         Those of an arm are decided on the first of its campaigns that can be read, and the others
         take them over with their own noise: comparisons in time need one law, and sums the same
-        columns. A campaign is asked again as long as archives that it was asked for turn out to be
-        broken.
+        columns.
         """
         arms: dict[str, Settings] = {}
         waiting = list(campaigns)
@@ -308,7 +306,7 @@ class _Batch:
     def _decide(
         self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]
     ) -> list[Campaign]:
-        """Decide settings of campaigns; returns those to be asked again."""
+        """Decide settings; returns campaigns to be asked again, without what turned out broken."""
         for one in campaigns:
             one.arms = arms.get(one.key.arm)
             one.settings = _known_settings(one.consulted, self._options, one.arms, self._where)
@@ -320,102 +318,107 @@ class _Batch:
             for one in left
         ]
         again = []
-        for one, note in zip(left, self._notes(tasks, "deciding settings"), strict=True):
-            count, failed = len(one.refs), isinstance(note, Broken)
-            broken = self._unreadable(one.consulted) if failed else note.broken
-            one.settings = None if failed else note.settings
-            self.broken += broken
+        for one, found in zip(left, self._results(tasks, "deciding settings"), strict=True):
+            count = len(one.refs)
+            if isinstance(found, Broken):
+                broken = self._unusable(
+                    one.consulted,
+                    [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in one.consulted],
+                    "opening archives one by one",
+                )
+                reason = found.reason
+            else:
+                one.settings, broken = found.settings, [*found.broken]
+                self.broken += broken
+                reason = "none of its archives says how it is to be read"
+                reason = reason if one.consulted else "it holds no excitation"
             paths = {each.path for each in broken}
             one.refs = tuple(ref for ref in one.refs if ref.location not in paths)
-            if one.settings is not None or (not one.refs and not failed):
+            if one.settings is not None:
                 continue
             if 0 < len(one.refs) < count:
                 again.append(one)
-            elif failed:
-                self.broken.append(Broken(one.key.campaign, note.reason))
-            else:
-                why = "none of its archives says how it is to be read"
-                why = why if one.consulted else "it holds no excitation"
-                self.broken.append(Broken(one.key.campaign, why))
+            elif one.refs or isinstance(found, Broken):
+                self.broken.append(Broken(one.key.campaign, reason))
         return again
 
-    def _unreadable(self, refs: Sequence[ArchiveRef]) -> list[Broken]:
-        tasks = [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in refs]
-        notes = self._notes(tasks, "opening archives one by one")
-        return [note for note in notes if isinstance(note, Broken)]
+    def _unusable(
+        self, refs: Sequence[ArchiveRef], tasks: Sequence[ArchiveTask[Any]], title: str
+    ) -> list[Broken]:
+        """Those of archives with which a task alone fails, or ends its process."""
+        pairs = zip(refs, self._results(tasks, title), strict=True)
+        broken = [Broken(ref.location, one.reason) for ref, one in pairs if _is_broken(one)]
+        self.broken += broken
+        return broken
 
     # Factors
 
     def _begin(self, campaigns: Sequence[Campaign]) -> None:
         """Give out the work on archives; what the cache has is read here where that can be seen."""
-        groups = []
-        for one in campaigns:
-            every = bundles(one.reduced)
-            if self._workers.near:
-                one.jobs = [([refs], is_cached(refs, one.ready, self._where)) for refs in every]
-            else:  # few sums to be sent
-                one.jobs = [(every, False)]
-            groups += [self._tasks(one, job) for job, in_cache in one.jobs if not in_cache]
-        archives = sum(len(task.arguments[0]) for group in groups for task in group)
-        share = archives / max(1, sum(map(len, groups)))
-        self._stream = self._workers.sums_in_turn(
-            groups, operator.add, done=lambda count: self._advance(share * count)
-        )
+        every = [bundles(one.reduced) for one in campaigns]
+        many = sum(map(len, every)) >= FAN_IN * _MANY * self._workers.count
+        size = 1 if self._workers.near or not many else FAN_IN
+        tasks = []
+        for one, own in zip(campaigns, every, strict=True):
+            for k in range(0, len(own), size):
+                run = own[k : k + size]
+                known = self._workers.near and is_cached(run[0], one.ready, self._where)
+                one.runs.append((run, known))
+                tasks += [] if known else [self._reducing(one, run)]
+        archives = sum(len(refs) for task in tasks for refs in task.arguments[0])
+        share = archives / max(1, len(tasks))
+        self._stream = self._workers.results(tasks, lambda count: self._advance(share * count))
 
-    def _tasks(
-        self, one: Campaign, job: Sequence[tuple[ArchiveRef, ...]]
-    ) -> list[ArchiveTask[PhaseFactor, Bundle]]:
-        return [ArchiveTask(r[0].location, reduced, (r, one.ready, self._where)) for r in job]
+    def _reducing(self, one: Campaign, run: Run) -> ArchiveTask[Any]:
+        arguments = run, one.ready, self._where
+        return ArchiveTask(run[0][0].location, added_up, arguments, len(run))
 
-    def _collected(self, one: Campaign) -> Iterator[Summed[PhaseFactor, Bundle]]:
-        """Sums of a campaign and the bundles in them, in turn."""
-        for job, in_cache in one.jobs:
-            if not in_cache:
-                yield self._without_crashes(one, job, next(self._stream))
-                continue
-            bundle = cached_bundle(job[0], one.ready, self._where)
+    def _collected(self, one: Campaign, sums: TreeSum[PhaseFactor]) -> Iterator[Bundle]:
+        """The bundles of a campaign in turn, added up."""
+        for run, in_cache in one.runs:
+            bundle = cached(run[0], one.ready, self._where) if in_cache else None
+            found: tuple[Bundle, ...]
             if bundle is not None:
-                yield Summed(bundle.phase, (bundle,))
-            else:  # damaged
-                (found,) = self._workers.sums([self._tasks(one, job)], operator.add)
-                yield self._without_crashes(one, job, found)
-            self._advance(len(job[0]), one.key.campaign)
+                total, found = bundle.phase, (bundle,)
+            else:  # or damaged
+                again = self._workers.results([self._reducing(one, run)])
+                result = next(again if in_cache else self._stream)
+                total, found = self._without_crashes(one, run, result)
+            if in_cache:
+                self._advance(len(run[0]), one.key.campaign)
+            sums.add(total, 0 if len(run) == 1 else 1)
+            yield from found
 
     def _without_crashes(
-        self,
-        one: Campaign,
-        job: Sequence[tuple[ArchiveRef, ...]],
-        found: Summed[PhaseFactor, Bundle],
-    ) -> Summed[PhaseFactor, Bundle]:
+        self, one: Campaign, run: Run, result: Any
+    ) -> tuple[PhaseFactor | None, tuple[Bundle, ...]]:
         """The sum of bundles; again without the archives that ended their process."""
         for _ in range(_ROUNDS):
-            if not any(isinstance(note, Broken) for note in found.notes):
+            if not isinstance(result, Broken):
                 break
-            pairs = list(zip(job, found.notes, strict=True))
-            job = [self._survivors(one, r) if isinstance(note, Broken) else r for r, note in pairs]
-            job = [refs for refs in job if refs]
-            (found,) = self._workers.sums([self._tasks(one, job)], operator.add)
-        for refs, note in zip(job, found.notes, strict=True):
-            if isinstance(note, Broken):
-                self.broken += [Broken(ref.location, note.reason) for ref in refs]
-        return found
+            refs = [ref for own in run for ref in own]
+            title = f"reading {refs[0].name} and others one by one"
+            alone = [self._reducing(one, [(ref,)]) for ref in refs]
+            paths = {each.path for each in self._unusable(refs, alone, title)}
+            run = [tuple(ref for ref in own if ref.location not in paths) for own in run]
+            run = [own for own in run if own]
+            if not run:
+                return None, ()
+            (result,) = self._workers.results([self._reducing(one, run)])
+        if isinstance(result, Broken):
+            self.broken += [Broken(ref.location, result.reason) for own in run for ref in own]
+            return None, ()
+        total, found = result
+        return total, found
 
-    def _survivors(self, one: Campaign, refs: Sequence[ArchiveRef]) -> tuple[ArchiveRef, ...]:
-        """Those of a bundle that do not end their process when they are reduced alone."""
-        tasks = self._tasks(one, [(ref,) for ref in refs])
-        notes = list(self._notes(tasks, f"reading {refs[0].name} and others one by one"))
-        pairs = list(zip(refs, notes, strict=True))
-        self.broken += [Broken(r.location, note.reason) for r, note in pairs if _is_broken(note)]
-        return tuple(ref for ref, note in pairs if not _is_broken(note))
-
-    def _notes(self, tasks: Sequence[ArchiveTask[Any, Any]], title: str) -> Iterator[Any]:
-        """What is noted of tasks; at most one bar of progress is shown."""
+    def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> Iterator[T | Broken]:
+        """What comes of tasks; at most one bar of progress is shown."""
         if not tasks or self._task is not None:
             self._advance(0, title)
-            yield from self._workers.notes(tasks)
+            yield from self._workers.results(tasks)
             return
         with self._reporter.task(title, len(tasks)) as progress:
-            found = list(self._workers.notes(tasks, done=progress.advance))
+            found = list(self._workers.results(tasks, progress.advance))
         yield from found
 
     def _advance(self, units: float, note: str = "") -> None:
@@ -460,20 +463,16 @@ class _Batch:
         used = settings_digest(one.ready)
         group, sums = Group(settings={used}), TreeSum[PhaseFactor]()
         waiting: list[Summary] = []  # for the centre of all; of very many archives if need be only
-        for found in self._collected(one):
-            sums.add(found.total)
-            for bundle in found.notes:
-                if isinstance(bundle, Broken):
-                    continue
-                self.broken += bundle.broken
-                self._read += bundle.read
-                self._cached += len(bundle.refs) - bundle.read
-                for summary in bundle.summaries:
-                    group.add_archive(summary)
-                    if summary.ref.use == "excitation" and estimator.shrinks:
-                        waiting.append(summary)
-                    elif summary.ref.use == "excitation":
-                        group.repetitions.append(repetition_level(estimator, summary, used))
+        for bundle in self._collected(one, sums):
+            self.broken += bundle.broken
+            self._read += bundle.read
+            self._cached += len(bundle.refs) - bundle.read
+            for summary in bundle.summaries:
+                group.add_archive(summary)
+                if summary.ref.use == "excitation" and estimator.shrinks:
+                    waiting.append(summary)
+                elif summary.ref.use == "excitation":
+                    group.repetitions.append(repetition_level(estimator, summary, used))
         phase = sums.result()
         levels: list[LevelEstimate] = []
         if phase is None:
@@ -483,8 +482,9 @@ class _Batch:
             group.repetitions += [
                 repetition_level(estimator, summary, used, centre) for summary in waiting
             ]
-            payload = _payload(self._cell(group.refs[0]))
-            levels.append(sum_level("campaign", estimator, group, phase, centre, (), payload))
+            payload = self._cell(group.refs[0]).model.payload
+            stated = payload if payload is not None and payload.parameters.any() else None
+            levels.append(sum_level("campaign", estimator, group, phase, centre, (), stated))
         self._repetitions += group.repetitions
         return group, phase, levels
 
@@ -498,15 +498,15 @@ class _Batch:
 
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""
-        texts = self._where.store(ref.location).get(ref.cell)
+        texts = self._where.store(ref.location).get(ref.cell, list)
         if texts is not None and json_digest(texts) == ref.cell:
             return cell_from(*texts)
         with opened(ref) as archive:
             return cell_in(archive)
 
 
-def _is_broken(note: object) -> bool:
-    return isinstance(note, Broken)
+def _is_broken(found: object) -> bool:
+    return isinstance(found, Broken)
 
 
 def _nothing_to_fit(broken: Sequence[Broken]) -> NothingToFitError:
@@ -519,17 +519,6 @@ def _nothing_to_fit(broken: Sequence[Broken]) -> NothingToFitError:
             else f"; {len(broken)} could not be used, the first of them {path}: {reason}"
         )
     return NothingToFitError(None, problem)
-
-
-def _without_path(one: Broken) -> Broken:
-    """Without the path in the reason, where it stands already."""
-    return Broken(one.path, one.reason.removeprefix(f"{one.path}: "))
-
-
-def _payload(cell: Cell) -> Payload | None:
-    """The payload that a cell states; None for one of no weight and inertia."""
-    payload = cell.model.payload
-    return payload if payload is not None and payload.parameters.any() else None
 
 
 def _setups(keys: Collection[GroupKey]) -> list[str]:

@@ -188,8 +188,8 @@ class Bundle:
     """
 
     refs: tuple[ArchiveRef, ...]
-    summaries: tuple[Summary, ...]
-    phase: PhaseFactor | None
+    summaries: tuple[Summary, ...] = ()
+    phase: PhaseFactor | None = None
     broken: tuple[Broken, ...] = ()
     lasting: bool = True
     read: int = 0

@@ -1,11 +1,7 @@
-"""Who does the work on archives, and in which order its results are added up.
+"""Work on archives in child processes, and sums that have the same bits whoever adds them.
 
-Floating-point addition is not associative, so where terms are added decides about the last bits.
-Here each sum is a tree over the terms in their order, of which every part can be added wherever
-its terms are: one process and a hundred machines give the same bits.
-
-Archives are worked on in child processes: one that crashes or hangs costs itself, linear algebra
-has one thread, and so the bits do not depend on how many tasks are done at once.
+An archive that crashes or hangs its process costs itself. Linear algebra has one thread there, so
+the bits do not depend on how many tasks are done at once.
 """
 
 from __future__ import annotations
@@ -14,9 +10,9 @@ import operator
 import os
 import signal
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Generic, NamedTuple, Self, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
 from hil.errors import HilError
 from planner.errors import PlannerCrashed, PlanningTimedOut
@@ -25,79 +21,66 @@ from planner.worker import WorkerProcess, stream_in_children
 from .types import Broken, CacheError
 
 T = TypeVar("T")
-S = TypeVar("S")
+T_co = TypeVar("T_co", covariant=True)
 Done = Callable[[int], None]
 
 TIMEOUT: Final = 300.0
-"""Longest time for one task [s]."""
+"""Longest time for one bundle of archives [s]."""
 FAN_IN: Final = 8
 """Terms of each sum of the tree: few enough to be held at once, many enough to send little."""
 _START: Final = 60.0
 """s that a new process may take to import what it needs, on a busy machine."""
-_TOGETHER: Final = 512
-"""Tasks without a sum that are given out as a group: few enough to be held at once."""
-
-
-class Part(NamedTuple, Generic[T, S]):
-    """What came of an archive: what is added up (None for nothing), and what else is known."""
-
-    total: T | None
-    note: S
 
 
 @dataclass(frozen=True, eq=False)
-class ArchiveTask(Generic[T, S]):
-    """Work on one archive.
+class ArchiveTask(Generic[T_co]):
+    """Work on archives.
 
     Attributes:
-        path: file or URL, by which it is named where it fails.
-        function: returns its part; importable where it runs.
+        path: file or URL, by which the task is named where it fails.
+        function: importable where it runs.
         arguments: of the function; they travel with each task, so they should be small.
+        size: how many times the longest time for one task it may take, at most `FAN_IN`.
     """
 
     path: str
-    function: Callable[..., Part[T, S] | Broken]
+    function: Callable[..., T_co]
     arguments: tuple[Any, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Summed(Generic[T, S]):
-    """What came of several archives.
-
-    Attributes:
-        total: sum of the parts that are there; None where there is none.
-        notes: of each archive in order, or why there is none.
-    """
-
-    total: T | None
-    notes: tuple[S | Broken, ...]
+    size: int = 1
 
 
 class WorkerSoftwareError(HilError):
     """A worker that runs other software than the one who asked it."""
 
 
-def plus(one: Any, other: Any, add: Callable[[Any, Any], Any] = operator.add) -> Any:
+def plus(one: Any, other: Any) -> Any:
     """The sum of two terms, each of which may be None, which is nothing."""
-    return one if other is None else other if one is None else add(one, other)
+    return one if other is None else other if one is None else operator.add(one, other)
 
 
 class TreeSum(Generic[T]):
     """The sum of terms that come in their order: runs of `FAN_IN`, then runs of their sums.
 
-    At each time one sum per level of the tree is held.
+    Floating-point addition is not associative; in a tree each run can be added wherever its terms
+    are. At each time one sum per level of the tree is held.
     """
 
-    def __init__(self, add: Callable[[Any, Any], Any] = operator.add) -> None:
-        self._add = add
+    def __init__(self, terms: Iterable[T | None] = ()) -> None:
         self._levels: list[tuple[int, T | None]] = []  # terms so far, and their sum
+        for term in terms:
+            self.add(term)
 
     def add(self, term: T | None, level: int = 0) -> None:
-        """Add the next term, which is not changed; None is nothing, and has its place."""
-        if level == len(self._levels):
+        """Add the next term, which is not changed; None is nothing, and has its place.
+
+        Args:
+            term: of the level.
+            level: 0, or 1 for the sum of a run: of `FAN_IN` terms, or of the last ones.
+        """
+        while level >= len(self._levels):
             self._levels.append((0, None))
         count, total = self._levels[level]
-        total = plus(total, term, self._add)
+        total = plus(total, term)
         self._levels[level] = (count + 1, total)
         if count + 1 == FAN_IN:
             self._levels[level] = (0, None)
@@ -115,36 +98,16 @@ class TreeSum(Generic[T]):
         return self._levels[-1][1] if self._levels else None
 
 
-def sum_tree(terms: Sequence[T | None], add: Callable[[T, T], T]) -> T | None:
-    """The sum of :class:`TreeSum`."""
-    sums = TreeSum[T](add)
-    for term in terms:
-        sums.add(term)
-    return sums.result()
-
-
-def joined(parts: Sequence[Summed[T, S]], add: Callable[[T, T], T]) -> Summed[T, S]:
-    """The sum of successive runs of tasks, each a whole branch of the tree."""
-    notes = tuple(note for part in parts for note in part.notes)
-    return Summed(sum_tree([part.total for part in parts], add), notes)
-
-
-def summed(parts: Sequence[Part[T, S] | Broken], add: Callable[[T, T], T]) -> Summed[T, S]:
-    """What comes of the tasks of one group."""
-    return Summed(
-        sum_tree([None if isinstance(part, Broken) else part.total for part in parts], add),
-        tuple(part if isinstance(part, Broken) else part.note for part in parts),
-    )
-
-
 class Workers(ABC):
     """Who does the work on archives.
 
     Attributes:
         near: whether files they write can be read here under the same names.
+        count: how many tasks are done at once.
     """
 
     near: bool
+    count: int
 
     def __enter__(self) -> Self:
         return self
@@ -156,41 +119,17 @@ class Workers(ABC):
         """End or leave those who work, if they are others than this process."""
 
     @abstractmethod
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Done | None = None,
-    ) -> Iterator[Summed[T, S]]:
-        """Do the tasks, and add up what comes of those of each group, in the order of `TreeSum`.
+    def results(
+        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
+    ) -> Iterator[T | Broken]:
+        """What comes of tasks, in their order; later ones are worked on meanwhile.
 
-        A task that ends its process or takes too long has a `Broken` in place of its note. Later
-        groups may be worked on before an earlier one is asked for.
+        A task that fails, ends its process or takes too long has a `Broken` in its place.
 
         Args:
-            groups: the work, in an order that decides about the last bits.
-            add: sum of two totals, importable on the workers; it must not change them.
+            tasks: the work.
             done: called with a number of tasks whenever so many more are finished.
         """
-
-    def sums(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Done | None = None,
-    ) -> list[Summed[T, S]]:
-        """The same of all groups."""
-        return list(self.sums_in_turn(groups, add, done=done))
-
-    def notes(
-        self, tasks: Sequence[ArchiveTask[T, S]], *, done: Done | None = None
-    ) -> Iterator[S | Broken]:
-        """The notes of tasks of which nothing is to be added up."""
-        groups = [tasks[k : k + _TOGETHER] for k in range(0, len(tasks), _TOGETHER)]
-        for found in self.sums_in_turn(groups, operator.add, done=done):
-            yield from found.notes
 
 
 class LocalWorkers(Workers):
@@ -198,7 +137,7 @@ class LocalWorkers(Workers):
 
     Args:
         count: how many; by default one for each core this process may use.
-        timeout: longest time for one task [s].
+        timeout: longest time for one task of size 1 [s].
     """
 
     near = True
@@ -215,55 +154,43 @@ class LocalWorkers(Workers):
         while self._children:
             self._children.pop().close()
 
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[T, S]]],
-        add: Callable[[T, T], T],
-        *,
-        done: Done | None = None,
-    ) -> Iterator[Summed[T, S]]:
+    def results(
+        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
+    ) -> Iterator[T | Broken]:
         """See :class:`Workers`.
 
         Raises:
             PlannerNotStarted: no child process can be started.
             CacheError: the cache cannot be written.
         """
-        tasks = [task for group in groups for task in group]
         children = [self._child() for _ in range(min(self.count, len(tasks)))]
-        results = stream_in_children(
+        found = stream_in_children(
             children,
-            run_tasks,
+            _run_tasks,
             ([k] for k in range(len(tasks))),
             lambda chunk: ([tasks[k] for k in chunk], self._timeout),
             done=done,
         )
-        parts: dict[int, Part[T, S] | Broken] = {}
+        early: dict[int, Any] = {}
         try:
-            first = 0
-            for group in groups:
-                wanted = range(first, first + len(group))
-                first += len(group)
-                while not all(k in parts for k in wanted):
-                    k, result = next(results)
-                    parts[k] = self._part(tasks[k], result)
-                yield summed([parts.pop(k) for k in wanted], add)
+            for k, task in enumerate(tasks):
+                while k not in early:
+                    other, result = next(found)
+                    early[other] = result
+                yield self._named(task, early.pop(k))
         finally:
-            results.close()
+            found.close()
             self._idle += [child for child in children if child in self._children]
 
     def _child(self) -> WorkerProcess:
         if not self._idle:
-            self._idle.append(WorkerProcess(timeout=self._timeout + _START))
+            self._idle.append(WorkerProcess(timeout=FAN_IN * self._timeout + _START))
             self._children += self._idle
         return self._idle.pop()
 
-    def _part(
-        self,
-        task: ArchiveTask[T, S],
-        result: Part[T, S] | Broken | PlannerCrashed | PlanningTimedOut,
-    ) -> Part[T, S] | Broken:
+    def _named(self, task: ArchiveTask[Any], result: Any) -> Any:
         if isinstance(result, PlanningTimedOut):
-            return Broken(task.path, f"took longer than {self._timeout:g} s")
+            return Broken(task.path, f"took longer than {task.size * self._timeout:g} s")
         if isinstance(result, PlannerCrashed):
             status = result.status
             end = f"signal {-status}" if status < 0 else f"status {status}"
@@ -271,19 +198,19 @@ class LocalWorkers(Workers):
         return result
 
 
-def run_tasks(tasks: Sequence[ArchiveTask[T, S]], timeout: float) -> list[Part[T, S] | Broken]:
-    """In a child: what comes of each task, or what it met; one that takes too long kills it."""
+def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Broken]:
+    """In a child: what comes of each task; one that takes too long ends the process."""
     found = []
     for task in tasks:
         # From here: what a new process takes to import is no fault of the archive.
         # `planner.worker` switches the alarm off when this returns.
-        signal.setitimer(signal.ITIMER_REAL, timeout)
+        signal.setitimer(signal.ITIMER_REAL, task.size * timeout)
         found.append(run_task(task))
     return found
 
 
-def run_task(task: ArchiveTask[T, S]) -> Part[T, S] | Broken:
-    """What comes of a task, or what it met.
+def run_task(task: ArchiveTask[T]) -> T | Broken:
+    """What comes of a task, or why nothing does.
 
     Raises:
         CacheError: the cache cannot be written; the next task would meet it as well.

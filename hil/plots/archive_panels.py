@@ -11,20 +11,26 @@ from numpy.typing import NDArray
 
 from hil.plots.archive_view import ArchiveView, runs
 from hil.plots.archive_view import Trace as Recorded
-from hil.report.figures.canvas import (
+from hil.report.drawing import (
     FIRST,
     INK,
     MUTED,
     OUTSIDE_3,
     ROUTES,
     SECOND,
+    Panel,
+    Plot,
+    Trace,
     blank,
+    drawing,
+    even_traces_text,
     footed,
     headed,
+    label,
     place,
     ruled,
+    to_panel,
 )
-from hil.report.figures.svg import Panel, Plot, Trace, drawing, even_traces_text, label, to_panel
 from hil.report.rendering import environment, page_bytes
 from hil.terminal_text import plural
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hil.plots import style
 from hil.plots.archive_view import ArchiveView, Trace
-from hil.report.figures.svg import label
+from hil.report.drawing import label
 
 _COLUMN, _ROW = 3.1, 1.15
 _LEFT, _RIGHT, _TOP, _STRIP, _BOTTOM, _LINE = 0.95, 0.15, 0.75, 0.32, 0.5, 0.155

@@ -21,7 +21,7 @@ from hil.archive.overview import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
-from hil.report.figures.canvas import thinned
+from hil.report.drawing import thinned
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 
@@ -389,7 +389,7 @@ def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]
     Args:
         time: (m,) [s].
         values: (m,); NaN where there is nothing.
-        bins: see `hil.report.figures.canvas.thinned`.
+        bins: see `hil.report.drawing.thinned`.
     """
     finite = np.isfinite(values)
     edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))

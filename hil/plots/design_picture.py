@@ -23,8 +23,8 @@ from hil.cell import AngleFrame, Cell
 from hil.plots import style
 from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
-from hil.report.figures.parameters import shade_scale
-from hil.report.figures.svg import label
+from hil.report.drawing import label
+from hil.report.figures import shade_scale
 from identification.excitation import correlation, coupling_index, coupling_index_max, information
 from identification.excitation.constraints import sampled
 from identification.excitation.excitation import Excitation

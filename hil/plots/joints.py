@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hil.cell import AngleFrame
 from hil.plots import style
-from hil.report.figures.canvas import thinned
+from hil.report.drawing import thinned
 from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import matplotlib as mpl
 from matplotlib.axes import Axes
 
-from hil.report.figures.svg import drawing
+from hil.report.drawing import drawing
 
 INK, MUTED, RULE, SHADE = "#1a1a1a", "#666666", "#dddddd", "#f0e8d2"
 LIMIT = "#b3261e"

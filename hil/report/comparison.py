@@ -12,8 +12,19 @@ from hil.compare.payload import LEAST_EFFECT
 from hil.compare.spread import FEWEST
 from hil.compare.trend import FALSE_ALARMS, LEAST_FRICTION
 from hil.report import numbers
-from hil.report.figures.canvas import FIRST, MUTED, OUTSIDE_3, WIDE, headed, plot_panel, ruled
-from hil.report.figures.svg import Panel, drawing, label, to_panel
+from hil.report.drawing import (
+    FIRST,
+    MUTED,
+    OUTSIDE_3,
+    WIDE,
+    Panel,
+    drawing,
+    headed,
+    label,
+    plot_panel,
+    ruled,
+    to_panel,
+)
 from hil.report.rendering import environment, page_bytes
 from hil.version import software
 

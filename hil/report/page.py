@@ -10,31 +10,17 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.archive.header import ArchiveName
-from hil.report import numbers, parameters, validation
-from hil.report.figures.friction import friction_curve_panels, warm_up_panels
-from hil.report.figures.motion import excitation_panels, replay_panels, split_panels, torque_panels
-from hil.report.figures.parameters import (
-    correlation_matrix,
-    deviation_panels,
-    elimination_panels,
-    shift_panels,
-    uncertainty_panels,
-)
-from hil.report.figures.residuals import (
-    autocorrelation_panels,
-    error_boxes,
-    friction_panels,
-    position_panels,
-    spectrum_panels,
-    speed_panels,
-)
+from hil.report import figures
+from hil.report.numbers import MISSING, beside, fixed, significant
 from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
 from hil.results import (
     ChoiceResult,
     CriteriaResult,
+    ParameterResult,
     RecordedResult,
     Results,
     outside_mark,
@@ -85,8 +71,7 @@ def render_report(results: Results, series: ReportSeries) -> str:
 
 
 def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
-    routes = parameters.routes(results)
-    errors = validation.example_errors(results)
+    joints = figures.joints_of(results)
     return {
         "results": results,
         "series": series,
@@ -94,29 +79,59 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "estimation_facts": estimation_facts(results),
         "criteria": criteria(results),
         "shown_candidates": shown_candidates,
-        "expression": parameters.expression,
-        "routes": routes,
-        "reported_title": parameters.reported_title(results),
+        "expression": expression,
+        "routes": routes(results),
+        "reported_title": ROUTES[results.uncertainty.reported][0],
         "pairs": strongest_pairs(results),
         "pairs_above": pairs_above(results, 0.9),
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
-        "excitation_panels": excitation_panels(series, results.joint_names),
+        "excitation_panels": figures.excitation_panels(series, results.joint_names),
         "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
-        "deviation_panels": deviation_panels(results),
-        "uncertainty_panels": uncertainty_panels(results, routes),
-        "correlation": correlation_matrix(results),
-        "box_panels": error_boxes(results),
-        "torque_panels": torque_panels(series, errors),
-        "split_panels": split_panels(series, errors),
-        "spectrum_panels": spectrum_panels(series, errors),
-        "replay_panels": replay_panels(series, errors),
-        "curve_panels": friction_curve_panels(series, errors),
-        **validation.validation_context(results),
+        "deviation_panels": figures.deviation_panels(results),
+        "correlation": figures.correlation_matrix(results),
+        "box_panels": figures.error_boxes(results),
+        "torque_panels": figures.torque_panels(series, joints),
+        "split_panels": figures.split_panels(series, joints),
+        "spectrum_panels": figures.spectrum_panels(series, joints),
+        "replay_panels": figures.replay_panels(series, joints),
+        "curve_panels": figures.friction_curve_panels(series, joints),
+        **validation_context(results),
         **judgement_context(results),
         **trust_context(results),
         **conduct_context(results),
+    }
+
+
+def validation_context(results: Results) -> dict[str, Any]:
+    """What `verdict.html.j2` and `validation.html.j2` need; `unseen` is None without runs."""
+    runs, unseen = results.validation, None
+    measures = [
+        ("Mean |e|", "mean_abs_error", ""),
+        ("RMS error", "rms_error", ""),
+        ("Signed mean error", "mean_error", ""),
+        ("Relative error", "relative_error", "overall_relative_error"),
+    ]
+    if all(run.all_rows_joint_errors for run in runs):
+        every = ("Relative error over every row", "all_rows_joint_errors")
+        measures.append((*every, "all_rows_relative_error"))
+    if runs:
+        worst = max(runs, key=lambda run: run.overall_relative_error)
+        unseen = {
+            "seconds": sum(run.duration for run in runs),
+            "median": float(np.median([run.overall_relative_error for run in runs])),
+            "worst": worst.overall_relative_error,
+            "worst_archive": worst.archive,
+            "every_row": float(np.median([run.all_rows_relative_error for run in runs])),
+        }
+    return {
+        "unseen": unseen,
+        "error_rows": error_rows(results),
+        "joint_errors": joint_errors(results),
+        "run_measures": measures,
+        # One number of decimals per joint, so that a column of signed means can be read down.
+        "usual_rms": [float(x) for x in np.median([r.rms_error for r in runs] or [[]], axis=0)],
     }
 
 
@@ -126,22 +141,21 @@ def judgement_context(results: Results) -> dict[str, Any]:
     if judgement is None:
         return {}
     return {
-        "every_row_errors": validation.every_row_errors(results),
-        "speed_panels": speed_panels(judgement),
-        "position_panels": position_panels(judgement),
-        "autocorrelation_panels": autocorrelation_panels(judgement),
-        "friction_panels": friction_panels(judgement),
+        "every_row_errors": every_row_errors(results),
+        "speed_panels": figures.speed_panels(judgement),
+        "position_panels": figures.position_panels(judgement),
+        "autocorrelation_panels": figures.autocorrelation_panels(judgement),
+        "friction_panels": figures.friction_panels(judgement),
     }
 
 
 def trust_context(results: Results) -> dict[str, Any]:
     """What `trust.html.j2` and `consistency.html.j2` need."""
-    essential, consistency = results.essential, results.consistency
+    essential = results.essential
     return {
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
-        "elimination_panels": [] if essential is None else elimination_panels(essential),
-        "shift_panels": [] if consistency is None else shift_panels(results, consistency),
+        "elimination_panels": [] if essential is None else figures.elimination_panels(essential),
     }
 
 
@@ -154,8 +168,150 @@ def conduct_context(results: Results) -> dict[str, Any]:
         "when": when(recorded),
         "health": health(recorded),
         "motion_name": motion_name,
-        "warm_up_panels": warm_up_panels(results),
+        "warm_up_panels": figures.warm_up_panels(results),
     }
+
+
+# Torque prediction
+
+
+def joint_errors(results: Results) -> list[dict[str, Any]]:
+    """Errors of each joint over all validation runs, N·m or N, and as shares of its torque.
+
+    Quartiles of the mean absolute error over the runs; RMS and signed mean over all runs, each
+    counting by its duration.
+    """
+    runs = results.validation
+    if not runs:
+        return []
+    seconds = np.array([run.duration for run in runs])
+    mean_abs, rms, signed, relative = (
+        np.array([getattr(run, name) for run in runs])
+        for name in ("mean_abs_error", "rms_error", "mean_error", "relative_error")
+    )
+    lower, median, upper = np.percentile(mean_abs, (25.0, 50.0, 75.0), axis=0)
+    columns: dict[str, NDArray[np.float64]] = {
+        "lower": lower,
+        "median": median,
+        "upper": upper,
+        "rms": np.sqrt(np.average(rms**2, axis=0, weights=seconds)),
+        "mean": np.average(signed, axis=0, weights=seconds),
+        "relative_median": np.median(relative, axis=0),
+        "relative_worst": relative.max(axis=0),
+        "fit_std": np.array(results.noise_std),
+    }
+    return [
+        {"joint": joint} | {name: float(column[j]) for name, column in columns.items()}
+        for j, joint in enumerate(results.joint_names)
+    ]
+
+
+def error_rows(results: Results) -> list[tuple[str, float | None, float]]:
+    """Motion, error of the verdict and error over every row, all joints, as shares."""
+    runs, fitted = results.validation, results.fitted
+    found: list[tuple[str, float | None, float]] = []
+    if runs:
+        both = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
+        many = len(runs) > 1
+        title = f"unseen, median of {len(runs)} runs" if many else "unseen"
+        found.append((title, *np.median(both, axis=0).tolist()))
+        if many:
+            found.append(("unseen, worst run", *both.max(axis=0).tolist()))
+    if fitted is not None:
+        title = "fitted" if runs else "fitted (in-sample: nothing was held out)"
+        found.append((title, fitted.overall_relative_error, fitted.all_rows_relative_error))
+        smoothed = fitted.smoothed_overall_relative_error
+        if smoothed is not None:
+            found.append(("fitted, torque smoothed as it was fitted", None, smoothed))
+    return found
+
+
+def every_row_errors(results: Results) -> list[float]:
+    """Error of each joint over every row, as a share; empty where no file says it.
+
+    The median of the runs on unseen motion, or the error on what was fitted.
+    """
+    known = [run.all_rows_joint_errors for run in results.validation]
+    if not known and results.fitted is not None:
+        known = [results.fitted.all_rows_joint_errors]
+    return np.median(np.array(known), axis=0).tolist() if known and all(known) else []
+
+
+# Parameters
+
+_VISCOUS_UNITS: Final = frozenset({"N·m·s/rad", "N·m/(rad/s)", "N m s/rad", "Nms/rad"})
+ROUTES: Final = {
+    "least_squares": (
+        "Least squares",
+        "residuals white: independent from sample to sample. Too small where they are coloured",
+    ),
+    "independent_repetitions": (
+        "Independent repetitions",
+        "residuals of any colour within a repetition, none from one repetition to the next",
+    ),
+    "phase_clustered": (
+        "Phase-clustered",
+        "residuals may also return at the same place of the motion in every repetition,"
+        " as what the model leaves out does",
+    ),
+    "scatter_of_mean": (
+        "Scatter of the mean",
+        "nothing but independent repetitions: their scatter over the root of their number."
+        " Blind to an error that all of them share",
+    ),
+    "posterior": (
+        "Posterior",
+        "what was believed before the data, and residuals of the colour they have",
+    ),
+}
+"""Title of each route to a standard deviation, and what it assumes."""
+
+
+def expression(p: ParameterResult) -> str:
+    """What the name stands for; viscous friction also in the unit that manufacturers print."""
+    text = p.expression if p.expression != p.name else ""
+    if p.unit not in _VISCOUS_UNITS:
+        return text
+    scale = math.pi / 180.0
+    per_degree = f"{beside(scale * p.estimate, scale * p.std)} N·m per °/s"
+    return f"{text}; {per_degree}" if text else per_degree
+
+
+def routes(results: Results) -> list[dict[str, Any]]:
+    """The standard-deviation routes that were computed, compared with the reported one."""
+    uncertainty, reported = results.uncertainty, np.array([p.std for p in results.parameters])
+    found = []
+    for key, (title, assumes) in ROUTES.items():
+        if getattr(uncertainty, key) is None:
+            continue
+        std = np.array(getattr(uncertainty, key), dtype=np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = std / reported
+        ratio = ratio[np.isfinite(ratio)]
+        median, low, high = (
+            significant(float(edge(ratio)), 2) if ratio.size else MISSING
+            for edge in (np.median, np.min, np.max)
+        )
+        far = [
+            abs(p.estimate - p.truth) / one if one else math.inf
+            for p, one in zip(results.parameters, std.tolist(), strict=True)
+            if p.truth is not None
+        ]
+        found.append(
+            {
+                "title": title,
+                "assumes": assumes,
+                "reported": key == uncertainty.reported,
+                "median_ratio": median,
+                "span": f"{low} to {high}" if ratio.size else MISSING,
+                "within_2": f"{sum(z <= 2.0 for z in far)} of {len(far)}" if far else MISSING,
+                "within_3": f"{sum(z <= 3.0 for z in far)} of {len(far)}" if far else MISSING,
+            }
+        )
+    return found
+
+
+# What was run, and how
 
 
 def facts(results: Results) -> list[Fact]:
@@ -163,7 +319,7 @@ def facts(results: Results) -> list[Fact]:
     excitation, runs = results.excitation, results.validation
     rate = 1.0 / results.period if results.period > 0 else float("inf")
     n_friction = len(results.parameters) - results.n_base
-    motion = [f"{numbers.fixed(excitation.duration, 2)} s"]
+    motion = [f"{fixed(excitation.duration, 2)} s"]
     if excitation.n_sines is not None:
         motion.append(f"{excitation.n_sines} sines per joint")
     if excitation.n_via is not None:
@@ -172,7 +328,7 @@ def facts(results: Results) -> list[Fact]:
         motion.append(f"fly-by {100.0 * excitation.fly:g} %")
     if excitation.method is not None:
         motion.append(_METHODS.get(excitation.method, f"found by {excitation.method}"))
-    seconds = numbers.significant(sum(run.duration for run in runs))
+    seconds = significant(sum(run.duration for run in runs))
     held_out = f"{len(runs)}, {seconds} s in all, none of it used for fitting" if runs else "none"
     return [
         ("Cell", results.cell),
@@ -189,7 +345,7 @@ def facts(results: Results) -> list[Fact]:
 def estimation_facts(results: Results) -> list[Fact]:
     """Estimator, conditioning, bias by noise in the regressor, prior, and base parameters."""
     estimator = results.estimator
-    condition = numbers.significant(estimator.condition, 3)
+    condition = significant(estimator.condition, 3)
     found = [
         ("Estimator", f"{estimator.words} (--estimator {estimator.name})"),
         ("Values and std", results.uncertainty.method),
@@ -229,8 +385,8 @@ def criteria(results: Results) -> list[tuple[str, str, str, str, str]]:
 def _criterion(criteria: CriteriaResult | None, field: str, decimals: int) -> str:
     value = None if criteria is None else getattr(criteria, field)
     if value is None:
-        return numbers.MISSING
-    return numbers.fixed(value, decimals) if abs(value) < 1e7 else numbers.significant(value)
+        return MISSING
+    return fixed(value, decimals) if abs(value) < 1e7 else significant(value)
 
 
 def _change(
@@ -240,10 +396,10 @@ def _change(
     before = None if planned is None else getattr(planned, field)
     after = getattr(executed, field)
     if before is None or after is None or field == "n_samples":
-        return numbers.MISSING
+        return MISSING
     if field in {"log10_det", "fitness"} or before == 0.0:
-        return numbers.fixed(after - before, decimals, sign=True)
-    return numbers.fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
+        return fixed(after - before, decimals, sign=True)
+    return fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
 
 
 def strongest_pairs(results: Results) -> list[tuple[str, str, float]]:
@@ -302,7 +458,7 @@ def health(recorded: Sequence[RecordedResult]) -> str:
         "cycles not archived": sum(one.lost for one in recorded),
     }
     losses = [
-        f"{count} {words} ({numbers.significant(1e6 * count / cycles, 2)} in a million)"
+        f"{count} {words} ({significant(1e6 * count / cycles, 2)} in a million)"
         for words, count in sums.items()
         if count
     ]

@@ -29,18 +29,21 @@ from hil.compare.trend import (
 from hil.files import write_atomically
 from hil.reading import instant
 from hil.report import numbers
-from hil.report.figures.canvas import (
+from hil.report.drawing import (
     BAND,
     FIRST,
     MUTED,
     OUTSIDE_3,
     SECOND,
     TICK_SIZE,
+    Panel,
+    drawing,
     headed,
+    label,
     plot_panel,
     ruled,
+    to_panel,
 )
-from hil.report.figures.svg import Panel, drawing, label, to_panel
 from hil.report.rendering import environment, page_bytes
 
 FILE_NAME: Final = "trend.html"

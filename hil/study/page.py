@@ -13,23 +13,27 @@ from numpy.typing import NDArray
 from hil.files import write_together
 from hil.progress import Reporter
 from hil.report import numbers
-from hil.report.figures.canvas import (
+from hil.report.drawing import (
     FIRST,
+    MOST_POINTS,
     MUTED,
     ROUTES,
     SECOND,
     TICK_SIZE,
     WIDE,
+    Panel,
+    Plot,
+    Trace,
     blank,
     boxed,
+    drawing,
     footed,
     headed,
     place,
     ruled,
+    to_panel,
 )
-from hil.report.figures.motion import time_panel
-from hil.report.figures.parameters import matrix_panel
-from hil.report.figures.svg import MOST_POINTS, Panel, Plot, Trace, drawing, to_panel
+from hil.report.figures import matrix_panel, time_panel
 from hil.report.rendering import environment, page_bytes
 
 from .records import ExampleRecord

@@ -7,13 +7,8 @@ import signal
 import time
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hil.batch.workers import ArchiveTask, Part
+from hil.batch.workers import ArchiveTask
 from hil.errors import ArchiveError
-
-Array = NDArray[np.float64]
 
 
 def identity() -> str:
@@ -21,53 +16,42 @@ def identity() -> str:
     return os.environ.get("TEST_IDENTITY", "the code of the test")
 
 
-def add(first: Array, second: Array) -> Array:
-    return first + second
+def number(k: int) -> int:
+    return k
 
 
-def numbers(seed: int) -> Part[Array, int]:
-    """Numbers of very different size, of which another order has another sum."""
-    rng = np.random.default_rng(seed)
-    return Part(rng.standard_normal(500) * 10.0 ** rng.uniform(-8, 8, 500), seed)
-
-
-def slow_numbers(seed: int) -> Part[Array, int]:
+def slow_number(k: int) -> int:
     time.sleep(0.1)
-    return numbers(seed)
+    return k
 
 
-def marked(path: str) -> Part[Array, int]:
+def marked(path: str) -> None:
     """Leaves a file behind that says it was begun."""
     Path(path).touch()
-    return slow_numbers(int(Path(path).name))
+    time.sleep(0.1)
 
 
-def from_file(path: str) -> Part[Array, int]:
-    if not Path(path).exists():
-        raise ArchiveError(path, "cannot be read: No such file or directory")
-    return numbers(int(Path(path).read_text()))
+def absent(k: int) -> None:
+    raise ArchiveError(f"{k}.mcap", "cannot be read: No such file or directory")
 
 
-def faulty(_: int) -> Part[Array, int]:
+def faulty(_: int) -> None:
     return [][0]
 
 
-def crash(_: int) -> Part[Array, int]:
+def crash(_: int) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
-    raise AssertionError
 
 
-def hang(_: int) -> Part[Array, int]:
+def hang(_: int) -> None:
     time.sleep(600.0)
-    raise AssertionError
 
 
-def kill_worker(_: int) -> Part[Array, int]:
+def kill_worker(_: int) -> None:
     """Kill the worker, as the kernel does where memory runs out."""
     os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(600.0)
-    raise AssertionError
 
 
-def task(function, argument) -> ArchiveTask[Array, int]:
+def task(function, argument) -> ArchiveTask:
     return ArchiveTask(f"{function.__name__}-{argument}.mcap", function, (argument,))

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from hil.batch.discovery import Place
 from hil.batch.types import ArchiveRef, Broken
-from hil.batch.workers import ArchiveTask, Part, Summed, Workers, run_task, summed
+from hil.batch.workers import ArchiveTask, Workers, run_task
 
 NOTHING_OPEN: Final = (
     *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
@@ -19,31 +19,26 @@ NOTHING_OPEN: Final = (
 class Here(Workers):
     """This process; `deadly` archives, by name, end it, or would if it were another."""
 
+    count = 1
+
     def __init__(self, *deadly: str, near: bool = True) -> None:
         self.deadly, self.near = deadly, near
-        self.tasks: list[ArchiveTask[Any, Any]] = []
+        self.tasks: list[ArchiveTask[Any]] = []
 
-    def sums_in_turn(
-        self,
-        groups: Sequence[Sequence[ArchiveTask[Any, Any]]],
-        add: Callable[[Any, Any], Any],
-        *,
-        done: Callable[[int], None] | None = None,
-    ) -> Iterator[Summed[Any, Any]]:
-        return (summed([self._part(task, done) for task in group], add) for group in groups)
-
-    def _part(
-        self, task: ArchiveTask[Any, Any], done: Callable[[int], None] | None
-    ) -> Part[Any, Any] | Broken:
-        self.tasks.append(task)
-        if done is not None:
-            done(1)
-        if any(ref.name in self.deadly for ref in _refs(task.arguments[0])):
-            return Broken(task.path, "ended its process")
-        return run_task(task)
+    def results(
+        self, tasks: Sequence[ArchiveTask[Any]], done: Callable[[int], None] | None = None
+    ) -> Iterator[Any]:
+        for task in tasks:
+            self.tasks.append(task)
+            if done is not None:
+                done(1)
+            deadly = any(ref.name in self.deadly for ref in _refs(task.arguments[0]))
+            yield Broken(task.path, "ended its process") if deadly else run_task(task)
 
 
-def _refs(argument: Any) -> Sequence[ArchiveRef]:
-    if isinstance(argument, Place):  # looking into an archive is harmless
-        return []
-    return [argument] if isinstance(argument, ArchiveRef) else argument
+def _refs(argument: Any) -> Iterator[ArchiveRef]:
+    if isinstance(argument, ArchiveRef):
+        yield argument
+    elif not isinstance(argument, Place):  # looking into an archive is harmless
+        for one in argument:
+            yield from _refs(one)

@@ -1,4 +1,4 @@
-"""Archives reduced and added up on the workers of a Dask cluster."""
+"""Tasks and archives on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,18 +20,12 @@ from hil.batch.cluster import (
     ClusterError,
     DaskWorkers,
     WorkerSoftwareError,
+    perform,
     release_children,
     software,
-    sum_archives,
 )
-from hil.batch.run import reduced
 from hil.batch.types import BatchResult, Broken
-from hil.batch.workers import (
-    LocalWorkers,
-    Summed,
-    Workers,
-    sum_tree,
-)
+from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import Campaign
 from hil.errors import InputError
 from hil.identify.options import FIXED
@@ -42,13 +37,6 @@ from tests.hil.mcap_bytes import metadata
 from tests.hil.web_folder import served
 
 PATIENCE = 60.0  # s; the machine may be busy
-
-
-def alone(seeds: Sequence[int]) -> bytes:
-    """The sum of the work on `seeds`, computed here, to the bit."""
-    total = sum_tree([work.numbers(seed).total for seed in seeds], work.add)
-    assert total is not None
-    return total.tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -76,75 +64,48 @@ def connected(cluster: Cluster, timeout: float = PATIENCE, patience: float = PAT
     return DaskWorkers(cluster.address, identity=work.identity, timeout=timeout, patience=patience)
 
 
-# What a cluster computes
+def tasks_of(function: Any, count: int) -> list[Any]:
+    return [work.task(function, k) for k in range(count)]
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 65, 200])
-def test_the_sum_has_the_bits_of_one_process(workers: DaskWorkers, count: int) -> None:
-    (found,) = workers.sums([[work.task(work.numbers, k) for k in range(count)]], work.add)
-    assert found.notes == tuple(range(count))
-    if count:
-        assert found.total.tobytes() == alone(range(count))
-    else:
-        assert found.total is None
+class TestResults:
+    @pytest.mark.parametrize("count", [0, 1, 65])
+    def test_come_in_order_and_are_reported_once(self, workers: DaskWorkers, count: int) -> None:
+        seen: list[int] = []
+        found = workers.results(tasks_of(work.number, count), seen.append)
+        assert list(found) == list(range(count))
+        assert sum(seen) == count
 
+    def test_come_while_later_tasks_are_worked_on(self, workers: DaskWorkers) -> None:
+        finished: list[int] = []
+        found = workers.results(tasks_of(work.slow_number, 72), finished.append)
+        assert next(found) == 0
+        assert sum(finished) < 72  # the first did not wait for the last
+        assert list(found) == list(range(1, 72))
 
-def test_groups_are_added_up_apart(workers: DaskWorkers) -> None:
-    groups = [range(10), range(0), range(20, 21), range(30, 47)]
-    found = workers.sums(
-        [[work.task(work.numbers, k) for k in group] for group in groups], work.add
-    )
-    for group, sums in zip(groups, found, strict=True):
-        assert sums.notes == tuple(group)
-        assert (sums.total is None) if not group else sums.total.tobytes() == alone(group)
+    def test_that_nobody_waits_for_are_not_computed(
+        self, tmp_path: Path, workers: DaskWorkers
+    ) -> None:
+        found = workers.results([work.task(work.marked, str(tmp_path / f"{k}")) for k in range(99)])
+        next(found)
+        found.close()
+        assert list(workers.results(tasks_of(work.number, 1))) == [0]
+        assert len([*tmp_path.iterdir()]) < 50
 
-
-def test_sums_come_in_turn_while_later_ones_are_worked_on(workers: DaskWorkers) -> None:
-    finished: list[int] = []
-    groups = [[work.task(work.slow_numbers, 10 * g + k) for k in range(3)] for g in range(24)]
-    seen = [
-        (sums.notes, sum(finished))
-        for sums in workers.sums_in_turn(groups, work.add, done=finished.append)
-    ]
-    assert [notes for notes, _ in seen] == [(10 * g, 10 * g + 1, 10 * g + 2) for g in range(24)]
-    assert seen[0][1] < 72  # the first did not wait for the last
-
-
-def test_sums_that_nobody_waits_for_any_more_are_dropped(
-    tmp_path: Path, workers: DaskWorkers
-) -> None:
-    groups = [[work.task(work.marked, str(tmp_path / f"{k}"))] for k in range(100)]
-    sums = workers.sums_in_turn(groups, work.add)
-    next(sums)
-    sums.close()
-    (found,) = workers.sums([[work.task(work.numbers, 3)]], work.add)
-    assert found.notes == (3,)
-    assert len([*tmp_path.iterdir()]) < 50
-
-
-def test_every_archive_is_reported_once(workers: DaskWorkers) -> None:
-    seen: list[int] = []
-    workers.sums([[work.task(work.numbers, k) for k in range(100)]], work.add, done=seen.append)
-    assert sum(seen) == 100
-
-
-def test_an_archive_that_fails_crashes_or_hangs_costs_itself_only(cluster: Cluster) -> None:
-    tasks = [work.task(work.numbers, k) for k in range(20)]
-    tasks[3] = work.task(work.from_file, "/nowhere/three.mcap")
-    tasks[8] = work.task(work.crash, 8)
-    tasks[9] = work.task(work.faulty, 9)
-    tasks[15] = work.task(work.hang, 15)
-    with connected(cluster, timeout=2.0) as workers:
-        (found,) = workers.sums([tasks], work.add)
-    expected = [None if k in (3, 8, 9, 15) else work.numbers(k).total for k in range(20)]
-    assert found.total.tobytes() == sum_tree(expected, work.add).tobytes()
-    broken = {note.path: note.reason for note in found.notes if isinstance(note, Broken)}
-    assert set(broken) == {tasks[k].path for k in (3, 8, 9, 15)}
-    assert "No such file" in broken[tasks[3].path]
-    assert "signal 11" in broken[tasks[8].path]
-    assert "IndexError" in broken[tasks[9].path]
-    assert "longer than 2 s" in broken[tasks[15].path]
-    assert all(worker.poll() is None for worker in cluster.workers)
+    def test_of_what_fails_crashes_or_hangs_are_broken(self, cluster: Cluster) -> None:
+        tasks = tasks_of(work.number, 20)
+        for k, harm in ((3, work.absent), (8, work.crash), (9, work.faulty), (15, work.hang)):
+            tasks[k] = work.task(harm, k)
+        with connected(cluster, timeout=2.0) as workers:
+            found = list(workers.results(tasks))
+        broken = {k: one for k, one in enumerate(found) if isinstance(one, Broken)}
+        assert [k for k in range(20) if found[k] == k] == [k for k in range(20) if k not in broken]
+        assert [(k, broken[k].path) for k in broken] == [(k, tasks[k].path) for k in (3, 8, 9, 15)]
+        for k, words in {
+            3: "No such file", 8: "signal 11", 9: "IndexError", 15: "longer than 2 s",
+        }.items():  # fmt: skip
+            assert words in broken[k].reason
+        assert all(worker.poll() is None for worker in cluster.workers)
 
 
 def test_a_folder_that_workers_do_not_see_is_refused(workers: DaskWorkers, tmp_path: Path) -> None:
@@ -153,81 +114,63 @@ def test_a_folder_that_workers_do_not_see_is_refused(workers: DaskWorkers, tmp_p
         workers.require_folders([tmp_path, tmp_path / "absent"])
 
 
-# Workers that die, join and differ
+class TestWorkers:
+    @pytest.mark.slow
+    def test_killed_in_mid_run_lose_nothing(self, pair: Cluster) -> None:
+        finished: list[int] = []
 
+        with connected(pair) as workers:
+            both(workers)
 
-@pytest.mark.slow
-def test_a_worker_killed_in_mid_run_changes_no_bit(pair: Cluster) -> None:
-    killed: list[int] = []
+            def done(count: int) -> None:
+                finished.append(count)
+                if len(finished) >= 20 and pair.workers[0].poll() is None:
+                    pair.workers[0].kill()
 
-    with connected(pair) as workers:
-        both(workers)
-
-        def done(count: int) -> None:
-            killed.append(count)
-            if sum(killed) >= 20 and pair.workers[0].poll() is None:
-                pair.workers[0].kill()
-
-        groups = [[work.task(work.slow_numbers, k) for k in range(80)]]
-        (found,) = workers.sums(groups, work.add, done=done)
+            assert list(workers.results(tasks_of(work.slow_number, 80), done)) == list(range(80))
         assert pair.workers[0].wait(1.0) == -9
         assert pair.workers[1].poll() is None
-    assert found.notes == tuple(range(80))
-    assert found.total.tobytes() == alone(range(80))
 
+    @pytest.mark.slow
+    def test_ended_by_an_archive_name_it(self, tmp_path: Path) -> None:
+        eager = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        with running(tmp_path, **eager) as cluster:
+            for _ in range(2):
+                cluster.add_worker("--nanny", "--worker-port", "0")
+            with connected(cluster) as workers:
+                tasks = tasks_of(work.number, 12)
+                tasks[5] = work.task(work.kill_worker, 5)
+                found = list(workers.results(tasks))
+        assert found[5] == Broken(tasks[5].path, "ended every worker that read it")
+        assert found[:5] + found[6:] == [k for k in range(12) if k != 5]
 
-@pytest.mark.slow
-def test_an_archive_that_ends_every_worker_is_named(tmp_path: Path) -> None:
-    eager = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-    with running(tmp_path, **eager) as cluster:
-        for _ in range(2):
-            cluster.add_worker("--nanny", "--worker-port", "0")
-        with connected(cluster) as workers:
-            tasks = [work.task(work.numbers, k) for k in range(12)]
-            tasks[5] = work.task(work.kill_worker, 5)
-            (found,) = workers.sums([tasks], work.add)
-    assert [note for note in found.notes if isinstance(note, Broken)] == [
-        Broken(tasks[5].path, "ended every worker that read it")
-    ]
-    expected = [None if k == 5 else work.numbers(k).total for k in range(12)]
-    assert found.total.tobytes() == sum_tree(expected, work.add).tobytes()
+    def test_with_other_code_are_refused(
+        self, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("TEST_IDENTITY", "other code")  # here, and not on the workers
+        with pytest.raises(
+            ClusterError, match=r"worker tcp://.* \(hil the code of .* instead of other"
+        ):
+            connected(cluster)
 
-
-def test_a_worker_with_other_code_is_refused(
-    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TEST_IDENTITY", "other code")  # here, and not on the workers
-    with pytest.raises(
-        ClusterError, match=r"worker tcp://.* \(hil the code of .* instead of other"
-    ):
-        connected(cluster)
-
-
-def test_a_worker_with_other_code_that_joins_later_computes_nothing() -> None:
-    expected = software(work.identity) | {"hil": "other code"}
-    with pytest.raises(WorkerSoftwareError, match=r"hil the code of .* instead of other code"):
-        sum_archives(
-            [work.task(work.numbers, 0)],
-            work.add,
-            timeout=PATIENCE,
-            identity=work.identity,
-            expected=expected,
-        )
-    release_children()
-
-
-@pytest.mark.slow
-def test_a_cluster_that_goes_away_is_an_error_and_no_wait(tmp_path: Path) -> None:
-    with running(tmp_path, workers=1) as cluster:
-        workers = connected(cluster, patience=5.0)
-
-        def done(_: int) -> None:
-            cluster.workers[0].kill()
-
-        with workers, pytest.raises(ClusterError, match=r"all workers .* went away"):
-            workers.sums(
-                [[work.task(work.slow_numbers, k) for k in range(50)]], work.add, done=done
+    def test_with_other_code_that_join_later_compute_nothing(self) -> None:
+        expected = software(work.identity) | {"hil": "other code"}
+        with pytest.raises(WorkerSoftwareError, match=r"hil the code of .* instead of other code"):
+            perform(
+                work.task(work.number, 0),
+                timeout=PATIENCE,
+                identity=work.identity,
+                expected=expected,
             )
+        release_children()
+
+    @pytest.mark.slow
+    def test_that_all_go_away_are_an_error_and_no_wait(self, tmp_path: Path) -> None:
+        with running(tmp_path, workers=1) as cluster:
+            workers = connected(cluster, patience=5.0)
+            with workers, pytest.raises(ClusterError, match=r"all workers .* went away"):
+                for _ in workers.results(tasks_of(work.slow_number, 50)):
+                    cluster.workers[0].kill()
 
 
 def test_nobody_at_the_address_is_an_error_with_the_address() -> None:
@@ -252,7 +195,7 @@ def test_a_scheduler_without_workers_is_an_error(
 def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     tmp_path: Path, campaign: Campaign, pair: Cluster
 ) -> None:
-    """Two campaigns, told apart by a record that no estimate reads."""
+    """Two campaigns, distinguished by a record that no estimate reads."""
     for number in range(2):
         _copy_with_mark(campaign.folder.root, tmp_path / "data" / f"{number}", f"copy {number}")
     plan, roots = run.Plan(FIXED, keep=False), [str(tmp_path / "data")]
@@ -288,6 +231,7 @@ class _KillsOne(Workers):
     """Workers of which one is killed as soon as the first archives were reduced."""
 
     near = False
+    count = 2
 
     def __init__(self, hands: DaskWorkers, victim: subprocess.Popen[bytes]) -> None:
         self._hands, self._victim = hands, victim
@@ -299,9 +243,9 @@ class _KillsOne(Workers):
     def __exit__(self, *_: object) -> None:
         self._hands.close()
 
-    def sums_in_turn(self, groups, add, *, done=None):
+    def results(self, tasks: Sequence[Any], done: Any = None) -> Iterator[Any]:
         """The work on archives."""
-        begun = any(task.function is reduced for group in groups for task in group)
+        begun = any(task.function is run.added_up for task in tasks)
 
         def killing(count: int) -> None:
             if begun:
@@ -309,7 +253,7 @@ class _KillsOne(Workers):
             if done is not None:
                 done(count)
 
-        return self._hands.sums_in_turn(groups, add, done=killing)
+        return self._hands.results(tasks, killing)
 
 
 def _copy_with_mark(source: Path, target: Path, mark: str) -> None:
@@ -359,7 +303,7 @@ def test_without_dask_the_error_says_what_to_install(monkeypatch: pytest.MonkeyP
 
 def both(workers: DaskWorkers) -> None:
     """Wait until both workers have joined and have done something."""
-    assert isinstance(workers.sums([[work.task(work.numbers, 0)]], work.add)[0], Summed)
+    assert list(workers.results(tasks_of(work.number, 1))) == [0]
     deadline = time.monotonic() + PATIENCE
     while workers.n_workers < 2:
         assert time.monotonic() < deadline

@@ -17,9 +17,9 @@ import pytest
 
 from hil.archive import Samples, write_samples
 from hil.batch import discovery, factors
-from hil.batch.cache import Where, bundle_with_cache, cached_bundle
+from hil.batch.cache import Where
 from hil.batch.discovery import Discovery, discover
-from hil.batch.factors import opened, reduce_bundle
+from hil.batch.factors import cached, opened, reduced
 from hil.batch.run import Plan, reidentify
 from hil.batch.types import ArchiveRef, ChangedError, NothingToFitError, UnavailableError
 from hil.batch.workers import LocalWorkers
@@ -362,9 +362,8 @@ def test_a_remote_archive_replaced_after_it_was_hashed_is_not_taken_for_it(
     fsspec.filesystem("memory").pipe(address, other)
     with pytest.raises(ChangedError), opened(ref):
         pass
-    reduced = bundle_with_cache((ref,), SETTINGS, where)
-    assert "changed" in reduced.broken[0].reason
-    assert cached_bundle((ref,), SETTINGS, where) is None
+    assert "changed" in reduced((ref,), SETTINGS, where).broken[0].reason
+    assert cached((ref,), SETTINGS, where) is None
 
 
 def test_what_a_file_met_while_it_was_written_to_is_no_fault_of_it(
@@ -381,7 +380,7 @@ def test_what_a_file_met_while_it_was_written_to_is_no_fault_of_it(
     monkeypatch.setattr(factors, "open_archive", written_to)
     with pytest.raises(ChangedError), opened(ref):
         pass
-    assert not reduce_bundle((ref,), SETTINGS).lasting
+    assert not reduced((ref,), SETTINGS, Where(keep=False)).lasting
 
 
 def test_a_store_that_fails_is_told_and_not_remembered(
@@ -399,9 +398,9 @@ def test_a_store_that_fails_is_told_and_not_remembered(
         patch.setattr(fsspec.get_filesystem_class("memory"), "get_file", busy)
         with pytest.raises(UnavailableError, match="503"), opened(ref):
             pass
-        failed = bundle_with_cache((ref,), SETTINGS, where)
+        failed = reduced((ref,), SETTINGS, where)
         assert "503" in failed.broken[0].reason
-    again = bundle_with_cache((ref,), SETTINGS, where)
+    again = reduced((ref,), SETTINGS, where)
     assert again.read == 1
     assert "503" not in str(again.broken)
 
@@ -412,11 +411,9 @@ def test_a_fault_of_the_bytes_is_remembered(tmp_path: Path, arm: Cell) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
     path.write_bytes(data)
-    now = ArchiveRef(
-        **{name: getattr(ref, name) for name in ref.__slots__} | {"stamp": factors.stamp_of(path)}
-    )
-    assert reduce_bundle((now,), SETTINGS).lasting
-    assert reduce_bundle((now,), SETTINGS).broken
+    now = replace(ref, stamp=factors.stamp_of(path))
+    found = reduced((now,), SETTINGS, Where(keep=False))
+    assert found.lasting and found.broken
 
 
 def test_a_whole_batch_reads_from_a_store(folder: Path, tmp_path: Path) -> None:

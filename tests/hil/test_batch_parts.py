@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import operator
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -22,18 +21,15 @@ from hil.batch.cache import (
     Store,
     Where,
     arm_digest,
-    cached_bundle,
-    cached_settings,
     code_digest,
     decoded,
     encoded,
-    put_settings,
     settings_digest,
     sum_key,
 )
-from hil.batch.factors import BUNDLE, bundles
+from hil.batch.factors import BUNDLE, bundles, cached
 from hil.batch.types import ArchiveRef, Broken, CacheError
-from hil.batch.workers import ArchiveTask, LocalWorkers, Part, TreeSum, sum_tree
+from hil.batch.workers import ArchiveTask, LocalWorkers, TreeSum
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.identify.settings import Settings
@@ -60,12 +56,15 @@ class TestTreeSum:
             runs = [expected[k : k + 8] for k in range(0, len(expected), 8)]
             present = [[term for term in run if term is not None] for run in runs]
             expected = [None if not run else sum(run[1:], run[0]) for run in present]
-        assert sum_tree(terms, operator.add) == (expected[0] if terms else None)
+        total = expected[0] if terms else None
+        assert TreeSum(terms).result() == total
+        far = TreeSum[float]()
+        for k in range(0, len(terms), 8):
+            far.add(TreeSum(terms[k : k + 8]).result(), 1)
+        assert far.result() == total
 
     def test_holds_one_sum_per_level(self) -> None:
-        sums = TreeSum[float]()
-        for _ in range(8**4 + 5):
-            sums.add(1.0)
+        sums = TreeSum(1.0 for _ in range(8**4 + 5))
         assert len(sums._levels) == 5
         assert sums.result() == 8**4 + 5
 
@@ -114,22 +113,31 @@ class TestCache:
                 pool.submit(lambda c=one: [store.put(KEY, c) for _ in range(100)])
                 for one in contents
             ]
-            found = [store.get(KEY) for _ in range(100)]
+            found = [store.get(KEY, np.ndarray) for _ in range(100)]
         assert all(one.exception() is None for one in writing)
         assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
         assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
 
-    def test_a_forged_sum_counts_as_absent(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("forged", [[{"gram": 3}], [{"type": "PhaseFactor"}], [], {}, None])
+    def test_a_forged_sum_counts_as_absent(self, tmp_path: Path, forged: object) -> None:
         settings, where = Settings(Preprocessing()), Where(str(tmp_path))
         key = sum_key([a_ref(0)], settings_digest(settings))
-        where.store(a_ref(0).location).put(key, {"sum": {"gram": 3}})
-        assert cached_bundle([a_ref(0)], settings, where) is None
+        where.store(a_ref(0).location).put(key, forged)
+        assert cached([a_ref(0)], settings, where) is None
+
+    @given(st.integers(1, 6), st.booleans())
+    def test_a_square_matrix_is_restored_to_the_bit(self, size: int, symmetric: bool) -> None:
+        square = np.random.default_rng(size).normal(size=(3, size, size))
+        square = square + square.swapaxes(1, 2) if symmetric else square
+        data = encoded(KEY, [square])
+        assert decoded(data, KEY)[0].tobytes() == square.tobytes()
+        assert not symmetric or len(data) < 300 + 8 * 3 * size * (size + 1) / 2
 
     def test_a_store_that_cannot_be_written_names_a_remedy(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
         with pytest.raises(CacheError, match="--cache"):
             Store(tmp_path / "file").put(KEY, {})
-        assert Store(tmp_path / "file").get(KEY) is None
+        assert Store(tmp_path / "file").get(KEY, dict) is None
 
     def test_archives_of_a_folder_share_a_store(self, tmp_path: Path) -> None:
         here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
@@ -156,10 +164,10 @@ class TestCache:
             choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
         )
         store = Store(tmp_path)
-        put_settings(store, KEY, settings)
-        assert cached_settings(store, KEY) == settings
+        store.put(KEY, settings)
+        assert store.get(KEY, Settings) == settings
         store.put(KEY, {"smoother": "spline", "torque_delay": 0.0})
-        assert cached_settings(store, KEY) is None
+        assert store.get(KEY, Settings) is None
 
 
 @pytest.mark.parametrize(
@@ -228,18 +236,16 @@ def test_factors_are_known_by_everything_they_depend_on() -> None:
 @pytest.mark.slow
 def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
     """The child knows functions by their module, so these are ready-made ones."""
-    fine = ArchiveTask("fine.mcap", Part, (2.0, "note"))
+    fine = ArchiveTask("fine.mcap", abs, (-2.0,))
     dead = ArchiveTask("dead.mcap", os._exit, (3,))
     slow = ArchiveTask("slow.mcap", time.sleep, (60.0,))
     wrong = ArchiveTask("wrong.mcap", int, ("no number",))
-    counted: list[int] = []
+    finished: list[int] = []
     with LocalWorkers(2, timeout=4.0) as workers:
-        (found,) = workers.sums(
-            [[fine, dead, slow, wrong, fine]], operator.add, done=counted.append
-        )
-    assert sum(counted) == 5
-    assert [found.notes[0], found.notes[4], found.total] == ["note", "note", 4.0]
-    broken = {note.path: note.reason for note in found.notes if isinstance(note, Broken)}
+        found = list(workers.results([fine, dead, slow, wrong, fine], finished.append))
+    assert sum(finished) == 5
+    assert [found[0], found[4]] == [2.0, 2.0]
+    broken = {one.path: one.reason for one in found if isinstance(one, Broken)}
     assert "ended its process, twice, with status 3" in broken["dead.mcap"]
     assert "took longer than 4 s" in broken["slow.mcap"]
     assert "ValueError" in broken["wrong.mcap"]

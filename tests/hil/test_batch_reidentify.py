@@ -23,7 +23,7 @@ from hil.archive import ArchiveWriter
 from hil.archive.repair import repair, repaired_name
 from hil.batch import factors
 from hil.batch.cache import Store
-from hil.batch.estimates import WarningCounts
+from hil.batch.estimates import warning_lines
 from hil.batch.run import Plan, reidentify
 from hil.batch.types import (
     ESTIMATORS,
@@ -32,7 +32,6 @@ from hil.batch.types import (
     BatchResult,
     Broken,
     NothingToFitError,
-    Summary,
 )
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign
@@ -225,13 +224,18 @@ def test_a_copy_counts_once(campaign: Campaign, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_workers_order_and_cache_make_no_difference_to_the_last_bit(
-    folder: Path, tmp_path: Path
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Nor whether bundles are added up here, or runs of them far away."""
+    monkeypatch.setattr(factors, "BUNDLE", 1)
     with LocalWorkers(2) as workers:
         alone = batch(folder, plan=Plan(FIXED, keep=False), workers=workers)
     files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
     assert same_bits(alone, batch(*files, plan=Plan(FIXED, keep=False)))
-    assert same_bits(alone, batch(folder, plan=Plan(FIXED, keep=False), workers=Here(near=False)))
+    monkeypatch.setattr("hil.batch.run._MANY", 0)
+    far = Here(near=False)
+    assert same_bits(alone, batch(folder, plan=Plan(FIXED, keep=False), workers=far))
+    assert max(task.size for task in far.tasks) == 5
     cached = Plan(FIXED, cache=tmp_path / "cache")
     assert same_bits(alone, batch(folder, plan=cached))
     assert same_bits(alone, batch(folder, plan=cached))
@@ -432,8 +436,11 @@ def test_a_file_that_is_not_what_was_recorded_is_not_used(folder: Path) -> None:
 
 @pytest.mark.parametrize("near", [True, False])
 def test_an_archive_that_ends_its_process_costs_itself(
-    near: bool, folder: Path, tmp_path: Path
+    near: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if not near:  # in a run of bundles
+        monkeypatch.setattr(factors, "BUNDLE", 2)
+        monkeypatch.setattr("hil.batch.run._MANY", 0)
     names = [path.name for path in sorted((folder / "archives").glob("excitation*"))]
     result = batch(
         folder, plan=Plan(FIXED, cache=tmp_path / "cache"), workers=Here(names[1], near=near)
@@ -598,34 +605,23 @@ def test_what_is_to_be_looked_into_is_told_even_quietly() -> None:
     assert line.startswith("arm: The payload has changed")
 
 
-def summary_of(name: str, *doubts: str) -> Summary:
-    ref = ArchiveRef(f"/line/c1/archives/{name}", "", "excitation", "", "/line/c1", 0, "", "")
-    return Summary(ref, None, {}, doubts)  # type: ignore[arg-type]
+def test_a_warning_is_given_once_with_what_it_concerns() -> None:
+    def warned(name: str, *warnings: str) -> tuple[ArchiveRef, tuple[str, ...]]:
+        path = f"/line/c1/archives/{name}"
+        return ArchiveRef(path, "", "excitation", "", "/line/c1", 0, "", ""), warnings
 
-
-def test_a_doubt_is_told_once_with_what_it_concerns() -> None:
-    doubts = WarningCounts()
-    for name in ("a", "b", "c"):
-        doubts.count(summary_of(name, "of all"))
-    assert doubts.lines() == ("of all",)
-    others = WarningCounts()
-    others.count(summary_of("d", "of all", "of one"))
-    others.count(summary_of("e", "of all", "of two"))
-    doubts.add(others)
-    doubts.count(summary_of("f", "of all", "of two"))
-    assert doubts.lines() == (
+    found = [warned(name, "of all") for name in ("a", "b", "c")]
+    assert warning_lines(found) == ("of all",)
+    found += [warned("d", "of all", "of one"), warned("e", "of all", "of two")]
+    found += [warned("f", "of all", "of two")]
+    assert warning_lines(found) == (
         "of all",
         "2 of 6 archives, such as c1/e: of two",
         "c1/d: of one",
     )
-
-
-def test_very_many_different_doubts_are_counted() -> None:
-    doubts = WarningCounts()
-    for k in range(100):
-        doubts.count(summary_of(f"{k}", f"the clock falls back {k} times"))
-    assert len(doubts.lines()) < 20
-    assert "more warnings stand with the repetitions" in doubts.lines()[-1]
+    many = warning_lines([warned(f"{k}", f"the clock falls back {k} times") for k in range(100)])
+    assert len(many) < 20
+    assert "more warnings stand with the repetitions" in many[-1]
 
 
 def test_what_is_left_alone_is_counted_by_reason() -> None:

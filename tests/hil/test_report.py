@@ -29,10 +29,10 @@ from hil.report import (
     numbers,
     render_report,
     report_bytes,
-    validation,
 )
-from hil.report.figures.canvas import thinned
-from hil.report.figures.parameters import correlation_matrix
+from hil.report.drawing import thinned
+from hil.report.figures import correlation_matrix
+from hil.report.page import joint_errors
 from hil.results import Results
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
@@ -371,9 +371,9 @@ def test_errors_over_runs_are_those_of_all_their_samples() -> None:
     found = [(0.01 * len(e), (e**2).mean(axis=0) ** 0.5, e.mean(axis=0)) for e in errors]
     runs = [_validation(rng, 1) | dict(zip(keys, values, strict=True)) for values in found]
     every = np.concatenate(errors)
-    for j, row in enumerate(validation.joint_errors(make_results(validation=runs))):
-        assert row.rms == pytest.approx(math.sqrt((every[:, j] ** 2).mean()))
-        assert row.mean == pytest.approx(every[:, j].mean())
+    for j, row in enumerate(joint_errors(make_results(validation=runs))):
+        assert row["rms"] == pytest.approx(math.sqrt((every[:, j] ** 2).mean()))
+        assert row["mean"] == pytest.approx(every[:, j].mean())
 
 
 def test_every_run_and_joint_stands_in_the_tables_with_names_whole(page: Page) -> None:
@@ -389,11 +389,11 @@ def test_every_run_and_joint_stands_in_the_tables_with_names_whole(page: Page) -
 
 def test_a_reader_who_cannot_see_is_told_what_each_figure_shows(page: Page, html: str) -> None:
     figures = [a for tag, a in page.tags if tag == "svg" and a.get("role") == "img"]
-    assert len(figures) == 6 + 3 + 3 + 1 + 6 + 6
+    assert len(figures) == 6 + 3 + 1 + 6 + 6
     assert all(len(a["aria-label"] or "") > 30 for a in figures)
     assert sum(tag == "h1" for tag, _ in page.tags) == 1
     assert sum(tag == "caption" for tag, _ in page.tags) == len(page.tables)
-    for kind, count in (("Figure", 6), ("Table", 10)):
+    for kind, count in (("Figure", 5), ("Table", 10)):
         found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
         assert found == [str(k) for k in range(1, count + 1)]
 

@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from hil.report import ReportSeries, SeriesError, render_report
-from hil.report.figures.friction import friction_curve_panels
-from hil.report.figures.motion import excitation_panels, split_panels, torque_panels
-from hil.report.figures.residuals import spectrum_panels
-from hil.report.page import shown_candidates
-from hil.report.validation import error_rows, every_row_errors, example_errors
+from hil.report.figures import (
+    excitation_panels,
+    friction_curve_panels,
+    joints_of,
+    spectrum_panels,
+    split_panels,
+    torque_panels,
+)
+from hil.report.page import error_rows, every_row_errors, shown_candidates
 from hil.results import ChoiceResult, Results
 from tests.hil.test_report import JOINTS, TORQUE, Page, make_results, make_series
 
@@ -141,13 +145,13 @@ class TestErrors:
     def test_stand_beside_each_joint(self, results: Results) -> None:
         assert every_row_errors(results) == [0.06] * N
         assert every_row_errors(make_results()) == []
-        assert all("every row 6.00 %" in one.words for one in example_errors(results))
+        assert all("every row 6.00 %" in one.error for one in joints_of(results))
 
     def test_are_those_of_the_fit_where_nothing_was_held_out(self) -> None:
         alone = make_results(fitted=FITTED, validation=[], repetitions=["log.mcap"])
         (row,) = error_rows(alone)
         assert "in-sample" in row[0]
-        assert example_errors(alone)[0].words == "error 2.00 %, every row 5.00 %"
+        assert joints_of(alone)[0].error == "error 2.00 %, every row 5.00 %"
 
 
 class TestShading:
@@ -160,7 +164,7 @@ class TestShading:
         assert second == [[0.0, pytest.approx(0.999)]]
 
     def test_is_the_same_in_all_plots_of_a_panel(self, results: Results) -> None:
-        series, errors = full_series(), example_errors(results)
+        series, errors = full_series(), joints_of(results)
         end = float(series.example_time[-1] - series.example_time[0])
         for panels, plots in (
             (torque_panels(series, errors), 2),
@@ -176,7 +180,7 @@ class TestFigures:
     """Friction, split and spectra of each joint."""
 
     def test_show_every_joint(self, results: Results) -> None:
-        series, errors = full_series(), example_errors(results)
+        series, errors = full_series(), joints_of(results)
         for panels in (
             friction_curve_panels(series, errors),
             split_panels(series, errors),
@@ -185,26 +189,26 @@ class TestFigures:
             assert [panel.title for panel in panels] == JOINTS
 
     def test_show_the_reversal_where_dry_friction_turns_round(self, results: Results) -> None:
-        first, second = friction_curve_panels(full_series(), example_errors(results))[:2]
+        first, second = friction_curve_panels(full_series(), joints_of(results))[:2]
         assert "at reversal" in first.svg and "travel [mrad]" in first.svg
         assert "at reversal" not in second.svg
 
     def test_draw_each_row_of_friction_as_one_dot(self, results: Results) -> None:
-        panel = friction_curve_panels(full_series(), example_errors(results))[1]
+        panel = friction_curve_panels(full_series(), joints_of(results))[1]
         longest = max(re.findall(r' d="([^"]*)"', panel.svg), key=len)
         assert longest.count("M") == 300
 
     def test_name_the_largest_part_of_the_torque(self, results: Results) -> None:
-        assert split_panels(full_series(), example_errors(results))[0].note.startswith(
+        assert split_panels(full_series(), joints_of(results))[0].note.startswith(
             "largest: gravity"
         )
 
     def test_name_the_residual_above_the_bandwidth(self, results: Results) -> None:
-        note = spectrum_panels(full_series(), example_errors(results))[0].note
+        note = spectrum_panels(full_series(), joints_of(results))[0].note
         assert "power above 10 Hz" in note
 
     def test_are_left_out_where_their_series_are_empty(self, results: Results) -> None:
-        series, errors = make_series(), example_errors(results)
+        series, errors = make_series(), joints_of(results)
         assert not friction_curve_panels(series, errors)
         assert not split_panels(series, errors)
         assert not spectrum_panels(series, errors)
@@ -212,7 +216,7 @@ class TestFigures:
     def test_leave_a_joint_out_that_never_moved(self, results: Results) -> None:
         series = full_series()
         series.law_speed[:, 2] = 0.0
-        titles = [one.title for one in friction_curve_panels(series, example_errors(results))]
+        titles = [one.title for one in friction_curve_panels(series, joints_of(results))]
         assert titles == [name for name in JOINTS if name != JOINTS[2]]
 
     def test_have_ids_of_their_own_and_page_colours(self, html: str) -> None:

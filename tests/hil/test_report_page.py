@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from hil.report import render_report
-from hil.report.figures.canvas import FIRST
-from hil.report.figures.svg import MOST_POINTS, Plot, Trace, traces_text
+from hil.report.drawing import FIRST, MOST_POINTS, Plot, Trace, traces_text
 from hil.results import Results
 
 from .test_report import HOSTILE, Page, assert_inert, make_results, make_series

@@ -1,4 +1,4 @@
-"""From a matplotlib figure to SVG that may stand inside a page, many times over.
+"""Drawings of the pages: from matplotlib to SVG that may stand inside a page, many times over.
 
 matplotlib writes a document: sizes in points, its own fonts, fixed colours, names that repeat from
 figure to figure. Inside a page the size comes from the layout, the font from the page and the
@@ -17,25 +17,57 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final
+from itertools import pairwise
+from typing import Any, Final, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, Locator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from hil.report.figures.canvas import CSS_VARIABLES
+Array = NDArray[np.float64]
 
-_SVG = "http://www.w3.org/2000/svg"
-_XLINK = "http://www.w3.org/1999/xlink"
-_LONG_DECIMAL = re.compile(r"-?\d+\.\d{3,}")
-_FONT_FAMILY = re.compile(r"font-family:[^;]*;?\s*")
-_REFERENCE = re.compile(r"url\(#([^)]+)\)")
-_LABEL_LENGTH = 28
+# Figures draw with stand-ins, colours that no one would draw with: each becomes a variable of the
+# style sheet when the figure enters the page, so that light, dark and print need one drawing.
+CSS_VARIABLES: Final = {
+    f"#0102{k:02x}": f"var(--{name})"
+    for k, name in enumerate(
+        (
+            *("ink", "muted", "grid", "band", "paper", "first", "second", "wide"),
+            *("route-0", "route-1", "route-2", "route-3", "inside", "outside-2", "outside-3"),
+        )
+    )
+}
+INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, INSIDE, OUTSIDE_2, OUTSIDE_3 = (
+    CSS_VARIABLES
+)
+"""`WIDE` is a light, broad line that another one may lie upon."""
 
-
+TICK_SIZE, TEXT_SIZE = 10.5, 11.0
+PANEL_WIDTH: Final = 370.0
+"""Of most figures, px."""
+DASHED: Final = (0, (4, 3))
+_TOP: Final = 20.0
+_SVG: Final = "http://www.w3.org/2000/svg"
+_XLINK: Final = "http://www.w3.org/1999/xlink"
+_LONG_DECIMAL: Final = re.compile(r"-?\d+\.\d{3,}")
+_FONT_FAMILY: Final = re.compile(r"font-family:[^;]*;?\s*")
+_REFERENCE: Final = re.compile(r"url\(#([^)]+)\)")
+_LABEL_LENGTH: Final = 28
 _settings = threading.RLock()
+
+
+class Caption(NamedTuple):
+    """Words of a panel, see :func:`to_panel`."""
+
+    key: str
+    title: str
+    note: str
+    alt: str
 
 
 @dataclass(frozen=True)
@@ -47,6 +79,103 @@ class Panel:
     svg: Markup
     width: float
     """Width [px] at which its letters have their intended size."""
+
+
+def blank(width: float, height: float) -> Figure:
+    """A transparent figure of `width` x `height` page pixels."""
+    figure = Figure(figsize=(width / 72.0, height / 72.0))
+    figure.patch.set_visible(False)
+    return figure
+
+
+def place(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Axes at (`left`, `top`) pixels from the upper left corner of the figure."""
+    full_width, full_height = figure.get_size_inches() * 72.0
+    bottom = (full_height - top - height) / full_height
+    axes = figure.add_axes(
+        (left / full_width, bottom, width / full_width, height / full_height),
+    )
+    axes.patch.set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set(color=MUTED, linewidth=0.8)
+    axes.tick_params(
+        colors=MUTED, labelcolor=INK, labelsize=TICK_SIZE, length=3.0, width=0.8, pad=3.0
+    )
+    axes.set_axisbelow(True)
+    return axes
+
+
+def plot_panel(
+    height: float, *, left: float = 46.0, right: float = 10.0, bottom: float = 40.0
+) -> tuple[Figure, Axes]:
+    """A figure of the page's usual width with one plot, and the room for its labels [px]."""
+    figure = blank(PANEL_WIDTH, height)
+    return figure, place(figure, left, _TOP, PANEL_WIDTH - left - right, height - _TOP - bottom)
+
+
+def log_ticks(axis: Axis, locator: Locator) -> None:
+    """Ticks of a logarithmic axis as decimal numbers, and none between them."""
+    axis.set_major_locator(locator)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def ruled(
+    axes: Axes, axis: Literal["x", "y", "both"], *, x_ticks: int = 5, y_ticks: int = 4
+) -> None:
+    """Light rules at few, round ticks."""
+    axes.grid(True, axis=axis, color=GRID, linewidth=0.8)
+    axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=[1, 2, 5, 10]))
+
+
+def headed(axes: Axes, text: str) -> None:
+    """`text` (what the vertical axis is, and its unit) above the axes, to be read level."""
+    axes.set_title(text, loc="left", fontsize=TEXT_SIZE, color=MUTED, pad=5.0)
+
+
+def footed(axes: Axes, text: str) -> None:
+    """`text` below the axes."""
+    axes.set_xlabel(text, fontsize=TEXT_SIZE, color=MUTED, labelpad=3.0)
+
+
+def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
+    """Small dots at (c,) points as one path, a tenth of what c marks would take of the page."""
+    gap = np.full(x.shape, np.nan)
+    # A line without length, with round ends, is a dot.
+    rows = [np.column_stack([v, v, gap]).ravel() for v in (x, y)]
+    with mpl.rc_context({"path.simplify": False}):
+        axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
+
+
+def boxed(axes: Axes, columns: Sequence[Array], width: float, **options: Any) -> None:
+    """A box for each column, side by side from 1 on: quartiles, median and whiskers."""
+    thin = {"color": MUTED, "linewidth": 1.1}
+    axes.boxplot(
+        columns,
+        positions=range(1, len(columns) + 1),
+        widths=width,
+        patch_artist=True,
+        boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
+        medianprops={"color": INK, "linewidth": 2.2},
+        whiskerprops=thin,
+        capprops=thin,
+        **options,
+    )
+
+
+def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
+    """Lowest and highest sample of each of `bins` equal stretches, in order; (m,) -> (<= 2 bins,).
+
+    Unlike taking every k-th sample this keeps every peak that a screen could show.
+    """
+    if time.size <= 2 * bins:
+        return time, values
+    edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
+    stretches = [(start, values[start:end]) for start, end in pairwise(edges)]
+    ends = [start + end(part) for start, part in stretches for end in (np.argmin, np.argmax)]
+    chosen = np.unique([0, *ends, time.size - 1])
+    return time[chosen], values[chosen]
 
 
 @contextmanager
@@ -76,9 +205,12 @@ def to_panel(
 ) -> Panel:
     """`figure` as SVG; `key` makes its ids unique in the page, `alt` says what it shows.
 
-    With `traces` (see :mod:`hil.report.figures.svg`) a reader can zoom into it.
+    With `traces` (see :func:`traces_text`) a reader can zoom into it.
     """
-    root = ET.fromstring(_document(figure))
+    out = io.BytesIO()
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(out, format="svg", metadata=metadata)
+    root = ET.fromstring(out.getvalue())
     _drop_document_parts(root)
     _rename_ids(root, key)
     for element in root.iter():
@@ -90,20 +222,9 @@ def to_panel(
     root.set("aria-label", " ".join("".join(c if c.isprintable() else " " for c in alt).split()))
     if traces:
         root.set("data-traces", traces)
-    return Panel(title=title, note=note, svg=Markup(_serialised(root)), width=width)
-
-
-def _document(figure: Figure) -> str:
-    out = io.BytesIO()
-    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(out, format="svg", metadata=metadata)
-    return out.getvalue().decode("utf-8")
-
-
-def _serialised(root: ET.Element) -> str:
     ET.register_namespace("", _SVG)
     ET.register_namespace("xlink", _XLINK)
-    return ET.tostring(root, encoding="unicode")
+    return Panel(title, note, Markup(ET.tostring(root, encoding="unicode")), width)
 
 
 def _drop_document_parts(root: ET.Element) -> None:
@@ -127,21 +248,15 @@ def _rename_ids(root: ET.Element, key: str) -> None:
     present = [i for e in root.iter() if (i := e.get("id")) is not None and i in references]
     names = {old: f"{key}-{k}" for k, old in enumerate(present)}
     for element in root.iter():
-        _rename_in(element, names)
-
-
-def _rename_in(element: ET.Element, names: dict[str, str]) -> None:
-    for attribute, value in list(element.attrib.items()):
-        if attribute == "id":
-            if value in names:
-                element.set("id", names[value])
-            else:
-                del element.attrib["id"]
-        elif attribute == f"{{{_XLINK}}}href" and value.startswith("#"):
-            del element.attrib[attribute]
-            element.set("href", f"#{names[value[1:]]}")
-        elif "url(#" in value:
-            element.set(attribute, _REFERENCE.sub(lambda m: f"url(#{names[m[1]]})", value))
+        name, target = element.attrib.pop("id", None), element.get(f"{{{_XLINK}}}href", "")
+        if name in names:
+            element.set("id", names[name])
+        if target.startswith("#"):
+            del element.attrib[f"{{{_XLINK}}}href"]
+            element.set("href", f"#{names[target[1:]]}")
+        for attribute, value in element.attrib.items():
+            if "url(#" in value:
+                element.set(attribute, _REFERENCE.sub(lambda m: f"url(#{names[m[1]]})", value))
 
 
 def _restyle(element: ET.Element) -> None:
@@ -161,7 +276,34 @@ def _restyle(element: ET.Element) -> None:
         del element.attrib["transform"]
 
 
-Array = NDArray[np.float64]
+@contextmanager
+def panel(
+    panels: list[Panel],
+    height: float,
+    caption: Caption,
+    heading: str = "",
+    foot: str = "",
+    **room: float,
+) -> Iterator[Axes]:
+    """Axes of a :func:`plot_panel` to draw on; what was drawn is then added to some panels.
+
+    Args:
+        panels: it becomes the last of them.
+        height: of the figure [px].
+        caption: of the panel.
+        heading: above the axes: the quantity and its unit.
+        foot: below the axes.
+        room: for labels, see :func:`plot_panel`.
+    """
+    with drawing():
+        figure, axes = plot_panel(height, **room)
+        yield axes
+        if heading:
+            headed(axes, heading)
+        if foot:
+            footed(axes, foot)
+        panels.append(to_panel(figure, **caption._asdict()))
+
 
 MOST_POINTS: Final = 3000
 """Of a line; more than three times what a panel shows at once."""

@@ -1,1 +1,0 @@
-"""Figures of the report as inline SVG that takes its colours from the page's style sheet."""

@@ -1,1 +1,0 @@
-"""Templates and style sheet of the report; a package so that they are installed with it."""
