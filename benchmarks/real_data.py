@@ -51,8 +51,7 @@ from hil.recordings import open_recording
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
-from identification.estimators.nominal_prior import nominal_prior
-from identification.estimators.prior import fit_with_prior
+from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Estimate, Factor, NormalEquations, joint_weights, solve

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from identification import Factor, Motion, RobotModel
 from identification.model.kinematics import FROM_PINOCCHIO
-from identification.model.wrench import LINK_SYMBOLS
+from identification.model.regressor import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from benchmarks.study_recordings import Condition, Kept, study_cell, validation_paths
 from hil.simulation import planted_values
 from identification.estimators.consistent import consistent_estimate
-from identification.estimators.instrument_motion import planned_motion
-from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.estimators.least_squares import fit_least_squares
+from identification.estimators.instrumental import (
+    InstrumentalEstimate,
+    estimate_instrumental,
+    planned_motion,
+)
+from identification.estimators.least_squares import estimate_repetitions, fit_least_squares
 from identification.estimators.losses import Huber, Tukey
-from identification.estimators.repetitions import estimate_repetitions
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate, Factor
 from identification.factor.phases import instrument_factor

@@ -7,29 +7,34 @@ from identification.estimators.consistent import (
     consistent_estimate,
 )
 from identification.estimators.covariance import with_block_covariance
-from identification.estimators.delay import DelayEstimate, estimate_delays
-from identification.estimators.delay_compensation import (
+from identification.estimators.delay import (
+    DelayEstimate,
     compensate,
     delay_sensitivity,
+    estimate_delays,
     rate_products,
     with_uncertain_delay,
 )
 from identification.estimators.gains import Gains, identify_gains
-from identification.estimators.instrument_motion import planned_motion
-from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
+from identification.estimators.instrumental import (
+    InstrumentalEstimate,
+    estimate_instrumental,
+    planned_motion,
+)
 from identification.estimators.least_squares import (
+    RepeatedEstimate,
+    estimate_repetitions,
     fit_least_squares,
     ordinary_least_squares,
 )
 from identification.estimators.losses import Huber, Tukey
-from identification.estimators.nominal_prior import nominal_prior
 from identification.estimators.prior import (
     GaussianPrior,
     PosteriorEstimate,
     fit_with_prior,
+    nominal_prior,
     with_prior,
 )
-from identification.estimators.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json

@@ -16,10 +16,9 @@ from hil.identify.cad_prior import cad_prior, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError, consistent_estimate
-from identification.estimators.delay_compensation import with_uncertain_delay
-from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.estimators.delay import with_uncertain_delay
+from identification.estimators.least_squares import Weighting, fit_least_squares, no_narrower
 from identification.estimators.prior import fit_with_prior, with_prior
-from identification.estimators.repetitions import no_narrower
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import (
     QR_CONDITION,

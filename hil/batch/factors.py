@@ -23,7 +23,7 @@ from hil.identify.sources import Source, known_warnings, source_of
 from hil.io import file_digest, json_digest
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
-from identification.estimators.delay_compensation import rate_products
+from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import Weighting, fit_least_squares
 from identification.factor.factor import Estimate, joint_weights
 from identification.factor.phases import PhaseFactor

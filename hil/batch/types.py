@@ -163,7 +163,7 @@ class Summary:
         fits: by weighting, "weighted" and "ordinary"; none of a validation run.
         warnings: what a reader must know of it.
         products: (n, p, p + 1), see
-            :func:`identification.estimators.delay_compensation.rate_products`; None where the delay
+            :func:`identification.estimators.delay.rate_products`; None where the delay
             is known, or nothing is fitted.
     """
 

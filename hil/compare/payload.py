@@ -36,7 +36,7 @@ from scipy.stats import t as student
 from hil.batch.types import LevelEstimate
 from identification import RobotModel
 from identification.model.payload import Payload
-from identification.model.wrench import LINK_SYMBOLS
+from identification.model.regressor import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,7 @@ from hil.cell import Cell
 from hil.cell.schema import NominalTable
 from hil.errors import InputError
 from identification import IdentificationError, RobotModel
-from identification.estimators.nominal_prior import nominal_prior
-from identification.estimators.prior import GaussianPrior
+from identification.estimators.prior import GaussianPrior, nominal_prior
 
 # Friction changes with temperature, lubricant and wear by tens of per cent (Bittencourt and
 # Gunnarsson 2012): a data sheet's is no better than to half of itself.

@@ -22,9 +22,9 @@ from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Question, choose_settings
 from identification.selection.inner_prediction import Settings as Candidate
-from identification.signals.repetition_noise import repetition_noise
+from identification.signals.noise import repetition_noise
 from identification.signals.samples import Preprocessing, Samples
-from identification.validation.thresholds import Thresholds
+from identification.validation.finding import Thresholds
 
 from .options import Options
 from .settings import Settings, samples_of, signals_of, stated_delay, stated_settings

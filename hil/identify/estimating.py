@@ -15,13 +15,21 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
 from identification.estimators.consistent import SolverError, consistent_estimate
-from identification.estimators.delay_compensation import rate_products, with_uncertain_delay
-from identification.estimators.instrument_motion import planned_motion, same_plan
-from identification.estimators.instrumental import InstrumentalEstimate, estimate_instrumental
-from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.estimators.delay import rate_products, with_uncertain_delay
+from identification.estimators.instrumental import (
+    InstrumentalEstimate,
+    estimate_instrumental,
+    planned_motion,
+    same_plan,
+)
+from identification.estimators.least_squares import (
+    RepeatedEstimate,
+    Weighting,
+    estimate_repetitions,
+    fit_least_squares,
+)
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
-from identification.estimators.repetitions import RepeatedEstimate, estimate_repetitions
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import QR_CONDITION, Estimate, joint_weights, nothing_usable

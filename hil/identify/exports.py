@@ -16,8 +16,7 @@ from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
-from identification.export.urdf import write_urdf
-from identification.export.xml_source import with_comment
+from identification.export.urdf import with_comment, write_urdf
 
 Array = NDArray[np.float64]
 

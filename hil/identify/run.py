@@ -19,17 +19,17 @@ from hil.reading import lies_there
 from hil.report import ReportSeries
 from hil.results import FindingResult, JointJudgement, JudgementResult, ProfileResult, Results
 from identification.errors import IdentificationError
-from identification.estimators.repetitions import RepeatedEstimate
+from identification.estimators.least_squares import RepeatedEstimate
 from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
-from identification.selection.essential_choice import EssentialChoice
+from identification.selection.essential import EssentialChoice
+from identification.signals.noise import spectrum
 from identification.signals.samples import Samples
-from identification.signals.spectrum import spectrum
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence, gather
 from identification.validation.prediction import for_figure
-from identification.validation.residual_profile import Profile
+from identification.validation.residuals import Profile
 from identification.validation.verdict import Verdict, judge
 
 from .estimating import Estimation, estimate_with

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from identification.estimators.delay_compensation import compensate
+from identification.estimators.delay import compensate
 from identification.estimators.shrinkage import Shrinkage
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Choice

@@ -37,10 +37,9 @@ from hil.results import (
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.consistent import Consistency
-from identification.estimators.consistent_program import link_parameters
+from identification.estimators.consistent import Consistency, link_parameters
 from identification.estimators.covariance import with_block_covariance
-from identification.estimators.repetitions import RepeatedEstimate
+from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.shrinkage import Shrinkage, fitted_values
 from identification.excitation import (
     Excitation,
@@ -55,12 +54,12 @@ from identification.excitation import (
 from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.elements import TorqueRipple
-from identification.selection.essential_choice import EssentialChoice, choose_essential
+from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.prediction import PredictionError, over_all, prediction_error
-from identification.validation.residual_blocks import BLOCK
+from identification.validation.residuals import BLOCK
 from identification.validation.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from identification.estimators.nominal_prior import NOMINAL_SHARE
+from identification.estimators.prior import NOMINAL_SHARE
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
 from identification.model.urdf_text import urdf_tree
@@ -19,9 +19,13 @@ from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
 from identification.validation.evidence import Surroundings
-from identification.validation.findings.finding import Finding, joined
-from identification.validation.inertia_ratio import InertiaRatio, inertia_ratio
-from identification.validation.nominal_scale import NominalScale, nominal_scale
+from identification.validation.finding import Finding, joined
+from identification.validation.nominal_scale import (
+    InertiaRatio,
+    NominalScale,
+    inertia_ratio,
+    nominal_scale,
+)
 from identification.validation.position_jumps import position_jumps
 from identification.validation.prediction import PredictionError, over_all
 

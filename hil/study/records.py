@@ -30,7 +30,7 @@ from hil.reading import text_of
 from hil.results import Frozen
 from hil.study.campaigns import Workers
 from identification import Factor, RobotModel
-from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.least_squares import estimate_repetitions
 from identification.excitation import correlation, coupling_index, information, log10_det
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.consistent_program import (
+from identification.estimators.consistent import (
     Consistency,
     Program,
     SquareRoot,

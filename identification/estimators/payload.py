@@ -54,9 +54,8 @@ from identification.model.pseudo_inertia import (
     pseudo_inertia,
     pseudo_inertia_map,
 )
-from identification.model.regressor import RegressorPlan
+from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
-from identification.model.wrench import LINK_SYMBOLS
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]

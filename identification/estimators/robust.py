@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.clustered import clustered_covariance
+from identification.estimators.covariance import clustered_covariance
 from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
 from identification.factor.factor import (
     Estimate,

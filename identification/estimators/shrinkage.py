@@ -19,8 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
-from identification.estimators.consistent_program import Consistency
+from identification.estimators.consistent import (
+    Consistency,
+    ConsistentEstimate,
+    consistent_estimate,
+)
 from identification.estimators.covariance import block_covariance
 from identification.factor.factor import (
     Estimate,

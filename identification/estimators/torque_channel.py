@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
-from identification.signals.low_passes import (
+from identification.signals.masks import LONGEST_END, torn_rows
+from identification.signals.noise import noiseless_above
+from identification.signals.recording import Recording
+from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
+from identification.signals.smoothing import (
     FORWARDS,
     SMOOTHER,
     WITHOUT_PHASE,
     LowPassShape,
     low_passed,
 )
-from identification.signals.masks import LONGEST_END, torn_rows
-from identification.signals.recording import Recording
-from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
-from identification.signals.spectrum import noiseless_above
 
 Array = NDArray[np.float64]
 

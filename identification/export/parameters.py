@@ -23,8 +23,8 @@ from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import friction_in_words
 from identification.export.urdf import not_in_urdf
 from identification.factor.factor import Estimate
+from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
-from identification.model.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 

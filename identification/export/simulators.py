@@ -30,16 +30,22 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.export.urdf import TENSOR, WriteBackError, as_text, rnea, write_urdf
-from identification.export.xml_source import comment_text, with_comment
+from identification.export.urdf import (
+    TENSOR,
+    WriteBackError,
+    as_text,
+    comment_text,
+    rnea,
+    with_comment,
+    write_urdf,
+)
 from identification.model.elements import TorsionSpring
 from identification.model.friction import Coulomb, Cubic, JointTerm, Kind, Quadratic, Tanh, Viscous
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body
-from identification.model.regressor import RegressorPlan
+from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
-from identification.model.wrench import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
 Node = ElementTree.Element

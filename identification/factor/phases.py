@@ -9,7 +9,7 @@ for any weights and parameters. Stored are only the columns that act on a joint,
 
 Instrumental variables need the same of [Z | W | y], a factor of twice the parameters: W is the
 regressor of the measured motion, whose noise it carries, and Z that of a motion without measurement
-noise (:mod:`identification.estimators.instrument_motion`), column by column the same functions.
+noise (:mod:`identification.estimators.instrumental`), column by column the same functions.
 """
 
 from __future__ import annotations

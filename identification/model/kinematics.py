@@ -126,7 +126,7 @@ class Chain:
         translation: origin of joint frame i in its parent's frame [m], shape (n, 3).
         axis: unit joint axis in the joint's own frame, shape (n, 3).
         revolute: False where the joint is prismatic, shape (n,).
-        inertial: the ten parameters per link (:data:`identification.model.wrench.LINK_SYMBOLS`)
+        inertial: the ten parameters per link (:data:`identification.model.regressor.LINK_SYMBOLS`)
             about the joint frame's origin in its axes, as the description gives them (the nominal,
             CAD values), shape (n, 10).
         frames: by name the links of the description, what is fixed to the base included: the

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
 from identification.model.pseudo_inertia import Body, inertial_parameters
-from identification.model.regressor import RegressorPlan, joint_arrays
-from identification.model.wrench import LINK_SYMBOLS
+from identification.model.regressor import LINK_SYMBOLS, RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
 

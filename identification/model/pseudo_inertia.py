@@ -14,7 +14,7 @@ Nominal parameters of a description are often no body at all: left out, typed wi
 rod without thickness. :func:`reference_bodies` keeps as much of each link as is possible, to hold
 on to where data leave its parameters open.
 
-The ten parameters stand in the order of :data:`identification.model.wrench.LINK_SYMBOLS`.
+The ten parameters stand in the order of :data:`identification.model.regressor.LINK_SYMBOLS`.
 """
 
 from __future__ import annotations

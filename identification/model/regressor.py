@@ -1,7 +1,7 @@
 r"""Inverse dynamics, linear in the parameters: tau = W(q, qd, qdd) pi, vectorised over samples.
 
 The torque of joint j is the power of the wrenches on all links it moves, on their twists per
-unit speed of joint j (:class:`LinkMotion`, :mod:`identification.model.wrench`).
+unit speed of joint j (:class:`LinkMotion`, :mod:`identification.model.regressor`).
 A column is therefore one dot product per sample, and only the columns asked for are made.
 """
 
@@ -19,15 +19,96 @@ from identification.errors import ShapeError
 from identification.model.elements import JointElements, PlacedElement
 from identification.model.friction import FrictionLaw, JointFriction, JointTerm
 from identification.model.kinematics import Chain, skew
-from identification.model.wrench import (
-    N_INERTIA,
-    N_PRIMITIVES,
-    ROTATIONAL,
-    wrench_matrix,
-    write_primitives,
-)
 
 Array = NDArray[np.float64]
+
+
+# The wrench on a link is linear in its ten inertial parameters. About the origin of the link's
+# frame, in its axes (omega, alpha: angular velocity and acceleration; a: acceleration of the origin
+# minus gravity):
+#
+# .. math:: n = I\alpha + \omega\times I\omega + mc\times a, \qquad
+#           f = m a + \alpha\times mc + \omega\times(\omega\times mc)
+#
+# Every entry is a sum, with signs, of twelve quantities per sample, the *primitives*: the three
+# components of a, of alpha, of the squares :math:`\omega_x^2, \omega_y^2, \omega_z^2`, and of the
+# products :math:`\omega_y\omega_z, \omega_z\omega_x, \omega_x\omega_y`. So the wrenches are one
+# constant matrix times the primitives.
+
+# Order of the ten inertial parameters of a link.
+LINK_SYMBOLS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
+N_INERTIA = 6
+N_PRIMITIVES = 12
+
+# Accelerations stand first: moments of inertia do without them.
+_ACCELERATION, _ALPHA, _SQUARE, _PRODUCT = 0, 3, 6, 9
+ROTATIONAL = slice(_ALPHA, N_PRIMITIVES)
+_TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def wrench_matrix(symbol: int) -> Array:
+    """Return the wrench (moment, then force) of a unit parameter, shape (6, 12).
+
+    Args:
+        symbol: index into :data:`LINK_SYMBOLS`.
+    """
+    matrix = np.zeros((6, N_PRIMITIVES))
+    if symbol < N_INERTIA:
+        _add_inertia(matrix[:3], *_TENSOR[symbol])
+    elif symbol < N_INERTIA + 3:
+        _add_first_moment(matrix[:3], matrix[3:], symbol - N_INERTIA)
+    else:
+        matrix[3:, _ACCELERATION : _ACCELERATION + 3] = np.eye(3)
+    return matrix
+
+
+def write_primitives(motion: Array, out: Array) -> None:
+    """Compute the primitives of all links.
+
+    Args:
+        motion: spatial velocity and acceleration, shape (n, 2, 2, 3, k).
+        out: shape (n, 12, k).
+    """
+    omega, speed = motion[:, 0, 0], motion[:, 0, 1]
+    out[:, _ALPHA : _ALPHA + 3] = motion[:, 1, 0]
+    np.multiply(omega, omega, out=out[:, _SQUARE : _SQUARE + 3])
+    for c in range(3):
+        a, b = (c + 1) % 3, (c + 2) % 3
+        np.multiply(omega[:, a], omega[:, b], out=out[:, _PRODUCT + c])
+        # The origin's acceleration is the spatial one + omega x v.
+        acceleration = out[:, _ACCELERATION + c]
+        np.multiply(omega[:, a], speed[:, b], out=acceleration)
+        acceleration -= omega[:, b] * speed[:, a]
+        acceleration += motion[:, 1, 1, c]
+
+
+def _product(a: int, b: int) -> int:
+    """Return the primitive omega_a omega_b."""
+    return _SQUARE + a if a == b else _PRODUCT + 3 - a - b
+
+
+def _add_inertia(moment: Array, first: int, second: int) -> None:
+    """Add I alpha + omega x I omega for a unit (symmetric) entry of I."""
+    entries = {(first, second), (second, first)}
+    for row, column in entries:  # I has a one at (row, column)
+        a, b = (row + 1) % 3, (row + 2) % 3
+        moment[row, _ALPHA + column] += 1.0
+        # omega x e_row = omega_b e_a - omega_a e_b, times omega_column
+        moment[a, _product(b, column)] += 1.0
+        moment[b, _product(a, column)] -= 1.0
+
+
+def _add_first_moment(moment: Array, force: Array, c: int) -> None:
+    """Add e_c x a to the moment, alpha x e_c + omega omega_c - e_c omega^2 to the force."""
+    a, b = (c + 1) % 3, (c + 2) % 3
+    moment[a, _ACCELERATION + b] = -1.0
+    moment[b, _ACCELERATION + a] = 1.0
+    force[a, [_ALPHA + b, _product(a, c)]] = 1.0
+    force[b, _ALPHA + a] = -1.0
+    force[b, _product(b, c)] = 1.0
+    force[c, [_SQUARE + a, _SQUARE + b]] = -1.0
+
+
 Rows = slice | NDArray[np.intp]
 
 # Samples worked on at a time: enough to make the cost of a numpy call small, few enough for the
@@ -67,7 +148,7 @@ class RegressorPlan:
     Args:
         chain: the robot.
         gravity: acceleration of gravity in base axes [m/s²], shape (3,).
-        links: per joint the used :data:`identification.model.wrench.LINK_SYMBOLS` (0..9), rising.
+        links: per joint the used :data:`LINK_SYMBOLS` (0..9), rising.
         rotors: joints whose rotor inertia has a column of its own.
         friction: of joints and coupled motors, None for none.
         couplings: pairs of joints whose coupling inertia has a column.

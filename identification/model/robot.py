@@ -18,8 +18,7 @@ from identification.model.elements import Element, ElementError, JointElements
 from identification.model.friction import FrictionLaw, JointFriction, Offset
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.payload import Load, Payload
-from identification.model.regressor import Regressor, RegressorPlan, joint_arrays
-from identification.model.wrench import LINK_SYMBOLS
+from identification.model.regressor import LINK_SYMBOLS, Regressor, RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]

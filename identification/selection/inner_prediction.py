@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.consistent_program import SolverError
+from identification.estimators.consistent import SolverError
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, shrunk_values
 from identification.factor.factor import Factor, augmented_rows, joint_weights, solve
 from identification.model.elements import Element, TorqueRipple

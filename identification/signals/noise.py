@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from identification.signals.recording import RecordingError
+from identification.errors import IdentificationError
+from identification.signals.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
+
 
 STANDSTILL_WINDOW: Final = 0.1  # s
 _SHORTEST_WINDOW: Final = 20  # samples
@@ -85,3 +91,200 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     stacked = np.lib.stride_tricks.sliding_window_view(values, order + 1, axis=0)
     return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
+
+
+# A standstill shows the noise of a sensor at rest: no quantisation steps, no ripple, no current
+# under load. The difference between repetitions of one motion shows all of that, and the motion
+# itself, whatever it is, drops out of it.
+
+_SHORTEST_RUN: Final = 64  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelNoise:
+    """Variance of one kind of channel, n joints.
+
+    Attributes:
+        white: of what differs from sample to sample (n,): measurement noise, the tolerance of a
+            smoothing spline.
+        unrepeatable: of all that differs between repetitions (n,): also friction that drifts, and
+            motion that a servo makes from noise.
+    """
+
+    white: Array
+    unrepeatable: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RepetitionNoise:
+    """Noise from R repetitions of one motion.
+
+    Attributes:
+        position: [rad² or m²].
+        torque: [N²·m² or N²], None where no torque was recorded.
+        motor_current: [A²], None where no current was recorded.
+        rows: instants that all repetitions have in common.
+        repetitions: R.
+    """
+
+    position: ChannelNoise
+    torque: ChannelNoise | None
+    motor_current: ChannelNoise | None
+    rows: int
+    repetitions: int
+
+
+def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
+    """Variances from repetitions, aligned at the start of their commanded motion.
+
+    Times are compared to the nearest sampling interval. What a shift of less than one leaves of
+    the motion is smooth and counts as unrepeatable, not as white.
+
+    Args:
+        recordings: two or more of one motion, checked, with equal joints and sampling rate.
+
+    Raises:
+        IdentificationError: fewer than two, other joints or rates, or no stretch in common.
+    """
+    if len(recordings) < 2:
+        raise IdentificationError(f"noise from repetitions takes two, got {len(recordings)}")
+    first = recordings[0]
+    step = float(np.median(np.diff(first.time)))
+    for one in recordings[1:]:
+        own = float(np.median(np.diff(one.time)))
+        if one.joint_names != first.joint_names or abs(own - step) > 0.01 * step:
+            raise IdentificationError("these are no repetitions: joints or sampling rates differ")
+    indices = [np.rint((one.time - one.motion_start) / step).astype(np.int64) for one in recordings]
+    common, runs = _common_runs(recordings, indices)
+    # First of the samples that round to the same instant, if clocks jitter.
+    rows = [np.searchsorted(index, common) for index in indices]
+    time: Array = common.astype(np.float64) * step
+
+    def noise(name: str) -> ChannelNoise | None:
+        channels = [getattr(one, name) for one in recordings]
+        if any(channel is None for channel in channels):
+            return None
+        return _channel_noise(
+            time, [channel[row] for channel, row in zip(channels, rows, strict=True)], runs
+        )
+
+    position = noise("position")
+    assert position is not None
+    return RepetitionNoise(
+        position=position,
+        torque=noise("torque"),
+        motor_current=noise("motor_current"),
+        rows=int(sum(stop - start for start, stop in runs)),
+        repetitions=len(recordings),
+    )
+
+
+def _common_runs(
+    recordings: Sequence[Recording], indices: Sequence[NDArray[np.int64]]
+) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Instants in all repetitions, and which stretches of them no gap of any interrupts."""
+    common = indices[0]
+    for index in indices[1:]:
+        common = np.intersect1d(common, index)
+    common = np.unique(common)
+    torn = np.diff(common) > 1
+    for one, index in zip(recordings, indices, strict=True):
+        for segment in one.segments()[1:]:
+            torn[: len(torn)] |= (common[:-1] < index[segment.start]) & (
+                common[1:] >= index[segment.start]
+            )
+    edges = [0, *(np.flatnonzero(torn) + 1).tolist(), len(common)]
+    runs = [(a, b) for a, b in pairwise(edges) if b - a >= _SHORTEST_RUN]
+    if not runs:
+        raise IdentificationError(
+            f"the repetitions have no {_SHORTEST_RUN} consecutive samples in common"
+        )
+    return common, runs
+
+
+def _channel_noise(
+    time: Array, channels: Sequence[Array], runs: Sequence[tuple[int, int]]
+) -> ChannelNoise:
+    stacked = np.stack(channels)
+    # About the mean of R repetitions a share of 1/R of the variance is lost.
+    apart = (stacked - stacked.mean(axis=0)) * np.sqrt(len(channels) / (len(channels) - 1.0))
+    white, total, rows = np.zeros(stacked.shape[2]), np.zeros(stacked.shape[2]), 0
+    for start, stop in runs:
+        for one in apart[:, start:stop]:
+            white += difference_variance(time[start:stop], one) * (stop - start)
+            total += (one**2).sum(axis=0)
+        rows += (stop - start) * len(channels)
+    return ChannelNoise(white / rows, total / rows)
+
+
+_STRETCH: Final = 4.0  # s; lines a quarter of a hertz apart
+_FEWEST: Final = 32  # samples
+_BINS: Final = 120
+# Share of a signal's power: that of noise of a thousandth of its amplitude.
+_NO_POWER: Final = 1e-6
+# Share of half the sampling rate: filters against aliases usually cut at 0.8 of it.
+_LOW_PASSED: Final = 0.75
+
+
+class Spectrum(NamedTuple):
+    """Amplitude spectral density.
+
+    Attributes:
+        frequency: (f,) [Hz], above zero and evenly spread on a logarithmic axis.
+        density: (f, c) [unit of the signals per √Hz].
+    """
+
+    frequency: Array
+    density: Array
+
+
+def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:
+    """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s].
+
+    As few points as a logarithmic figure shows. Uneven samples are interpolated at their median
+    interval; f is 0 where there are too few.
+    """
+    frequency, power = _power(time, signals, segments, "hann")
+    if not frequency.size:
+        return Spectrum(frequency, power)
+    edges = np.geomspace(frequency[0], frequency[-1], _BINS + 1)
+    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _BINS - 1)
+    starts = np.flatnonzero(np.diff(bins, prepend=-1))
+    counts = np.diff(starts, append=len(bins))
+    mean_power = np.add.reduceat(power, starts, axis=0) / counts[:, None]
+    return Spectrum(np.add.reduceat(frequency, starts) / counts, np.sqrt(mean_power))
+
+
+def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
+    """Return the frequency [Hz] above which signals (m, c) have no power, not even that of noise.
+
+    A measured signal has noise up to half its sampling rate, unless it came through a low-pass.
+    None where any of the signals has some, or where there are too few samples.
+    """
+    frequency, power = _power(time, signals, segments, "blackmanharris")
+    power = power[:, power.sum(axis=0) > 0.0]
+    if not power.size:
+        return None
+    above = np.cumsum(power[::-1], axis=0)[::-1]
+    silent = np.all(above < _NO_POWER * above[0], axis=1)
+    found = float(frequency[np.argmax(silent)])
+    return found if silent.any() and found < _LOW_PASSED * frequency[-1] else None
+
+
+def _power(
+    time: Array, signals: Array, segments: Sequence[slice], window: str
+) -> tuple[Array, Array]:
+    """Frequencies (f,) above zero, and the power spectral density at each (f, c)."""
+    longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
+    time, signals = time[longest], signals[longest]
+    if time.size < _FEWEST:
+        return np.empty(0), np.empty((0, signals.shape[1]))
+    interval = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1], interval)
+    resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
+    length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
+    frequency, power = scipy.signal.welch(
+        resampled, fs=1.0 / interval, window=window, nperseg=length, axis=0
+    )
+    # The mean is no part of it, and its line has what detrending left.
+    return frequency[1:], power[1:]

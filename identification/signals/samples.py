@@ -12,7 +12,6 @@ from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.signals.butterworth import butterworth_motion, choose_cutoff
-from identification.signals.low_passes import SMOOTHER, LowPassShape, low_passed
 from identification.signals.masks import (
     REVERSAL_PERIODS,
     SHORTEST_STRETCH,
@@ -22,7 +21,12 @@ from identification.signals.masks import (
 )
 from identification.signals.noise import difference_variance
 from identification.signals.recording import Recording, RecordingError
-from identification.signals.smoothing import fit_smoothing_spline
+from identification.signals.smoothing import (
+    SMOOTHER,
+    LowPassShape,
+    fit_smoothing_spline,
+    low_passed,
+)
 
 Array = NDArray[np.float64]
 

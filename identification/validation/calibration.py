@@ -41,7 +41,7 @@ from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
 from identification.signals.masks import SATURATED, TORN
 from identification.signals.samples import Samples
-from identification.validation.residual_blocks import BLOCK, FEWEST_BLOCKS, block_index
+from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_index
 
 Array = NDArray[np.float64]
 

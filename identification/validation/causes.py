@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.model.motion import Motion
-from identification.model.regressor import RegressorPlan
+from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
 from identification.model.robot import RobotModel
-from identification.model.wrench import LINK_SYMBOLS
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]

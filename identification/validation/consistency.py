@@ -19,13 +19,13 @@ from identification.estimators.consistent import (
     Consistency,
     ConsistentEstimate,
     consistent_estimate,
+    link_parameters,
 )
-from identification.estimators.consistent_program import link_parameters
 from identification.factor.factor import Estimate, Factor
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.selection.essential_choice import relative_error
-from identification.validation.findings.finding import joined
+from identification.selection.essential import relative_error
+from identification.validation.finding import joined
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
+from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
-from identification.estimators.repetitions import RepeatedEstimate
 from identification.excitation.criteria import (
     coupling_index,
     coupling_index_max,
@@ -21,14 +21,13 @@ from identification.excitation.criteria import (
 )
 from identification.factor.factor import Estimate, Factor, total
 from identification.factor.standard_gram import StandardGram, gravity_loads, solve, squared_errors
+from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
-from identification.model.wrench import LINK_SYMBOLS
+from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
-from identification.signals.spectrum import noiseless_above
 from identification.validation.causes import Causes, find_causes
-from identification.validation.findings.finding import Finding
-from identification.validation.inertia_ratio import InertiaRatio
-from identification.validation.nominal_scale import NominalScale
+from identification.validation.finding import Finding, Thresholds
+from identification.validation.nominal_scale import InertiaRatio, NominalScale
 from identification.validation.plausibility import Implausible, implausibilities
 from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
@@ -38,8 +37,7 @@ from identification.validation.prediction import (
     residual,
     slow_error,
 )
-from identification.validation.residual_checks import ResidualChecks, check_residuals
-from identification.validation.thresholds import Thresholds
+from identification.validation.residuals import ResidualChecks, check_residuals
 
 # Whether recordings make more sense with gravity pulling another way than declared.
 #

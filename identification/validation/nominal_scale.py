@@ -8,21 +8,21 @@ of per cent, and so are rotor inertias of which nobody knows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError
-from identification.estimators.nominal_prior import NOMINAL_SHARE
+from identification.errors import IdentificationError, ShapeError
+from identification.estimators.prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
+
 
 _BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the standard deviation
 # What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
@@ -33,9 +33,6 @@ _WIDEST: Final = 0.5  # a tolerance, as a share of the scale, above which an axi
 # simulated UR5 whose links were off by up to 10 % each no scale was off by more than 7 %.
 _LINKS_APART: Final = 0.05
 _SURE: Final = 2.0  # standard deviations
-# No arm's links are wrong by that much in a description in use: it is a unit, or torques of the
-# motors mistaken for those of the joints (gears turn 30 to 200 times).
-_IMPOSSIBLE: Final = 10.0
 _OTHER_UNIT: Final = 3.0
 
 
@@ -44,13 +41,11 @@ class NominalScale:
     """Measured over nominal torque, n axes.
 
     Attributes:
-        joint_names: (n,).
         scale: (n,), NaN for an axis on which the nominal torque carries too little.
         tolerance: what is no wonder in it (n,): half a 95 % interval, and what a wrong nominal
             torque and a friction that its law does not describe may do; infinite likewise.
     """
 
-    joint_names: tuple[str, ...]
     scale: Array
     tolerance: Array
 
@@ -87,41 +82,11 @@ class NominalScale:
         enough = np.count_nonzero(known) >= min(2, len(known))
         return bool(enough and np.all(self.scale[known] + self.tolerance[known] < 0.0))
 
-    def findings(self) -> list[Finding]:
-        """What a verdict says: the axes that are off; nothing where none is."""
-        if self.negated:
-            known = np.flatnonzero(np.isfinite(self.scale))
-            figures = [f"{self.joint_names[j]} {self.scale[j]:.2g}" for j in known]
-            return [
-                Finding(
-                    "direction of axes",
-                    "wrong",
-                    "all torques seem to have the other sign: over that of the nominal inertias"
-                    f" they are {joined(figures)}",
-                    "give the torques of the column map scale = -1, or all torque constants the"
-                    " other sign",
-                )
-            ]
-        common = self.common
-        off = self.off if common == 1.0 else np.flatnonzero(np.isfinite(self.scale))
-        if not off.size:
-            return []
-        figures = [
-            f"{self.joint_names[j]} {self.scale[j]:.3g} ± {self.tolerance[j]:.2g}" for j in off
-        ]
-        names = [self.joint_names[j] for j in off]
-        step = f"check torque constant and gear ratio of {joined(names)}, and the payload"
-        if common != 1.0:
-            step = "check the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
-        return [
-            Finding(
-                "scale of the torque",
-                "wrong" if abs(np.log(common)) > np.log(_IMPOSSIBLE) else "doubtful",
-                "the torque is not as large as the nominal inertias ask for, by a factor: "
-                + joined(figures),
-                f"{step}, and the masses of the URDF",
-            )
-        ]
+    def without(self, joints: Iterable[int]) -> NominalScale:
+        """The same with nothing said of some axes."""
+        scale = self.scale.copy()
+        scale[sorted(set(joints))] = np.nan
+        return NominalScale(scale, self.tolerance)
 
 
 def nominal_scale(
@@ -164,7 +129,7 @@ def nominal_scale(
         scale[joint], tolerance[joint] = _scale(
             np.concatenate(tables), np.concatenate(torques), share
         )
-    return NominalScale(model.joint_names, scale, tolerance)
+    return NominalScale(scale, tolerance)
 
 
 def _turning(model: RobotModel, joint: int) -> list[int]:
@@ -205,3 +170,63 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
     known = tolerance < _WIDEST * max(1.0, abs(scale))
     return (scale, float(tolerance)) if known else (np.nan, np.inf)
+
+
+class InertiaRatio(NamedTuple):
+    """Controller's over identified inertia of each joint, rotors included, on the joint side.
+
+    Attributes:
+        ratio: median over the postures (n,); NaN where the controller sends zero, or where the
+            data leave the model's own inertia open.
+        spread: standard deviation over the postures of the ratio (n,), NaN likewise.
+    """
+
+    ratio: Array
+    spread: Array
+
+
+def diagonal_inertia(model: RobotModel, values: Array, position: Array) -> Array:
+    """Diagonal of the inertia matrix, rotors included, at positions (m, n): (m, n) [kg·m² or kg].
+
+    From the base parameters (p,): the torque that one joint's acceleration alone takes, which is
+    the same for all standard parameters behind them.
+    """
+    n = model.n_joints
+    if position.ndim != 2 or position.shape[1] != n:
+        raise ShapeError("position", position.shape, f"(m, {n})")
+    rigid = values.copy()
+    rigid[model.base.rank :] = 0.0
+    still = np.zeros_like(position)
+    rest = model.torque(rigid, position, still, still)
+    result = np.empty_like(position)
+    for joint in range(n):
+        acceleration = still.copy()
+        acceleration[:, joint] = 1.0
+        result[:, joint] = (model.torque(rigid, position, still, acceleration) - rest)[:, joint]
+    return result
+
+
+def inertia_ratio(
+    model: RobotModel, values: Array, position: Array, theirs: Array
+) -> InertiaRatio | None:
+    """Compare the controller's diagonal inertia (m, n) at positions (m, n) with the model's.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        position: of the joints [rad or m].
+        theirs: joint side [kg·m² or kg]; zero where the controller sends nothing.
+
+    Returns:
+        None where there is nothing to compare.
+    """
+    if not np.any(theirs):
+        return None
+    ours = diagonal_inertia(model, values, position)
+    known = (ours > 0.0) & (theirs > 0.0)
+    ratio = np.where(known, theirs, np.nan) / np.where(known, ours, 1.0)
+    whole = known.mean(axis=0) > 0.9
+    median, spread = np.full(model.n_joints, np.nan), np.full(model.n_joints, np.nan)
+    median[whole] = np.nanmedian(ratio[:, whole], axis=0)
+    spread[whole] = np.nanstd(ratio[:, whole], axis=0)
+    return InertiaRatio(median, spread)

@@ -11,7 +11,6 @@ clock's, and is subtracted before it is judged.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.signals.recording import GAP_STEPS, Recording
-from identification.validation.findings.finding import Finding, joined
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -32,7 +30,6 @@ _BEYOND_USUAL: Final = 3.0
 # Acceleration that turns a joint's speed within one step of the clock; robots reach a fifth of it.
 _FASTEST: Final = 150.0  # rad/s² or m/s²
 _BESIDE: Final = 4  # steps to either side
-_SHOWN: Final = 3
 # Standard deviations that other joints must move in a step to show that a row is missing.
 _SHOWS: Final = 5.0
 # Departures of whole steps of motion are sought to this share of one.
@@ -138,25 +135,3 @@ def _lasts(departure: Array, at: int) -> bool:
     """Whether the steps that follow and precede do not take it back."""
     around = departure[max(0, at - _BESIDE) : at + _BESIDE + 1]
     return bool(np.abs(around.sum()) > 0.5 * np.abs(departure[at]))
-
-
-def jump_findings(jumps: Sequence[PositionJump]) -> list[Finding]:
-    """What a verdict says of jumps: nothing where there are none."""
-    if not jumps:
-        return []
-    names = tuple(dict.fromkeys(jump.joint for jump in jumps))
-    largest = sorted(jumps, key=lambda jump: -abs(jump.size))
-    where = [
-        f"{jump.joint} by {jump.size:+.3g} after {jump.time:.3f} s of {jump.recording}"
-        for jump in largest
-    ]
-    return [
-        Finding(
-            "position jumps",
-            "wrong",
-            "the measured position jumped where no arm can follow (rad or m): "
-            + joined(where, _SHOWN),
-            f"look at encoder, coupling and cable of {joined(names)}, and record again; or leave"
-            " out what was recorded after the jump",
-        )
-    ]

@@ -9,43 +9,10 @@ from itertools import chain
 import numpy as np
 
 from identification.validation.evidence import Evidence
-from identification.validation.findings import causes, errors, model, outside, residual
-from identification.validation.findings.finding import Finding
-from identification.validation.thresholds import Thresholds
+from identification.validation.finding import Finding, Thresholds
+from identification.validation.findings import CHECKS, Case
 
 __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
-
-# In the order in which reasons are given: the first one stands in the verdict's line.
-_CHECKS = (
-    errors.untested,
-    outside.jumps,
-    model.determined,
-    causes.outliers,
-    causes.gravity,
-    causes.causes,
-    outside.scale,
-    causes.load,
-    causes.friction_change,
-    model.plausible,
-    errors.size,
-    errors.unexplained,
-    errors.explained,
-    errors.growth,
-    model.systematic,
-    model.consistent,
-    errors.nominal,
-    errors.controller,
-    outside.inertia,
-    model.delay,
-    outside.mended,
-    residual.saturation,
-    residual.noise,
-    residual.over_speed,
-    residual.over_position,
-    residual.over_motor_angle,
-    residual.over_time,
-)
-
 
 # What is smaller would be shown as nothing.
 _SHOWN = 0.0005
@@ -92,9 +59,8 @@ def judge(
         tested_on: what the held-out motion was, in words.
     """
     evidence = replace(evidence, tested_on=tested_on)
-    findings = tuple(
-        chain.from_iterable(check(joint_names, evidence, thresholds) for check in _CHECKS)
-    )
+    case = Case(joint_names, evidence, thresholds)
+    findings = tuple(chain.from_iterable(check(case) for check in CHECKS))
     wrong = [finding for finding in findings if finding.level == "wrong"]
     doubtful = [finding for finding in findings if finding.level == "doubtful"]
     measure = _measure(joint_names, evidence)

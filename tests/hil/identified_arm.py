@@ -19,7 +19,7 @@ from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
-from identification.selection.essential_choice import EssentialChoice
+from identification.selection.essential import EssentialChoice
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 

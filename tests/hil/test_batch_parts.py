@@ -35,8 +35,8 @@ from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.identify.settings import Settings
 from identification.estimators.shrinkage import Shrinkage
 from identification.selection.inner_prediction import Choice
-from identification.signals.low_passes import LowPassShape
 from identification.signals.samples import Preprocessing
+from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
 
 KEY = "0123456789abcdef"

@@ -16,7 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimators.instrument_motion import Instruments
+from identification.estimators.instrumental import Instruments
 from identification.model.elements import JointElements
 from identification.model.friction import FrictionTerm
 from identification.model.kinematics import FROM_PINOCCHIO, Chain
@@ -66,7 +66,7 @@ def simulated_motion(
         values: its parameters (p,), an earlier estimate.
         servo: of all joints.
         command: what it follows, without gaps, in the rows the result is to have: see
-            :func:`identification.estimators.instrument_motion.planned_motion`, without lag.
+            :func:`identification.estimators.instrumental.planned_motion`, without lag.
 
     Raises:
         ShapeError: arrays of other shapes than the model's.

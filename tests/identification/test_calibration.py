@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask

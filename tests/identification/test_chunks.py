@@ -17,8 +17,7 @@ from identification.estimators.consistent import consistent_estimate
 from identification.estimators.instrumental import estimate_instrumental
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
-from identification.estimators.nominal_prior import nominal_prior
-from identification.estimators.prior import fit_with_prior
+from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from identification.estimators.consistent_program import Cone, Smooth, follow_path, polish
+from identification.estimators.consistent import Cone, Smooth, follow_path, polish
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from identification.estimators.covariance import (
     spread,
     with_block_covariance,
 )
-from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, estimate, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.signals.samples import Samples

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimators.delay_compensation import (
+from identification.estimators.delay import (
     compensate,
     delay_sensitivity,
     rate_products,

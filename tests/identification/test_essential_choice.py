@@ -15,8 +15,7 @@ from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.selection.essential import CutRule, eliminate
-from identification.selection.essential_choice import choose_essential, relative_error
+from identification.selection.essential import CutRule, choose_essential, eliminate, relative_error
 from identification.signals.samples import Samples
 from identification.validation.prediction import over_all, prediction_error
 from tests.identification.test_essential import (

@@ -18,9 +18,9 @@ from identification.selection.inner_prediction import (
     Settings,
     choose_settings,
 )
-from identification.signals.low_passes import LowPassShape, low_passed
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.smoothing import LowPassShape, low_passed
 from tests.identification.two_link import MODEL, a_motion, truth
 
 CAUSAL = LowPassShape(order=2, causal=True)

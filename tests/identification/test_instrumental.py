@@ -13,11 +13,12 @@ from scipy.signal import lfilter
 
 from identification.errors import IdentificationError, ShapeError
 from identification.estimators import instrument_motion
-from identification.estimators.instrument_motion import planned_motion, same_plan
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
     estimate_instrumental,
     partial_r2,
+    planned_motion,
+    same_plan,
 )
 from identification.factor.factor import Factor
 from identification.factor.phases import PhaseFactor, instrument_factor, measured_part

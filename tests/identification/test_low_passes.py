@@ -13,9 +13,9 @@ from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Question, Settings, choose_settings
-from identification.signals.low_passes import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
 from tests.identification.two_link import MODEL, NOISE, a_motion, truth
 
 Array = NDArray[np.float64]

@@ -1,21 +1,32 @@
-"""A wrong torque constant shows beside the nominal inertias, and nowhere else."""
+"""A wrong torque constant shows beside the nominal inertias, or the controller's own."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
 from identification import RobotModel
 from identification.model.friction import FrictionLaw
 from identification.signals.samples import Samples
-from identification.validation.nominal_scale import nominal_scale
+from identification.validation.evidence import Surroundings
+from identification.validation.finding import Finding, Thresholds
+from identification.validation.findings import Case, inertia, scale
+from identification.validation.nominal_scale import diagonal_inertia, inertia_ratio, nominal_scale
 from tests.hil.identified_arm import a_motion, packaged_urdf
 
 Array = NDArray[np.float64]
 AXES = range(1, 4)  # of the UR5, whose weight and inertia stand out of their friction
+
+
+def findings(check, model: RobotModel, **surroundings) -> list[Finding]:
+    """What one check says of these surroundings alone."""
+    evidence = SimpleNamespace(causes=None, surroundings=Surroundings(**surroundings))
+    return list(check(Case(model.joint_names, evidence, Thresholds())))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +77,7 @@ def nominal(model: RobotModel) -> Array:
 def test_links_that_are_off_by_a_tenth_raise_no_doubt(model: RobotModel, seed: int) -> None:
     found = nominal_scale(model, nominal(model), runs(model, standard(model, 0.1, seed), seed))
     assert np.isfinite(found.scale[2])
-    assert found.findings() == []
+    assert findings(scale, model, nominal_scale=found) == []
 
 
 @pytest.mark.parametrize("axis", AXES)
@@ -82,7 +93,7 @@ def test_a_wrong_torque_constant_is_told_by_axis_and_factor(
     found = nominal_scale(model, nominal(model), scaled)
     assert found.off.tolist() == [axis]
     assert found.scale[axis] == pytest.approx(factor, rel=0.1)
-    (finding,) = found.findings()
+    (finding,) = findings(scale, model, nominal_scale=found)
     name = model.joint_names[axis]
     assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
 
@@ -90,7 +101,7 @@ def test_a_wrong_torque_constant_is_told_by_axis_and_factor(
 def test_of_a_urdf_without_masses_nothing_is_said(model: RobotModel) -> None:
     zero = np.zeros(model.n_parameters)
     found = nominal_scale(model, zero, runs(model, standard(model, 0.0, 1), 1))
-    assert np.isnan(found.scale).all() and found.findings() == []
+    assert np.isnan(found.scale).all() and findings(scale, model, nominal_scale=found) == []
 
 
 @pytest.mark.parametrize("factor", [0.01, 1000.0])
@@ -100,13 +111,56 @@ def test_torques_of_another_unit_or_of_the_motors_leave_no_model_to_rely_on(
     scaled = [
         replace(run, torque=factor * run.torque) for run in runs(model, standard(model, 0.05, 1), 1)
     ]
-    (finding,) = nominal_scale(model, nominal(model), scaled).findings()
+    (finding,) = findings(scale, model, nominal_scale=nominal_scale(model, nominal(model), scaled))
     assert finding.level == "wrong"
     assert "unit" in finding.next_step and "side" in finding.next_step
 
 
 def test_all_torques_negated_are_one_finding(model: RobotModel) -> None:
     negated = [replace(run, torque=-run.torque) for run in runs(model, standard(model, 0.05, 1), 1)]
-    (finding,) = nominal_scale(model, nominal(model), negated).findings()
+    found = nominal_scale(model, nominal(model), negated)
+    (finding,) = findings(scale, model, nominal_scale=found)
     assert (finding.check, finding.level) == ("direction of axes", "wrong")
     assert "all torques seem to have the other sign" in finding.words
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[RobotModel, Array, Array, Array]:
+    """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
+    urdf = packaged_urdf("ur5_robot.urdf")
+    model = RobotModel.from_urdf(urdf)
+    standard = model.nominal.copy()
+    standard[model.layout.rotors] = 0.2
+    friction = np.full(model.n_parameters - model.base.rank, 3.0)
+    values = np.concatenate([model.base.grouping @ standard, friction])
+    position = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 6))
+    reference = pin.buildModelFromXML(urdf)
+    data = reference.createData()
+    diagonal = np.array([np.diag(pin.crba(reference, data, q)) for q in position]) + 0.2
+    return model, values, position, diagonal
+
+
+def test_the_diagonal_is_that_of_the_composite_rigid_body_algorithm(
+    arm: tuple[RobotModel, Array, Array, Array],
+) -> None:
+    model, values, position, diagonal = arm
+    np.testing.assert_allclose(diagonal_inertia(model, values, position), diagonal, rtol=1e-9)
+
+
+def test_a_joint_that_is_off_is_named_and_a_silent_one_is_not(
+    arm: tuple[RobotModel, Array, Array, Array],
+) -> None:
+    model, values, position, diagonal = arm
+    theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
+    found = inertia_ratio(model, values, position, theirs)
+    assert found is not None
+    np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
+    np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
+    (finding,) = findings(inertia, model, controller_inertia=found)
+    assert finding.level == "doubtful"
+    assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
+
+
+def test_zeros_are_no_inertia(arm: tuple[RobotModel, Array, Array, Array]) -> None:
+    model, values, position, diagonal = arm
+    assert inertia_ratio(model, values, position, 0.0 * diagonal) is None

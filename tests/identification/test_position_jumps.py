@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from identification import Recording
-from identification.validation.position_jumps import jump_findings, position_jumps
+from identification.validation.evidence import Surroundings
+from identification.validation.finding import Thresholds
+from identification.validation.findings import Case, jumps
+from identification.validation.position_jumps import position_jumps
 
 
 def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:
@@ -31,7 +36,8 @@ def test_a_lasting_jump_is_named_with_its_joint_time_and_size(rate: float, size:
     assert (jump.recording, jump.joint) == ("log.mcap", "knee")
     assert jump.time == pytest.approx(one.time[at] - one.time[0])
     assert jump.size == pytest.approx(size, abs=2e-3)
-    (finding,) = jump_findings([jump])
+    evidence = SimpleNamespace(surroundings=Surroundings(jumps=(jump,)))
+    (finding,) = jumps(Case(("hip", "knee"), evidence, Thresholds()))
     assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
 
 
@@ -39,7 +45,6 @@ def test_a_lasting_jump_is_named_with_its_joint_time_and_size(rate: float, size:
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_motion_with_an_uneven_clock_has_none(rate: float, jitter: float) -> None:
     assert position_jumps(recording(rate, jitter=jitter, seed=3)) == []
-    assert jump_findings([]) == []
 
 
 def test_a_sudden_stop_is_none() -> None:

@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimators.nominal_prior import nominal_prior
-from identification.estimators.prior import LEARNED, GaussianPrior, fit_with_prior, with_prior
+from identification.estimators.prior import (
+    LEARNED,
+    GaussianPrior,
+    fit_with_prior,
+    nominal_prior,
+    with_prior,
+)
 from identification.factor.factor import Factor, QRFactor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification.signals.recording import Recording
-from identification.signals.repeats import offsets_of_repetitions
+from identification.signals.recording import Recording, offsets_of_repetitions
 
 STEP = 2e-3
 

@@ -5,9 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.signals.noise import standstill_variance
+from identification.signals.noise import repetition_noise, standstill_variance
 from identification.signals.recording import Recording
-from identification.signals.repetition_noise import repetition_noise
 
 Array = NDArray[np.float64]
 STEP = 1e-3

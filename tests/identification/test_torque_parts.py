@@ -14,9 +14,9 @@ from identification.model.elements import TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.low_passes import LowPassShape, low_passed
+from identification.signals.noise import noiseless_above, spectrum
 from identification.signals.samples import Samples
-from identification.signals.spectrum import noiseless_above, spectrum
+from identification.signals.smoothing import LowPassShape, low_passed
 
 Array = NDArray[np.float64]
 

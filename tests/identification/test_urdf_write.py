@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.export.urdf import NotConsistentError, WriteBackError, write_urdf
-from identification.export.xml_source import Element, XmlSource
+from identification.export.urdf import (
+    Element,
+    NotConsistentError,
+    WriteBackError,
+    XmlSource,
+    write_urdf,
+)
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import robot_text, some_bodies
 

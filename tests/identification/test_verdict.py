@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
-from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Estimate
 from identification.model.motion import Motion
 from identification.model.payload import Payload

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification.estimators.delay import DelayEstimate, estimate_delays
-from identification.estimators.delay_compensation import rate_products, with_uncertain_delay
+from identification.estimators.delay import (
+    DelayEstimate,
+    estimate_delays,
+    rate_products,
+    with_uncertain_delay,
+)
 from identification.estimators.least_squares import fit_least_squares
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw

@@ -16,7 +16,7 @@ from hil.campaign.plan import CampaignPlan
 from hil.campaign.run import RunResult
 from hil.cell import Cell
 from identification import RobotModel, Samples
-from identification.estimators.repetitions import RepeatedEstimate
+from identification.estimators.least_squares import RepeatedEstimate
 from sim_fixtures import ControllerSettings
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from identification import IdentificationError
-from identification.estimators.repetitions import estimate_repetitions
+from identification.estimators.least_squares import estimate_repetitions
 from sim_fixtures.settings import WHILE_SILENT
 from tests.simulate.drawing import Story, draw_script
 from tests.simulate.observed import Estimated, Life, Observed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +18,19 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.residual_blocks import FEWEST_BLOCKS, BlockSums
-from identification.validation.residual_checks import (
+from identification.validation.finding import Thresholds
+from identification.validation.findings import Case, over_motor_angle, over_time
+from identification.validation.residuals import (
+    FEWEST_BLOCKS,
     HARMONICS,
+    BlockMean,
+    FrictionDrift,
     ResidualChecks,
+    Ripple,
     autocorrelation,
+    block_mean,
     check_residuals,
+    find_outliers,
 )
 
 Array = NDArray[np.float64]
@@ -157,7 +165,7 @@ def test_friction_that_falls_from_run_to_run_is_found_with_its_size(
         return np.asarray(change * model.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
 
     drift = checked(model, cooling, noise=0.1).drift
-    assert drift is not None and drift.pieces == 15
+    assert drift is not None and len(drift.share) == 15
     assert drift.significant.tolist() == [False, True]
     assert drift.change[1] == pytest.approx(-0.08, abs=4.0 * drift.change_std[1])
     assert drift.change_std[1] < 0.02
@@ -165,7 +173,7 @@ def test_friction_that_falls_from_run_to_run_is_found_with_its_size(
 
 def test_one_recording_is_cut_so_that_drift_can_be_seen(model: RobotModel) -> None:
     drift = check_residuals(model, values_of(model), [a_run(model, 1, duration=30.0)]).drift
-    assert drift is not None and drift.pieces >= 4
+    assert drift is not None and len(drift.share) >= 4
 
 
 def test_no_recording_is_an_error(model: RobotModel) -> None:
@@ -216,11 +224,8 @@ def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not()
     inside, naive = 0, 0
     for seed in range(seeds):
         noise = coloured(np.random.default_rng(seed), (blocks * per_block,))
-        sums = BlockSums(
-            noise.reshape(blocks, per_block).sum(axis=1, keepdims=True),
-            np.full((blocks, 1), float(per_block)),
-        )
-        found = sums.mean()
+        sums = noise.reshape(blocks, per_block).sum(axis=1, keepdims=True)
+        found = block_mean([np.array([sums, np.full((blocks, 1), float(per_block))])])
         inside += abs(found.mean[0]) < 1.96 * found.std[0]
         naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
     assert 0.90 < inside / seeds < 0.98
@@ -229,15 +234,111 @@ def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not()
 
 def test_repetitions_of_one_motion_do_not_make_its_errors_more_certain() -> None:
     rng = np.random.default_rng(3)
-    repeated = BlockSums(rng.standard_normal((40, 1)), np.ones((40, 1)))
-    once = repeated.mean()
-    thrice = repeated.plus(repeated, same_motion=True).plus(repeated, same_motion=True).mean()
-    other = repeated.plus(repeated, same_motion=False).plus(repeated, same_motion=False).mean()
+    motion = np.array([rng.standard_normal((40, 1)), np.ones((40, 1))])
+    once, thrice = block_mean([motion]), block_mean([motion] * 3, repeated=3)
+    other = block_mean([motion] * 3)
     assert thrice.mean[0] == pytest.approx(once.mean[0])
     assert thrice.std[0] == pytest.approx(once.std[0])
     assert other.std[0] == pytest.approx(once.std[0] / np.sqrt(3.0), rel=0.02)
 
 
 def test_too_few_blocks_give_no_mean() -> None:
-    few = BlockSums(np.ones((FEWEST_BLOCKS - 1, 1)), np.ones((FEWEST_BLOCKS - 1, 1)))
-    assert np.isnan(few.mean().mean).all()
+    assert np.isnan(block_mean([np.ones((2, FEWEST_BLOCKS - 1, 1))]).mean).all()
+
+
+def test_planted_spikes_are_counted_and_taken_off() -> None:
+    random = np.random.default_rng(5)
+    torque, residual = 10.0 * random.standard_normal((2, 5000, 2))
+    residual *= 0.01
+    hit = random.permutation(5000)[:25]
+    residual[hit, 1] += 20.0
+    usable = np.ones((5000, 2), dtype=np.bool_)
+    usable[hit[:5], 1] = False  # what does not count is no outlier
+    found = find_outliers(torque, residual, usable)
+    np.testing.assert_allclose(found.share, [0.0, 20 / 4995])
+    assert found.power[0] == 0.0 and found.power[1] > 0.9
+    np.testing.assert_allclose(found.without.rms, [0.1, 0.1], rtol=0.05)
+    assert found.without.rows.tolist() == [5000, 4975]
+
+
+def test_noise_of_any_size_has_none() -> None:
+    noise = np.random.default_rng(6).standard_normal((20000, 3)) * [1e-6, 1.0, 1e6]
+    found = find_outliers(noise, noise, np.ones(noise.shape, dtype=np.bool_))
+    np.testing.assert_array_equal(found.share, 0.0)
+
+
+NAMES = ("shoulder", "elbow")
+LIMIT = Thresholds()
+TORQUE = np.array([10.0, 10.0])
+
+
+def evidence(ripple=None, drift=None, friction_share=1.0) -> SimpleNamespace:
+    checks = SimpleNamespace(
+        ripple=ripple,
+        drift=drift,
+        friction_share=friction_share,
+        rms=0.05 * TORQUE,
+        torque_rms=TORQUE,
+        share=lambda size: size / TORQUE,
+    )
+    return SimpleNamespace(residuals=checks)
+
+
+def ripple(share: float) -> Ripple:
+    """Of the elbow's torque, four times per motor turn."""
+    mean = np.zeros((2, len(HARMONICS), 2))
+    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * share * TORQUE[1]
+    std = np.full_like(mean, 1e-6)
+    return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
+
+
+def drift(*change: float) -> FrictionDrift:
+    """From the first of ten pieces to the last; the scatter is small."""
+    total = np.array(change)
+    return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
+
+
+@pytest.mark.parametrize("look", [over_motor_angle, over_time])
+def test_what_was_not_looked_at_is_not_spoken_of(look):
+    assert list(look(Case(NAMES, evidence(), LIMIT))) == []
+    assert list(look(Case(NAMES, SimpleNamespace(residuals=None), LIMIT))) == []
+
+
+class TestRipple:
+    def found(self, share: float):
+        [finding] = over_motor_angle(Case(NAMES, evidence(ripple(share)), LIMIT))
+        return finding
+
+    def test_none_is_good(self):
+        assert self.found(0.0).level == "good"
+
+    def test_a_small_one_is_usual_and_a_large_one_a_doubt(self):
+        assert self.found(0.9 * LIMIT.ripple).level == "information"
+        large = self.found(1.1 * LIMIT.ripple)
+        assert large.level == "doubtful"
+        assert "elbow (4 per motor turn, 3.3% of its torque)" in large.words
+        assert "shoulder" not in large.words
+
+
+class TestDrift:
+    def found(self, *change: float, share=1.0):
+        [finding] = over_time(
+            Case(NAMES, evidence(drift=drift(*change), friction_share=share), LIMIT)
+        )
+        return finding
+
+    def test_none_that_stands_out_is_good(self):
+        assert self.found(1e-5, -1e-5).level == "good"
+
+    def test_one_that_is_little_torque_is_mentioned(self):
+        little = self.found(0.02, 0.0)
+        assert little.level == "information"
+        assert "shoulder by 2.0% up; that is at most 2.0% of an axis's torque" in little.words
+        weighted = self.found(0.1, 0.0, share=np.array([0.2, 1.0]))
+        assert weighted.level == "information"
+        assert "at most 2.0%" in weighted.words
+
+    def test_a_large_one_is_a_doubt_and_named_with_its_direction(self):
+        large = self.found(0.02, -0.2)
+        assert (large.level, large.role) == ("doubtful", "cause")
+        assert large.words.endswith("elbow by 20.0% down")

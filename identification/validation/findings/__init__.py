@@ -1,1 +1,0 @@
-"""Findings of a verdict: what was checked, what was found, what to do."""

@@ -1,0 +1,506 @@
+"""What is left over, looked at from all sides: is it noise, and if not, what does it follow?
+
+A check gives its size as a share of the torque and whether it stands out of noise. Both matter: of
+a long recording the smallest error is significant, and of a short one a large one may be chance.
+
+What a torque model leaves over is correlated over tenths of a second: a thousand samples of one
+move say about as much as one number. Means are therefore judged by how much they differ from
+block to block of time, not from sample to sample (cluster-robust, Liang and Zeger 1986), which
+assumes nothing about what happens inside a block. Repetitions of one motion share their blocks:
+an error that repeats with the motion is not confirmed by being repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.distributions import student_limit
+from identification.errors import IdentificationError
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+from identification.validation.prediction import PredictionError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Rows = NDArray[np.bool_]
+
+# Errors of a model come and go with the moves of the arm.
+BLOCK: Final = 0.5  # s
+# A mean over fewer blocks has no standard error worth the name.
+FEWEST_BLOCKS: Final = 5
+BINS: Final = 12
+# Chance that a joint without any such error is mistaken for one with it, over all its bins.
+CHANCE: Final = 0.001
+# Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors beyond.
+HARMONICS: Final = (1, 2, 3, 4, 6)
+# Of the worst of five: about one chance in a thousand, with an amplitude of two components.
+_SIGMAS: Final = 4.1
+# A trend through fewer points is none.
+FEWEST_PIECES: Final = 4
+# Pieces in all: fewer leave the trend's own scatter too uncertain.
+_PIECES: Final = 12
+# Median absolute deviations, as standard deviations of a normal distribution: beyond six lies one
+# sample of 500 million.
+BEYOND: Final = 6.0
+_NORMAL: Final = 1.4826
+# Longer than any move of an arm takes to forget the one before.
+LONGEST_LAG: Final = 0.5  # s
+_MOST_LAGS: Final = 1000
+
+
+class BlockMean(NamedTuple):
+    """Means over blocks of time; every array has the shape of what was averaged.
+
+    Attributes:
+        mean: NaN with fewer than `FEWEST_BLOCKS` blocks.
+        std: standard error, likewise.
+        rows: samples.
+        blocks: blocks with at least one sample.
+    """
+
+    mean: Array
+    std: Array
+    rows: Array
+    blocks: Indices
+
+
+def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
+    """Sum of values over sum of weights of all blocks, and its standard error.
+
+    Args:
+        parts: of each recording by blocks the sums of a quantity, and of what it is divided by (a
+            number of samples, or the power of a regressor): (2, B, ...).
+        repeated: so many recordings, the first ones, are of one motion and share their blocks.
+    """
+    shared = np.zeros((2, max(p.shape[1] for p in parts[:repeated]), *parts[0].shape[2:]))
+    for part in parts[:repeated]:
+        shared[:, : part.shape[1]] += part
+    values, weights = np.concatenate([shared, *parts[repeated:]], axis=1)
+    total, blocks = weights.sum(axis=0), np.count_nonzero(weights, axis=0)
+    enough = blocks >= FEWEST_BLOCKS
+    divisor = np.where(enough, total, 1.0)
+    mean = values.sum(axis=0) / divisor
+    scores = (values - mean * weights) / divisor
+    std = np.sqrt((scores**2).sum(axis=0) * blocks / np.maximum(blocks - 1, 1))
+    return BlockMean(np.where(enough, mean, np.nan), np.where(enough, std, np.nan), total, blocks)
+
+
+def block_index(samples: Samples) -> Indices:
+    """Block of each row (m,), numbered from the beginning of the motion."""
+    since = samples.motion.time - samples.origin
+    return np.maximum(np.floor(since / BLOCK + 1e-9).astype(np.intp), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Mean residual of n joints in K bins of their own speed or position.
+
+    Attributes:
+        edges: of the bins, (n, K + 1) [rad/s, m/s, rad or m].
+        bins: mean and standard error of the residual (n, K) [N·m or N], NaN in a bin that too
+            few blocks of time have seen.
+    """
+
+    edges: Array
+    bins: BlockMean
+
+    @property
+    def centres(self) -> Array:
+        """Middle of each bin (n, K)."""
+        return 0.5 * (self.edges[:, 1:] + self.edges[:, :-1])
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square over the samples of what the bins explain (n,) [N·m or N].
+
+        The standard errors are subtracted, so that noise alone gives about zero.
+        """
+        seen = np.isfinite(self.bins.mean)
+        rows = np.where(seen, self.bins.rows, 0.0)
+        squares = np.where(seen, self.bins.mean**2 - self.bins.std**2, 0.0)
+        total = np.maximum(rows.sum(axis=1), 1.0)
+        return np.asarray(np.sqrt(np.maximum((rows * squares).sum(axis=1) / total, 0.0)))
+
+    @property
+    def significant(self) -> Rows:
+        """Whether some bin of a joint is off by more than chance explains (n,).
+
+        Student's t of the worst bin, at `CHANCE` shared among the bins (Bonferroni).
+        """
+        seen = np.isfinite(self.bins.mean)
+        freedom = np.maximum(self.bins.blocks - 1, 1)
+        limit = student_limit(0.5 * CHANCE / np.maximum(seen.sum(axis=1), 1)[:, None], freedom)
+        return np.asarray((self._certainty > limit).any(axis=1))
+
+    def worst(self, joint: int) -> tuple[float, float]:
+        """Middle of the bin in which a joint's mean residual is most certain, and that residual."""
+        k = int(self._certainty[joint].argmax())
+        return float(self.centres[joint, k]), float(np.nan_to_num(self.bins.mean[joint, k]))
+
+    @property
+    def _certainty(self) -> Array:
+        """Size of each mean in its standard errors (n, K), zero where it is not known."""
+        std = np.nan_to_num(self.bins.std)
+        return np.abs(np.nan_to_num(self.bins.mean)) / np.where(std > 0.0, std, np.inf)
+
+
+def _profile_edges(runs: Sequence[Array], usable: Sequence[Rows]) -> Array:
+    """Edges (n, `BINS` + 1) of equal bins over what each joint did in the rows that count."""
+    values, rows = np.concatenate(runs), np.concatenate(usable)
+    lowest = np.where(rows, values, np.inf).min(axis=0)
+    highest = np.where(rows, values, -np.inf).max(axis=0)
+    moved = np.isfinite(lowest) & (highest > lowest)
+    lowest, highest = np.where(moved, lowest, 0.0), np.where(moved, highest, 1.0)
+    return np.asarray(np.linspace(lowest, highest, BINS + 1, axis=1))
+
+
+def _profile_sums(samples: Samples, residual: Array, over: Array, edges: Array) -> Array:
+    """Sums of a residual (m, n) and of rows by block, joint and bin of `over`: (2, B, n, K)."""
+    block = block_index(samples)
+    n = residual.shape[1]
+    found = np.zeros((2, int(block[-1]) + 1, n, BINS))
+    for joint in range(n):
+        bins = np.searchsorted(edges[joint, 1:-1], over[:, joint], side="right")
+        place, rows = block * BINS + bins, samples.usable[:, joint]
+        for sums, values in zip(found, (residual[:, joint], np.ones(len(rows))), strict=True):
+            some = np.bincount(place, np.where(rows, values, 0.0), len(sums) * BINS)
+            sums[:, joint] = some.reshape(-1, BINS)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Ripple:
+    """Residual of n joints that follows the angle of their motors.
+
+    Attributes:
+        parts: mean cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N].
+    """
+
+    parts: BlockMean
+
+    @property
+    def amplitude(self) -> Array:
+        """Amplitude per joint and harmonic (n, H) [N·m or N], NaN where not seen."""
+        return np.asarray(np.hypot(self.parts.mean[..., 0], self.parts.mean[..., 1]))
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of what all harmonics explain (n,) [N·m or N], noise subtracted."""
+        squares = 0.5 * (self.parts.mean**2 - self.parts.std**2).sum(axis=-1)
+        return np.asarray(np.sqrt(np.maximum(np.nan_to_num(squares).sum(axis=-1), 0.0)))
+
+    @property
+    def significant(self) -> Rows:
+        """Whether some harmonic of a joint stands out (n,)."""
+        std = np.sqrt(np.mean(self.parts.std**2, axis=-1))
+        return np.asarray((np.nan_to_num(self.amplitude) > _SIGMAS * np.nan_to_num(std)).any(-1))
+
+    def strongest(self, joint: int) -> int:
+        """Periods per motor turn of a joint's largest harmonic."""
+        return HARMONICS[int(np.nan_to_num(self.amplitude[joint]).argmax())]
+
+
+def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
+    """Sums of a residual (m, n) times cosine and sine, and of their squares (2, B, n, H, 2).
+
+    The phase is that of the motor's angle about its zero joint angles; the same in every
+    recording, as long as nobody takes the gear apart.
+    """
+    block = block_index(samples)
+    count, n = int(block[-1]) + 1, residual.shape[1]
+    found = np.zeros((2, count, n, len(HARMONICS), 2))
+    motor = samples.motion.position @ motor_from_joint.T
+    for joint in range(n):
+        rows = samples.usable[:, joint]
+        left = residual[rows, joint]
+        for h, harmonic in enumerate(HARMONICS):
+            angle = harmonic * motor[rows, joint]
+            for part, wave in enumerate((np.cos(angle), np.sin(angle))):
+                found[0, :, joint, h, part] = np.bincount(block[rows], left * wave, count)
+                found[1, :, joint, h, part] = np.bincount(block[rows], wave**2, count)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionDrift:
+    """By how much friction was higher than estimated, piece by piece in the order of recording.
+
+    Attributes:
+        share: (P, n), 0.05 for friction 5 % higher; NaN where a joint did not move.
+        change: of a straight line through the pieces from the first to the last (n,).
+        change_std: its standard error from the scatter about the line (n,).
+        freedom: degrees of freedom of that scatter.
+    """
+
+    share: Array
+    change: Array
+    change_std: Array
+    freedom: int
+
+    @property
+    def significant(self) -> Rows:
+        """Whether the trend stands out of the scatter (n,)."""
+        limit = student_limit(0.5 * CHANCE, self.freedom)
+        return np.asarray(np.abs(self.change) > limit * self.change_std)
+
+
+def _drift_sums(samples: Samples, residual: Array, friction: Array, pieces: int) -> Array:
+    """Friction (m, n) times residual, and squared, summed over equal parts (2, pieces, n)."""
+    edges = np.linspace(0, len(residual), pieces + 1).astype(np.intp)[:-1]
+    tables = np.where(samples.usable, [friction * residual, friction**2], 0.0)
+    return np.asarray(np.add.reduceat(tables, edges, axis=1))
+
+
+def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
+    """Trend over all pieces in order; None where they are too few.
+
+    Of several recordings, equal parts are compared with each other: what the friction law gets
+    wrong in one part of a motion is no change of friction.
+    """
+    if not sums:
+        return None
+    product, power = np.concatenate(sums, axis=1)
+    if len(product) < FEWEST_PIECES:
+        return None
+    usual = np.median(power, axis=0)
+    moved = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
+    share = np.where(moved, product / np.where(moved, power, 1.0), np.nan)
+    parts = sums[0].shape[1] if len(sums) >= FEWEST_PIECES else 1
+    freedom = max(len(share) - parts - 1, 1)
+    trends = [
+        _trend(own, weight, parts, freedom) for own, weight in zip(share.T, power.T, strict=True)
+    ]
+    change, std = np.array(trends).T
+    return FrictionDrift(share, change, std, freedom)
+
+
+def _trend(share: Array, weight: Array, parts: int, freedom: int) -> tuple[float, float]:
+    """Rise of a weighted straight line from the first to the last, and its standard error.
+
+    The line is common to all parts of a motion, its level is each part's own.
+    """
+    known = np.isfinite(share)
+    count = int(np.count_nonzero(known))
+    if count < FEWEST_PIECES + parts - 1:
+        return np.nan, np.nan
+    w = np.where(known, weight, 0.0)
+
+    def about_means(values: Array) -> Array:
+        """Values (R parts,) less the weighted mean of their part over the R recordings."""
+        table, own = values.reshape(-1, parts), w.reshape(-1, parts)
+        total = own.sum(axis=0)
+        mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
+        return np.asarray((table - mean).ravel())
+
+    at = about_means(np.linspace(-0.5, 0.5, len(share)))
+    y = about_means(np.where(known, share, 0.0))
+    spread = float(w @ at**2)
+    slope = float(w @ (at * y)) / spread
+    left = np.where(known, y - slope * at, 0.0)
+    scale = count / max(freedom - (len(share) - count), 1)
+    return slope, float(np.sqrt(np.sum((w * at * left) ** 2) / spread**2 * scale))
+
+
+@dataclass(frozen=True, eq=False)
+class Outliers:
+    """Samples of which the residual is beyond `BEYOND` robust deviations of its joint.
+
+    Attributes:
+        share: of the usable samples of each joint (n,).
+        power: their share of the squared residual (n,).
+        without: prediction error of all other samples.
+    """
+
+    share: Array
+    power: Array
+    without: PredictionError
+
+
+def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
+    """Look for outliers in measured torque and residual (m, n) over the rows that count (m, n)."""
+    far = np.zeros_like(usable)
+    for joint, rows in enumerate(usable.T):
+        if rows.any():
+            distance = np.abs(residual[:, joint] - np.median(residual[rows, joint]))
+            limit = BEYOND * _NORMAL * float(np.median(distance[rows]))
+            far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
+    squares = np.where(usable, residual, 0.0) ** 2
+    total = squares.sum(axis=0)
+    return Outliers(
+        share=np.count_nonzero(far, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1),
+        power=np.where(far, squares, 0.0).sum(axis=0) / np.where(total > 0.0, total, 1.0),
+        without=PredictionError.between(torque, torque - residual, usable & ~far),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Autocorrelation:
+    """Autocorrelation of the residual of n joints at L + 1 lags.
+
+    Attributes:
+        lag: (L + 1,) [s], from zero.
+        correlation: (L + 1, n), one at lag zero; NaN for a joint without rows.
+        rows: samples that were correlated (n,).
+    """
+
+    lag: Array
+    correlation: Array
+    rows: Indices
+
+    @property
+    def time(self) -> Array:
+        """Integrated correlation time per joint (n,) [s], half a sampling step for white noise.
+
+        The sum over lags ends where two neighbours together are no longer positive (initial
+        positive sequence, Geyer 1992): beyond that an estimated autocorrelation is noise.
+        """
+        pairs = self.correlation[: len(self.lag) // 2 * 2].reshape(-1, 2, len(self.rows)).sum(1)
+        positive = np.cumprod(pairs > 0.0, axis=0)
+        return np.asarray(self.lag[1] * ((pairs * positive).sum(axis=0) - 0.5))
+
+    @property
+    def effective_rows(self) -> Array:
+        """Independent samples that would say as much about a mean as these do (n,)."""
+        return np.asarray(self.rows / np.maximum(2.0 * self.time / self.lag[1], 1.0))
+
+
+def autocorrelation(
+    residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = LONGEST_LAG
+) -> Autocorrelation:
+    """Autocorrelation over several recordings, each with one clock step.
+
+    Pairs of rows count if both do, so that gaps and reversals need not be bridged.
+
+    Args:
+        residuals: of each recording torque residual (m, n) and which rows count (m, n).
+        step: sampling step [s].
+        longest: lag [s].
+    """
+    lags = max(2, min(_MOST_LAGS, round(longest / step)))
+    products = sum(_products(np.where(usable, left, 0.0), lags) for left, usable in residuals)
+    pairs = np.rint(sum(_products(usable.astype(np.float64), lags) for _, usable in residuals))
+    covariance = products / np.maximum(pairs, 1.0)
+    power = covariance[0]
+    return Autocorrelation(
+        lag=np.asarray(step * np.arange(lags + 1), dtype=np.float64),
+        correlation=np.where(power > 0.0, covariance / np.where(power > 0.0, power, 1.0), np.nan),
+        rows=pairs[0].astype(np.intp),
+    )
+
+
+def _products(values: Array, lags: int) -> Array:
+    """Sums of x(t) x(t + l) for l = 0 .. lags, per column: (lags + 1, n)."""
+    m, n = values.shape
+    found = np.zeros((lags + 1, n))
+    reach = min(lags, m - 1)
+    length = scipy.fft.next_fast_len(m + reach, real=True)  # so long that nothing wraps round
+    power = np.abs(scipy.fft.rfft(values, length, axis=0)) ** 2
+    found[: reach + 1] = scipy.fft.irfft(power, length, axis=0)[: reach + 1]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualChecks:
+    """What the torque residual of all recordings follows.
+
+    Attributes:
+        torque_rms: measured torque of the rows that count (n,) [N·m or N].
+        rms: residual of those rows (n,) [N·m or N].
+        colour: correlation in time, of what was fitted.
+        speed: mean residual against the joint's own speed.
+        position: against the joint's own position.
+        ripple: against the angle of the joint's motor; None where no gear ratio is known.
+        drift: change of friction over the fitted recordings; None where they are too few.
+        friction_share: friction torque of the fitted recordings over the measured one (n,).
+        outliers: of the unseen motion, or of the fitted one where there is no other.
+    """
+
+    torque_rms: Array
+    rms: Array
+    colour: Autocorrelation
+    speed: Profile
+    position: Profile
+    ripple: Ripple | None
+    drift: FrictionDrift | None
+    friction_share: Array
+    outliers: Outliers
+
+    def share(self, size: Array) -> Array:
+        """A residual (n,) as a share of the joint's torque; zero for a joint without rows."""
+        torque = self.torque_rms
+        return np.where(torque > 0.0, size / np.where(torque > 0.0, torque, 1.0), 0.0)
+
+
+def check_residuals(
+    model: RobotModel,
+    values: Array,
+    training: Sequence[Samples],
+    held_out: Sequence[Samples] = (),
+    *,
+    same_motion: bool = False,
+    motor_from_joint: Array | None = None,
+) -> ResidualChecks:
+    """Look at the residuals of parameters (p,) on all recordings.
+
+    Args:
+        model: the robot.
+        values: parameters (p,).
+        training: recordings in the order in which they were made; drift is looked for in these.
+        held_out: recordings of other motions.
+        same_motion: whether the training recordings repeat one motion.
+        motor_from_joint: motor angle per joint angle (n, n); None where unknown.
+
+    Raises:
+        IdentificationError: no recording.
+    """
+    runs = [*training, *held_out]
+    if not runs:
+        raise IdentificationError("there is no residual to check: no recording is given")
+    fitted, usable = len(training), [run.usable for run in runs]
+    heat = np.where(model.friction_columns, values, 0.0)
+    speeds = _profile_edges([run.motion.velocity for run in runs], usable)
+    positions = _profile_edges([run.motion.position for run in runs], usable)
+    left = [
+        np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
+    ]
+    each = list(zip(runs, left, strict=True))
+    pieces = max(1, -(-_PIECES // max(fitted, 1)))
+    drift = [
+        _drift_sums(run, own, run.predicted_torque(model, heat), pieces)
+        for run, own in each[:fitted]
+    ]
+    torque = np.array([(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0) for run in runs])
+    seen, friction = torque[:fitted].sum(axis=0), sum((one[1].sum(axis=0) for one in drift), 0.0)
+    rows = np.maximum(np.count_nonzero(np.concatenate(usable), axis=0), 1)
+    repeated = fitted if same_motion and fitted else 1
+    velocity = [_profile_sums(run, own, run.motion.velocity, speeds) for run, own in each]
+    posture = [_profile_sums(run, own, run.motion.position, positions) for run, own in each]
+    ripple = None
+    if motor_from_joint is not None:
+        waves = [_ripple_sums(run, own, motor_from_joint) for run, own in each]
+        ripple = Ripple(block_mean(waves, repeated))
+    judged = slice(fitted, None) if held_out else slice(None)
+    steps = [np.median(np.diff(run.motion.time)) for run in training or runs]
+    return ResidualChecks(
+        torque_rms=np.sqrt(torque.sum(axis=0) / rows),
+        rms=np.sqrt(sum((own**2).sum(axis=0) for own in left) / rows),
+        colour=autocorrelation(
+            list(zip(left, usable, strict=True))[: fitted or None], float(np.median(steps))
+        ),
+        speed=Profile(speeds, block_mean(velocity, repeated)),
+        position=Profile(positions, block_mean(posture, repeated)),
+        ripple=ripple,
+        drift=_friction_drift(drift),
+        friction_share=np.sqrt(friction / np.where(seen > 0.0, seen, 1.0)),
+        outliers=find_outliers(
+            np.concatenate([run.torque for run in runs[judged]]),
+            np.concatenate(left[judged]),
+            np.concatenate(usable[judged]),
+        ),
+    )
