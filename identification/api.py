@@ -59,7 +59,6 @@ from identification.selection.essential import Elimination, eliminate
 from identification.signals.clock import Clock, TimeBase, time_base, true_times
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
-from identification.signals.resampling import resample
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from identification.validation.evidence import Evidence, gather
@@ -85,7 +84,6 @@ __all__ = [
     "Recording",
     "Clock",
     "TimeBase",
-    "resample",
     "time_base",
     "true_times",
     "Preprocessing",

@@ -42,8 +42,8 @@ from identification.estimators.shrinkage import Shrinkage
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
 from identification.selection.inner_prediction import Choice
-from identification.signals.low_passes import LowPassShape
 from identification.signals.samples import Preprocessing
+from identification.signals.smoothing import LowPassShape
 from planner.checked_data import DAMAGED
 
 from .types import ArchiveRef, CacheError, Fit, Summary

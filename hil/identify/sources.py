@@ -22,8 +22,12 @@ from hil.io import file_digest
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.noise import standstill_variance
-from identification.signals.recording import Recording, RecordingError, offsets_of_repetitions
-from identification.signals.resampling import without_repeats
+from identification.signals.recording import (
+    Recording,
+    RecordingError,
+    offsets_of_repetitions,
+    without_repeats,
+)
 
 Array = NDArray[np.float64]
 

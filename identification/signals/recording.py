@@ -268,6 +268,36 @@ class Recording:
                 )
 
 
+def without_repeats(recording: Recording) -> Recording:
+    """Return the recording with one sample per time stamp: the mean of those that share it.
+
+    Raises:
+        RecordingError: the clock falls back; which sample is right cannot be determined.
+    """
+    steps = np.diff(recording.time)
+    if np.any(steps < 0.0):
+        sample = int(np.argmax(steps < 0.0)) + 1
+        text = f"the clock falls back at sample {sample}; samples are not put in order here"
+        raise RecordingError("clock", text, sample=sample)
+    starts = np.flatnonzero(np.concatenate([[True], steps > 0.0]))
+    if len(starts) == recording.n_samples:
+        return recording
+    count = np.diff(np.append(starts, recording.n_samples))[:, None]
+
+    def mean(values: Array) -> Array:
+        # One sample stays what it is to the last bit.
+        total = np.add.reduceat(values, starts, axis=0)
+        return np.asarray(np.where(count == 1, values[starts], total / count))
+
+    gap = recording.gap_before
+    return replace(
+        recording,
+        time=recording.time[starts],
+        gap_before=None if gap is None else np.logical_or.reduceat(gap, starts),
+        **recording.each_channel(mean),
+    )
+
+
 def stuck(position: Array, command: Array) -> tuple[int, float] | None:
     """Where a joint stays the same to the last bit while it is commanded to move.
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
-from identification.signals.butterworth import butterworth_motion, choose_cutoff
 from identification.signals.masks import (
     REVERSAL_PERIODS,
     SHORTEST_STRETCH,
@@ -24,6 +23,8 @@ from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
     SMOOTHER,
     LowPassShape,
+    butterworth_motion,
+    choose_cutoff,
     fit_smoothing_spline,
     low_passed,
 )
@@ -47,7 +48,7 @@ class Preprocessing:
     Attributes:
         smoother: of the positions: the smoothing spline whose mean squared residual is the noise
             variance, or a zero-phase Butterworth filter
-            (:mod:`identification.signals.butterworth`).
+            (:mod:`identification.signals.smoothing`).
         rigid_bandwidth: widest bandwidth of the smoothed positions [Hz], however little noise
             they have. A rigid model has nothing to say above the first resonance of the arm,
             where motors accelerate without their links; and a wide one lets ripple that has

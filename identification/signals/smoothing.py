@@ -27,6 +27,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.model.motion import Motion
+from identification.signals.clock import time_base
+from identification.signals.noise import difference_variance
+from identification.signals.recording import Recording, RecordingError
+
 Array = NDArray[np.float64]
 
 
@@ -380,3 +385,107 @@ def _filtered(columns: Array, cycles: float, shape: LowPassShape) -> Array:
 
 def _read(at: Array, time: Array, columns: Array) -> Array:
     return np.column_stack([np.interp(at, time, column) for column in columns.T])
+
+
+# Zero-phase Butterworth smoothing is the alternative to the spline. Run forwards and backwards its
+# gain is |H(f)|² = 1 / (1 + (f / f_c)^(2 k)) for the order k: at the cut-off it halves a sine.
+BUTTERWORTH_ORDER: Final = 4
+LOWEST_CUTOFF: Final = 0.5  # Hz; below it nothing of a robot's motion would be left
+# Of the sampling rate: higher, the filter is none and the bilinear transform bends it.
+HIGHEST_CUTOFF: Final = 0.4
+# The filter starts from the signal's point reflection at its end, for so many of its periods.
+_BUTTERWORTH_PADDING: Final = 3.0
+_SHORTEST: Final = 24  # samples
+_CANDIDATES: Final = 80
+# A periodogram of white noise exceeds its mean by this factor in two of 10^9 frequencies.
+_CLEAR: Final = 20.0
+
+
+def choose_cutoff(
+    recording: Recording, noise_variance: Array | None = None, *, widest: float = np.inf
+) -> Array:
+    """Cut-off per joint (n,) [Hz] with the least estimated error of the acceleration.
+
+    What the filter takes from the part of the spectrum that stands clear of the noise, and what
+    it leaves of the noise, both as accelerations, on the longest stretch. The accelerations
+    decide what a fit is worth; a residual as large as the noise (the spline's rule; with filters,
+    Winter's residual analysis) chooses for the positions, and too low for them.
+
+    Args:
+        recording: checked.
+        noise_variance: of the positions (n,) [rad² or m²]; None: estimated from their differences.
+        widest: highest cut-off [Hz], however little noise there is.
+
+    Raises:
+        RecordingError: no stretch is long enough.
+    """
+    own = max(recording.segments(), key=lambda segment: int(segment.stop - segment.start))
+    time, position = recording.time[own], recording.position[own]
+    if len(time) < _SHORTEST:
+        text = f"a filter needs a stretch of {_SHORTEST} samples, the longest has {len(time)}"
+        raise RecordingError("shape", text)
+    if noise_variance is None:
+        noise_variance = difference_variance(time, position)
+    time, position = _even(time, position)
+    step = _median_step(time)
+    highest = min(widest, HIGHEST_CUTOFF / step)
+    candidates = np.geomspace(min(LOWEST_CUTOFF, 0.5 * highest), highest, _CANDIDATES)
+    # A window that closes smoothly: what leaks from the slow motion would pass for fast signal.
+    frequency, power = scipy.signal.periodogram(
+        position, 1.0 / step, window="blackmanharris", detrend="linear", axis=0
+    )
+    noise = 2.0 * step * np.asarray(noise_variance, dtype=np.float64)  # one-sided density
+    signal = np.where(power > _CLEAR * noise, power, 0.0)
+    bent = np.tan(np.minimum(np.pi * frequency * step, 0.4999 * np.pi))
+    ratio = bent / np.tan(np.pi * candidates * step)[:, None]
+    gain = 1.0 / (1.0 + ratio ** (2 * BUTTERWORTH_ORDER))
+    fourth = frequency**4
+    lost = ((1.0 - gain) ** 2 * fourth) @ signal
+    left = (gain**2 * fourth).sum(axis=1)[:, None] * noise
+    return np.asarray(candidates[np.argmin(lost + left, axis=0)])
+
+
+def butterworth_motion(
+    recording: Recording, cutoff: Array, *, order: int = BUTTERWORTH_ORDER, delay: float = 0.0
+) -> Motion:
+    """Filtered motion in the rows of the recording, at each instant less the delay.
+
+    The derivatives are those of the quintic spline through the filtered positions, exact where
+    central differences lose a share (2 pi f h)²/6 of a velocity at frequency f. Uneven positions
+    are interpolated for the filter and read again at their own times. Rows of a stretch too short
+    to filter keep their position, at rest.
+
+    Args:
+        recording: checked.
+        cutoff: per joint (n,) [Hz], below the Nyquist frequency.
+        order: of the filter, one way.
+        delay: time by which what the motion is to be compared with lags it [s].
+    """
+    q = recording.position.copy()
+    qd, qdd = np.zeros_like(q), np.zeros_like(q)
+    for segment in recording.segments():
+        inside = recording.time[segment]
+        if len(inside) < _SHORTEST:
+            continue
+        time, position = _even(inside, recording.position[segment])
+        step = _median_step(time)
+        for channel, frequency in zip(position.T, cutoff.tolist(), strict=True):
+            sections = scipy.signal.butter(order, frequency, fs=1.0 / step, output="sos")
+            padding = min(len(time) - 1, int(np.ceil(_BUTTERWORTH_PADDING / (frequency * step))))
+            channel[:] = scipy.signal.sosfiltfilt(sections, channel, padlen=padding)
+        spline = scipy.interpolate.make_interp_spline(time, position, k=5)
+        at = np.clip(inside - delay, inside[0], time[-1])
+        q[segment], qd[segment], qdd[segment] = spline(at), spline(at, 1), spline(at, 2)
+    return Motion(recording.time, q, qd, qdd)
+
+
+def _even(time: Array, position: Array) -> tuple[Array, Array]:
+    """One stretch at even times, from the interpolating cubic spline where its own are not."""
+    if time_base(time).uniform:
+        return time, position.copy()
+    step = _median_step(time)
+    # Rounding of stamps must not cost the last sample.
+    count = int(np.floor((time[-1] - time[0]) / step + 1e-6)) + 1
+    at = time[0] + step * np.arange(count)
+    spline = scipy.interpolate.make_interp_spline(time, position, k=3)
+    return at, spline(np.clip(at, time[0], time[-1]))
