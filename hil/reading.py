@@ -16,6 +16,8 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any, Final
 
+from hil.errors import InputError
+
 _FIRST: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
 """Of the years that calendars, time zones and figures agree on."""
@@ -113,6 +115,21 @@ def remedy_of(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
     if isinstance(trouble, UnicodeDecodeError):
         return "save it as UTF-8"
     return "write it to a file first, and name that" if trouble.strerror == _NO_FILE else otherwise
+
+
+def named_text(path: Path, otherwise: str = "name another file") -> str:
+    """The text of a file that a person named.
+
+    Raises:
+        InputError: it cannot be read; the remedy is `otherwise` unless the reason suggests one.
+    """
+    try:
+        return text_of(path)
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise InputError(
+            path, f"cannot be read ({why})", remedy=remedy_of(error, otherwise)
+        ) from error
 
 
 def json_of(text: str | bytes) -> Any:

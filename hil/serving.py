@@ -18,8 +18,8 @@ from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
 from hil.reading import port_number
 from sim_fixtures import ControllerSettings, SimulatedController
-from sim_fixtures.errors import PlantDiverged, SettingError
-from sim_fixtures.far_end import FarEnd, FarEndError, UdpFarEnd
+from sim_fixtures.errors import PlantDiverged
+from sim_fixtures.far_end import FarEnd, UdpFarEnd
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, Tally, serve
 
@@ -38,36 +38,30 @@ def open_far_end(
         n_axes: axes of the robot.
 
     Raises:
-        InputError: neither or both, not of that form, impossible to open, or unfit for the session.
+        InputError: neither or both, or not of that form.
+        FarEndError: impossible to open, or unfit for the session.
     """
     if (udp is None) == (can is None):
         raise InputError(
             None, "a link has to be named, one of them", remedy="give --udp or --can, not both"
         )
-    try:
-        return _udp(udp) if udp is not None else _can(can or "", settings, n_axes)
-    except FarEndError as error:
-        raise InputError(None, str(error)) from error
-
-
-def _udp(text: str) -> FarEnd:
-    host, _, port_text = text.rpartition(":")
+    if can is not None:
+        return _bus(can, settings, n_axes)
+    host, _, port_text = (udp or "").rpartition(":")
     port = port_number(port_text)
     if not host or port is None:
         raise InputError(
             None,
-            f"--udp {text!r} is not an address",
+            f"--udp {udp!r} is not an address",
             remedy="write HOST:PORT, for instance 127.0.0.1:2001",
         )
     return UdpFarEnd(host, port)
 
 
-def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
+def _bus(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
     interface, _, rest = text.partition(":")
-    channel, colon, profile = rest.rpartition(":")
-    if not colon:
-        channel, profile = rest, "fd"
-    elif profile not in ("fd", "classic"):
+    channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
+    if profile not in ("fd", "classic"):
         raise InputError(
             None,
             f"--can {text!r} ends in {profile!r}, which is neither of the profiles fd and classic",
@@ -79,8 +73,7 @@ def _can(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
             f"--can {text!r} is not a bus",
             remedy="write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic",
         )
-    # python-can is loaded only where a bus is asked for.
-    from sim_fixtures import can_end
+    from sim_fixtures import can_end  # python-can is slow to load
 
     moved_by_pc = settings.corrected or not settings.own_motion
     kind: Literal["fd", "classic"] = "classic" if profile == "classic" else "fd"
@@ -159,7 +152,8 @@ def undisturbed(priority: int | None) -> Iterator[None]:
                 f"the system refuses a real-time priority of {priority} ({error.strerror})",
                 remedy="leave --priority out, or raise the limit (ulimit -r) or run as root",
             ) from error
-    _wake_exactly()
+    with suppress(OSError, AttributeError):  # else timers are batched with others, 50 µs
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -168,12 +162,6 @@ def undisturbed(priority: int | None) -> Iterator[None]:
     finally:
         gc.enable()
         gc.unfreeze()
-
-
-def _wake_exactly() -> None:
-    """Ask not to have this thread's timers batched with others (50 µs by default)."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -221,13 +209,13 @@ def serve_session(
         watch: called every cycle with the counts so far.
 
     Raises:
-        InputError: the controller cannot be built so, or the link cannot carry the session.
+        InputError: the link cannot carry the session.
         ControllerFault: the simulated arm left the finite numbers.
     """
     starts = 0
     while True:
         starts += 1
-        controller = _switched_on(build)
+        controller = build()
         record = _Observed(controller, pressed, watch)
         try:
             summary = serve(
@@ -248,14 +236,9 @@ def serve_session(
                 foreign=getattr(far_end, "foreign", 0),
                 gave_up=controller.gave_up,
             )
-        _pause(KNOCK_INTERVAL, pressed)
-
-
-def _switched_on(build: Callable[[], SimulatedController]) -> SimulatedController:
-    try:
-        return build()
-    except SettingError as error:
-        raise InputError(None, str(error)) from error
+        until = time.monotonic() + KNOCK_INTERVAL
+        while time.monotonic() < until and pressed.request() is Request.GO_ON:
+            time.sleep(0.05)
 
 
 class _Observed:
@@ -283,9 +266,3 @@ class _Observed:
             self.intervals += phase is Phase.OPEN
         self._pressed.pass_on(self._controller)
         self._watch(self._controller, tally)
-
-
-def _pause(seconds: float, pressed: Buttons) -> None:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until and pressed.request() is Request.GO_ON:
-        time.sleep(0.05)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections import UserDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,11 +56,15 @@ def exit_code_of(error: BaseException) -> int:
 
 def _comes_from_below(error: BaseException) -> bool:
     """Whether a package that knows no exit status refused; it is loaded where that was raised."""
-    for package, name in (("identification", "IdentificationError"), ("planner", "PlannerError")):
-        errors = sys.modules.get(f"{package}.errors")
-        if errors is not None and isinstance(error, getattr(errors, name)):
-            return True
-    return False
+    below = {
+        "identification": "IdentificationError",
+        "planner": "PlannerError",
+        "sim_fixtures": "SimulationError",
+    }
+    return any(
+        isinstance(error, getattr(sys.modules.get(f"{package}.errors"), name, ()))
+        for package, name in below.items()
+    )
 
 
 def as_json(error: BaseException) -> dict[str, Any]:
@@ -145,18 +150,29 @@ def _command(name: str, module: str) -> Any:
         alone.command(name)(getattr(found, name))
     group = typer.main.get_command(alone)
     assert isinstance(group, TyperGroup)
-    return without_flag_types(group.commands[name])
+    return presented(group.commands[name])
 
 
-def without_flag_types(command: Any) -> Any:
-    """The command, in whose help nothing stands behind a flag: nothing is typed there."""
-    help_option = command.get_help_option(typer.Context(command))
-    for option in (*command.params, help_option):
+def presented(command: Any) -> Any:
+    """The command as its help shows it.
+
+    The paragraphs below `Options:` in its docstring explain its parameters. Nothing stands behind
+    a flag, as nothing is typed there; one that is off has no opposite.
+    """
+    if isinstance(commands := getattr(command, "commands", {}), LazyCommands):
+        commands = {}
+    for one in commands.values():
+        presented(one)
+    text, _, options = (command.help or "").partition("\n\nOptions:\n")
+    command.help = text
+    entries = re.split(r"^    (?=\w)", options, flags=re.MULTILINE)[1:]
+    explained = dict(entry.split(": ", 1) for entry in entries)
+    for option in (*command.params, command.get_help_option(typer.Context(command))):
+        if option.name in explained:
+            option.help = " ".join(explained[option.name].split())
         if getattr(option, "is_flag", False):
             option.metavar = ""
-    if not isinstance(commands := getattr(command, "commands", {}), LazyCommands):
-        for one in commands.values():
-            without_flag_types(one)
+            option.secondary_opts = option.secondary_opts if option.default else []
     return command
 
 
@@ -233,7 +249,7 @@ class Group(TyperGroup):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**{**settings, "commands": COMMANDS})
-        without_flag_types(self)
+        presented(self)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Show the commands by their purposes: none of them is imported for that."""

@@ -65,21 +65,20 @@ def check(files: Files, as_json: JsonOption = False) -> None:
 
 @app.command("repair")
 def repair(
-    file: Annotated[Path, typer.Argument(help="The archive.", show_default=False)],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="The file to write; FILE_repaired.mcap by default."),
-    ] = None,
-    in_place: Annotated[
-        bool, typer.Option("--in-place", help="Replace the archive, once the repair has succeeded.")
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print what was saved and lost as JSON.")
-    ] = False,
+    file: Path,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    in_place: bool = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
     """Rewrite a torn or damaged archive so that every reader accepts it.
 
     Exit status: 0 nothing is lost, 3 something is, 1 nothing could be saved.
+
+    Options:
+        file: The archive.
+        output: The file to write; FILE_repaired.mcap by default.
+        in_place: Replace the archive, once the repair has succeeded.
+        as_json: Print what was saved and lost as JSON.
     """
     if in_place and output is not None:
         raise InputError(None, "contradicts --output", field="--in-place", remedy="give one")

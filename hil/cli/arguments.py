@@ -1,4 +1,4 @@
-"""Arguments that many commands have."""
+"""Arguments that many commands have, and what they refuse alike."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ import typer
 
 from hil.errors import InputError
 
-CampaignArgument = Annotated[
-    Path, typer.Argument(help="The campaign's folder (`hil design -o`).", show_default=False)
-]
+CampaignArgument = Annotated[Path, typer.Argument(help="The campaign's folder (`hil design -o`).")]
 ArchivesArgument = Annotated[
     list[Path],
     typer.Argument(
         help="Archives (*.mcap), or one campaign folder.",
-        show_default=False,
         metavar="ARCHIVE...",
     ),
 ]
@@ -39,7 +36,6 @@ DhOption = Annotated[
         help="In place of --urdf, a CSV table of DH parameters, where nothing else is known of the "
         "robot: joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
         "joint. Needs --convention.",
-        show_default=False,
     ),
 ]
 ConventionOption = Annotated[
@@ -47,9 +43,36 @@ ConventionOption = Annotated[
     typer.Option(
         help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or modified "
         "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
-        show_default=False,
     ),
 ]
+
+
+def at_most_one(**given: object) -> None:
+    """Refuse options that exclude each other, by their names in Python.
+
+    Raises:
+        InputError: more than one of them was typed.
+    """
+    typed = [_option(name) for name, value in given.items() if value not in (None, False, [])]
+    if len(typed) > 1:
+        problem = "exclude each other"
+        raise InputError(None, problem, field=" and ".join(typed), remedy="give one of them")
+
+
+def exactly_one(**given: object) -> None:
+    """Refuse options of which not exactly one was typed, by their names in Python.
+
+    Raises:
+        InputError: none of them was typed, or more than one.
+    """
+    at_most_one(**given)
+    if all(value in (None, False, []) for value in given.values()):
+        names = " or ".join(map(_option, given))
+        raise InputError(None, "one of them is needed", field=names, remedy=f"give {names}")
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def print_json(document: object) -> None:

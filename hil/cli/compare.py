@@ -20,23 +20,9 @@ CHANGED: Final = 5
 
 
 def compare(
-    campaigns: Annotated[
-        list[str],
-        typer.Argument(
-            help="Campaign folders of one arm, two or more, or folders with campaigns below.",
-            show_default=False,
-            metavar="CAMPAIGN...",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", help="HTML file for the report; none if left out.", show_default=False
-        ),
-    ] = None,
-    fail_on_change: Annotated[
-        bool, typer.Option("--fail-on-change", help="Exit status 5 if something has changed.")
-    ] = False,
+    campaigns: Annotated[list[str], typer.Argument(metavar="CAMPAIGN...")],
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    fail_on_change: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,6 +31,11 @@ def compare(
     The earliest campaign is what the others are compared with; the first one named, where not all
     have a time of recording. Archives are read as `hil reidentify` reads them. Exit status 0,
     whatever came out, unless --fail-on-change is given.
+
+    Options:
+        campaigns: Campaign folders of one arm, two or more, or folders with campaigns below.
+        output: HTML file for the report; none if left out.
+        fail_on_change: Exit status 5 if something has changed.
     """
     reporter = make_reporter(quiet=quiet or json)
     with LocalWorkers() as workers:

@@ -42,48 +42,15 @@ computer need not be fit for a robot."""
 
 
 def demo(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Campaign folder to make.", show_default=True)
-    ] = Path("runs/demo"),
-    repetitions: Annotated[
-        int | None, typer.Option(min=2, help="Repetitions; 30 as in the paper if left out.")
-    ] = None,
-    validation: Annotated[
-        int | None, typer.Option(min=1, help="Validation runs, never used for fitting.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the simulated cell: one seed, one run.")
-    ] = None,
-    effects: Annotated[
-        bool,
-        typer.Option(
-            "--effects/--no-effects",
-            help="Switch on what the model leaves out: torque ripple, friction drift, "
-            "elasticity, delay.",
-        ),
-    ] = False,
-    excitation: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Run this excitation, a result of `hil design` for the NS 16 cell, instead of "
-            "one found in a few seconds.",
-            show_default=False,
-        ),
-    ] = None,
-    link: Annotated[
-        Literal["simulated", "udp", "can"],
-        typer.Option(
-            help="simulated: in virtual time. udp, can: the controller is a process of its own, "
-            "reached over real sockets in real time."
-        ),
-    ] = "simulated",
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an earlier campaign in OUTPUT.")
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a campaign in OUTPUT that was stopped.")
-    ] = False,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/demo"),
+    repetitions: Annotated[int | None, typer.Option(min=2)] = None,
+    validation: Annotated[int | None, typer.Option(min=1)] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    effects: Annotated[bool, typer.Option("--effects/--no-effects")] = False,
+    excitation: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    link: Literal["simulated", "udp", "can"] = "simulated",
+    force: bool = False,
+    resume: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -94,6 +61,20 @@ def demo(
     Nothing here is hardware: controller, drives and arm are simulated, packet for packet.
     With --link udp or can the same campaign takes as long as it would on a robot, so ask for
     fewer repetitions. The CAN bus is one within this computer, with a cycle of 2 ms.
+
+    Options:
+        output: Campaign folder to make.
+        repetitions: Repetitions; 30 as in the paper if left out.
+        validation: Validation runs, never used for fitting.
+        seed: Seed of the simulated cell: one seed, one run.
+        effects: Switch on what the model leaves out: torque ripple, friction drift, elasticity,
+            delay.
+        excitation: Run this excitation, a result of `hil design` for the NS 16 cell, instead of one
+            found in a few seconds.
+        link: simulated: in virtual time. udp, can: the controller is a process of its own, reached
+            over real sockets in real time.
+        force: Replace an earlier campaign in OUTPUT.
+        resume: Go on with a campaign in OUTPUT that was stopped.
     """
     reporter = make_reporter(quiet=quiet or json)
     if resume:

@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -19,8 +19,8 @@ from hil.campaign.operator import Stop, stop_on_interrupt
 from hil.campaign.quick_design import quick_settings
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.design import DesignSettings, Method, load_settings, preset
+from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
+from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, margins, weakest
 from hil.design.compare import References, references
 from hil.design.earlier import known_from
@@ -29,97 +29,67 @@ from hil.design.run import Designed, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.plots import save
-from hil.progress import Reporter, say
 from hil.progress import reporter as make_reporter
+from hil.progress import say
 from hil.terminal_text import printable
 
 
-def say_result(reporter: Reporter, done: Designed) -> None:
-    """Say what the criteria are and what stood in the way."""
-    excitation, front = done.result.excitation, done.design.front
-    broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
-    reporter.say(
-        f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
-        f"{len(front.log10_det)} on the front"
-    )
-    _say_condition(reporter, done)
-    if (origin := done.result.polished_from) is not None:
-        reporter.say(
-            f"polished from log det {origin.log10_det:.2f}, I_c {origin.coupling_index:.2f}"
-        )
-    sines = done.result.settings.sines
-    if sines is not None and sines.ramp == 0.0:
-        reporter.say(
-            "this motion begins and ends at full speed: no controller can run it; give it a ramp"
-        )
-
-
-def warn_of_unchecked(done: Designed, cell: Cell) -> None:
-    """Say on stderr, however quiet it is to be, what was not looked at."""
-    unchecked = done.result.settings.unchecked
-    if unchecked:
-        say(
-            f"warning: not looked at: {', '.join(unchecked)}; {cell.name} may refuse this motion",
-            err=True,
-        )
-
-
-def summary_line(done: Designed, folder: DesignFolder) -> str:
-    """Return the one line that says how good the motion is."""
-    excitation, n = done.result.excitation, done.result.n_parameters
-    criteria = excitation.criteria
-    return (
-        f"log det {criteria.log10_det:.2f}, I_c {criteria.coupling_index:.2f} of "
-        f"{n * (n - 1) // 2}, {excitation.trajectory.duration:.2f} s: {folder.result}"
-    )
-
-
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
-    """Return the same as data; what is no finite number is None."""
-    excitation = done.result.excitation
+    """What was found, for a script; what is no finite number is None."""
+    excitation, design = done.result.excitation, done.design
     criteria = excitation.criteria
+
+    def finite(value: float | None) -> float | None:
+        return value if value is not None and math.isfinite(value) else None
+
     return {
         "method": excitation.method,
         "seed": excitation.seed,
-        "complete": done.design.complete,
-        "exhausted": done.design.exhausted,
+        "complete": design.complete,
+        "exhausted": design.exhausted,
         "unchecked": list(done.result.settings.unchecked),
-        "log10_det": _finite(criteria.log10_det),
-        "coupling_index": _finite(criteria.coupling_index),
-        "fitness": _finite(criteria.fitness),
-        "condition": _finite(criteria.condition),
-        "scaled_condition": _finite(criteria.scaled_condition),
+        "log10_det": finite(criteria.log10_det),
+        "coupling_index": finite(criteria.coupling_index),
+        "fitness": finite(criteria.fitness),
+        "condition": finite(criteria.condition),
+        "scaled_condition": finite(criteria.scaled_condition),
         "duration": float(excitation.trajectory.duration),
         "tried": excitation.tried,
         "infeasible": dict(excitation.rejected),
-        "front": len(done.design.front.log10_det),
+        "front": len(design.front.log10_det),
         "file": str(folder.result),
         "picture": str(folder.picture),
     }
 
 
-def say_campaign(
-    reporter: Reporter, folder: DesignFolder, lacking: str | None, files: Sequence[str]
-) -> None:
-    """Say what comes next, or why the motion became no campaign."""
-    if files:
-        reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
-    elif lacking is None:
-        root = shlex.quote(str(folder.root))
-        reporter.say(f"{folder.root} is a campaign now; next: hil rehearse {root}")
-    else:
-        reporter.say(f"note: no campaign was made of it: {lacking}")
+def _lines(done: Designed) -> Iterator[str]:
+    """What the criteria are and what limited them."""
+    result, excitation = done.result, done.result.excitation
+    sines, criteria = result.settings.sines, excitation.criteria
+    broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
+    yield (
+        f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
+        f"{len(done.design.front.log10_det)} on the front"
+    )
+    raw, scaled = criteria.condition, criteria.scaled_condition
+    if raw is not None and scaled is not None:
+        yield (
+            f"condition number of the regressor {raw:.0f}, {scaled:.1f} with columns of unit length"
+        )
+        if scaled > WEAK:
+            names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
+            more = "via points" if sines is None else "harmonics"
+            yield (
+                f"this motion hardly separates {names}: take more {more}, allow a longer motion, "
+                "search longer, or judge by other parameters ([objective] parameters)"
+            )
+    if (origin := result.polished_from) is not None:
+        yield f"polished from log det {origin.log10_det:.2f}, I_c {origin.coupling_index:.2f}"
+    if sines is not None and sines.ramp == 0.0:
+        yield "this motion begins and ends at full speed: no controller can run it; give it a ramp"
 
 
-def campaign_summary(
-    folder: DesignFolder, lacking: str | None, files: Sequence[str]
-) -> dict[str, Any]:
-    """Return the same as data."""
-    campaign = str(folder.root) if lacking is None and not files else None
-    return {"campaign": campaign, "no_campaign": lacking, "trajectories": [*files]}
-
-
-def draw_pictures(
+def _draw(
     folder: DesignFolder, done: Designed, cell: Cell, references: References, *, together: bool
 ) -> None:
     """Draw the picture; without it the design is as good."""
@@ -127,15 +97,14 @@ def draw_pictures(
 
     design, excitation = done.design, done.result.excitation
     front, origin = design.front, design.origin
-    knee = None
-    if design.chosen is None:
-        knee = float(front.log10_det[origin]), float(front.coupling_index[origin])
     figure = draw_design(
         excitation,
         cell,
         front=front,
         chosen=design.chosen,
-        knee=knee,
+        knee=None
+        if design.chosen is not None
+        else (float(front.log10_det[origin]), float(front.coupling_index[origin])),
         references=references.measures,
         kinematic=references.kinematic,
         unchecked=done.result.settings.unchecked,
@@ -150,138 +119,32 @@ def draw_pictures(
         say(f"warning: {error}; repeat with --resume to draw it again", err=True)
 
 
-def _say_condition(reporter: Reporter, done: Designed) -> None:
-    excitation = done.result.excitation
-    raw, scaled = excitation.criteria.condition, excitation.criteria.scaled_condition
-    if raw is None or scaled is None:
-        return
-    reporter.say(
-        f"condition number of the regressor {raw:.0f}, {scaled:.1f} with columns of unit length"
-    )
-    if scaled > WEAK:
-        names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
-        more = "via points" if done.result.settings.sines is None else "harmonics"
-        reporter.say(
-            f"this motion hardly tells apart {names}: take more {more}, allow a longer motion, "
-            "search longer, or judge by other parameters ([objective] parameters)"
-        )
-
-
-def _finite(value: float | None) -> float | None:
-    """JSON knows no infinity."""
-    return value if value is not None and math.isfinite(value) else None
-
-
 def _folder(given: str) -> Path:
-    """Return the folder named; a name that is empty would be the working directory."""
+    """The folder named; a name that is empty would be the working directory."""
     if not given:
         raise InputError(None, "is empty", field="--output", remedy="name a folder")
     return Path(given)
 
 
 def design(
-    cell: Annotated[Path | None, typer.Argument(help="The cell file.", show_default=False)] = None,
+    cell: Annotated[Path | None, typer.Argument()] = None,
     output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", help="Folder for the result.", parser=_folder, metavar="<path>"
-        ),
+        Path, typer.Option("--output", "-o", parser=_folder, metavar="<path>")
     ] = Path("runs/design"),
-    method: Annotated[
-        Method | None,
-        typer.Option(
-            help="What is searched. a: the paper's method A, sines of largest determinant. b: its "
-            "method B, via points of best fitness by eq. 7. balanced: the same with terms of equal "
-            "weight. front: both criteria at once, and the knee of their front (the default).",
-            show_default=False,
-        ),
-    ] = None,
-    settings: Annotated[
-        Path | None,
-        typer.Option(
-            help="Settings of your own (TOML) instead of a method's, or those of an earlier "
-            "excitation.toml; begin with --show-settings.",
-            show_default=False,
-        ),
-    ] = None,
-    show_settings: Annotated[
-        Method | None,
-        typer.Option(
-            help="Print the settings of a method, explained, and do nothing else.",
-            show_default=False,
-        ),
-    ] = None,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="A short search, for a first look: method b, as many motions as `candidates` of "
-            "[campaign] says.",
-        ),
-    ] = False,
-    repetitions: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=1000,
-            help="How often the motion is run; that of [campaign] if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="One seed is one result; that of the settings if left out."),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=256,
-            help="Processes; as many as there are processors if left out. The result does not "
-            "depend on it.",
-        ),
-    ] = None,
-    kinematic: Annotated[
-        bool,
-        typer.Option(
-            "--kinematic",
-            help="Keep joint limits only, and do not return home: for comparison with the paper, "
-            "not for a robot.",
-        ),
-    ] = False,
-    purpose: Annotated[
-        Literal["arm", "payload"],
-        typer.Option(
-            "--for",
-            help="arm: all parameters of the arm. payload: only the payload, the arm known, by a "
-            "motion of at most ten seconds (`hil payload`).",
-        ),
-    ] = "arm",
-    earlier: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="A campaign folder, or archives (repeat the option): the new motion adds to what "
-            "they say, and concentrates on what they leave uncertain.",
-            show_default=False,
-        ),
-    ] = None,
-    compare: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Earlier results to draw on the front, e.g. those of methods a and b; of the same "
-            "robot, judged by the same parameters, without --earlier.",
-            show_default=False,
-        ),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the search in OUTPUT that was stopped.")
-    ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an earlier design in OUTPUT.")
-    ] = False,
-    view: Annotated[
-        bool, typer.Option("--view", help="Then show the motion in the browser, in 3D.")
-    ] = False,
+    method: Method | None = None,
+    settings: Path | None = None,
+    show_settings: Method | None = None,
+    quick: bool = False,
+    repetitions: Annotated[int | None, typer.Option(min=1, max=1000)] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
+    kinematic: bool = False,
+    purpose: Annotated[Literal["arm", "payload"], typer.Option("--for")] = "arm",
+    earlier: list[Path] | None = None,
+    compare: list[Path] | None = None,
+    resume: bool = False,
+    force: bool = False,
+    view: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -309,59 +172,98 @@ def design(
     - `hil design cell.toml --method b --kinematic -o runs/b`: the paper's comparison
     - `hil design cell.toml --earlier runs/demo -o runs/second`: adds to what is known
     - `hil design cell.toml --for payload -o runs/load`: a short motion for `hil payload`
+
+    Options:
+        cell: The cell file.
+        output: Folder for the result.
+        method: What is searched. a: the paper's method A, sines of largest determinant. b: its
+            method B, via points of best fitness by eq. 7. balanced: the same with terms of equal
+            weight. front: both criteria at once, and the knee of their front (the default).
+        settings: Settings of your own (TOML) instead of a method's, or those of an earlier
+            excitation.toml; begin with --show-settings.
+        show_settings: Print the settings of a method, explained, and do nothing else.
+        quick: A short search, for a first look: method b, as many motions as `candidates` of
+            [campaign] says.
+        repetitions: How often the motion is run; that of [campaign] if left out.
+        seed: One seed is one result; that of the settings if left out.
+        workers: Processes; as many as there are processors if left out. The result does not depend
+            on it.
+        kinematic: Keep joint limits only, and do not return home: for comparison with the paper,
+            not for a robot.
+        purpose: arm: all parameters of the arm. payload: only the payload, the arm known, by a
+            motion of at most ten seconds (`hil payload`).
+        earlier: A campaign folder, or archives (repeat the option): the new motion adds to what
+            they say, and concentrates on what they leave uncertain.
+        compare: Earlier results to draw on the front, e.g. those of methods a and b; of the same
+            robot, judged by the same parameters, without --earlier.
+        resume: Go on with the search in OUTPUT that was stopped.
+        force: Replace an earlier design in OUTPUT.
+        view: Then show the motion in the browser, in 3D.
     """
     if show_settings is not None:
         typer.echo(preset_text(show_settings), nl=False)
         return
     if cell is None:
         raise InputError(None, "for which cell?", remedy="name a cell file: hil design CELL")
-    if method is not None and settings is not None:
-        raise InputError(
-            None,
-            "names a method, and so do the settings",
-            field="--method",
-            remedy="give either --method or --settings",
-        )
-    if quick and (method is not None or settings is not None):
-        raise InputError(
-            None,
-            "names a method of its own",
-            field="--quick",
-            remedy="leave out --method and --settings, or --quick",
-        )
-    if resume and force:
-        raise InputError(None, "--resume and --force exclude each other", remedy="give one of them")
+    at_most_one(method=method, settings=settings, quick=quick)
+    at_most_one(resume=resume, force=force)
     if view:
-        _require_view()
+        from hil.view import require_viewer, show  # loads the arm's shapes
+
+        require_viewer()
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
     require_replaceable(output)
-    own = quick_settings(loaded) if quick else None
-    asked = _settings(
-        folder,
-        method,
-        settings,
-        seed,
-        own,
-        kinematic=kinematic,
-        resume=resume,
-        payload=purpose == "payload",
-    )
+    there = folder.interrupted() if resume else None
+    if quick:
+        asked = quick_settings(loaded)
+    elif settings is not None:
+        asked = load_settings(settings)
+    else:
+        asked = preset(method or "front") if method or there is None else there
+    if seed is not None:
+        asked = asked.replaced(seed=seed)
+    if kinematic:
+        asked = asked.kinematic()
+    if purpose == "payload":
+        asked = asked.for_payload()
+    if there is not None:
+        require_same(asked, there, folder.settings)
     beside = references(compare or [], loaded, asked, together=bool(earlier))
     known = known_from(earlier, loaded, reporter) if earlier else None
 
     def finish(done: Designed) -> None:
         """Say what was found, then draw it, while no other search may enter the folder."""
-        say_result(reporter, done)
-        warn_of_unchecked(done, loaded)
-        made, files = _campaign(folder, loaded, done)
-        say_campaign(reporter, folder, made, files)
+        for line in _lines(done):
+            reporter.say(line)
+        if unchecked := ", ".join(done.result.settings.unchecked):
+            words = f"not looked at: {unchecked}; {loaded.name} may refuse this motion"
+            say(f"warning: {words}", err=True)  # however quiet it is to be
+        lacking, files = _campaign(folder, loaded, done)
+        if files:
+            reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
+        elif lacking is None:
+            root = shlex.quote(str(folder.root))
+            reporter.say(f"{folder.root} is a campaign now; next: hil rehearse {root}")
+        else:
+            reporter.say(f"note: no campaign was made of it: {lacking}")
+        found = design_summary(done, folder) | {
+            "campaign": str(folder.root) if lacking is None and not files else None,
+            "no_campaign": lacking,
+            "trajectories": [*files],
+        }
         if json:
-            found = design_summary(done, folder) | campaign_summary(folder, made, files)
             print_json(found)
         else:
-            typer.echo(printable(summary_line(done, folder)))
-        draw_pictures(folder, done, loaded, beside, together=known is not None)
+            excitation, n = done.result.excitation, done.result.n_parameters
+            criteria = excitation.criteria
+            typer.echo(
+                printable(
+                    f"log det {criteria.log10_det:.2f}, I_c {criteria.coupling_index:.2f} of "
+                    f"{n * (n - 1) // 2}, {excitation.trajectory.duration:.2f} s: {folder.result}"
+                )
+            )
+        _draw(folder, done, loaded, beside, together=known is not None)
 
     with _stoppable(folder) as stop:
         try:
@@ -390,7 +292,9 @@ def design(
             "go on with --resume"
         )
     if view:
-        _show(done, loaded)
+        with show(done.result.excitation, loaded) as opened:
+            typer.echo(f"3D view: {opened.address} (Ctrl-C ends it)", err=True)
+            opened.run()
 
 
 def _campaign(
@@ -398,7 +302,8 @@ def _campaign(
 ) -> tuple[str | None, tuple[str, ...]]:
     """Make the design a campaign, or trajectory files where the cell names no controller.
 
-    In words why there is neither, None if there is; and the trajectory files.
+    Returns:
+        in words why there is neither, None if there is; and the trajectory files.
     """
     unchecked = done.result.settings.unchecked
     if not done.design.complete:
@@ -432,50 +337,3 @@ def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
         ) from None
     finally:
         signal.signal(signal.SIGTERM, previous)
-
-
-def _settings(
-    folder: DesignFolder,
-    method: Method | None,
-    file: Path | None,
-    seed: int | None,
-    own: DesignSettings | None,
-    *,
-    kinematic: bool,
-    resume: bool,
-    payload: bool,
-) -> DesignSettings:
-    """Return what is asked for, or `own`; of a search to be resumed, what it began with."""
-    there = folder.interrupted() if resume else None
-    if own is not None:
-        asked = own
-    elif file is not None:
-        asked = load_settings(file)
-    elif method is not None or there is None:
-        asked = preset(method or "front")
-    else:
-        asked = there
-    if seed is not None:
-        asked = asked.replaced(seed=seed)
-    if kinematic:
-        asked = asked.kinematic()
-    if payload:
-        asked = asked.for_payload()
-    if there is not None:
-        require_same(asked, there, folder.settings)
-    return asked
-
-
-def _require_view() -> None:
-    """Refuse before the search what could not be shown after it."""
-    from hil.view import require_viewer  # what it needs may not be installed
-
-    require_viewer()
-
-
-def _show(done: Designed, cell: Cell) -> None:
-    from hil.view import show  # what it needs may not be installed
-
-    with show(done.result.excitation, cell) as opened:
-        typer.echo(f"3D view: {opened.address} (Ctrl-C ends it)", err=True)
-        opened.run()

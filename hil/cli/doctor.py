@@ -18,20 +18,10 @@ QUICK_SECONDS = 5.0
 
 
 def doctor(
-    cell: Annotated[
-        Path | None,
-        typer.Argument(help="Cell file: its link is looked at, and its cycle has to be fit."),
-    ] = None,
-    duration: Annotated[
-        float,
-        typer.Option(min=1.0, max=36_000.0, help="Seconds of each of the two measurements."),
-    ] = 60.0,
-    output: Annotated[
-        Path, typer.Option(help="Where archives will be written; its disk is tried.")
-    ] = Path("runs"),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="5 s of each; the verdict is provisional (exit 5).")
-    ] = False,
+    cell: Annotated[Path | None, typer.Argument()] = None,
+    duration: Annotated[float, typer.Option(min=1.0, max=36000.0)] = 60.0,
+    output: Path = Path("runs"),
+    quick: bool = False,
     json: JsonOption = False,
 ) -> None:
     """Measure whether this PC can answer a controller every 1 or 2 ms, and say what to change.
@@ -44,6 +34,12 @@ def doctor(
 
     Exit status: 0 fit for the cell's cycle; 5 not fit, or the link cannot work, or measured for
     less than 60 s, so that the verdict is provisional; 2 bad input.
+
+    Options:
+        cell: Cell file: its link is looked at, and its cycle has to be fit.
+        duration: Seconds of each of the two measurements.
+        output: Where archives will be written; its disk is tried.
+        quick: 5 s of each; the verdict is provisional (exit 5).
     """
     controller = None if cell is None else controller_in(cell)
     diagnosis = examine(

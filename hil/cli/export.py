@@ -18,33 +18,10 @@ from hil.progress import say
 
 def export(
     archives: ArchivesArgument,
-    to: Annotated[
-        FormatName,
-        typer.Option(
-            help="mjcf: MuJoCo's XML; sdf: Gazebo, Drake; urdf: everything else.",
-            show_default=False,
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The file; if left out identified.xml, .sdf or .urdf, in the campaign folder or "
-            "here.",
-            show_default=False,
-        ),
-    ] = None,
-    ensemble: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=10_000,
-            help="Number of variants as far apart as the parameters are uncertain, every one a "
-            "possible machine; in a folder beside OUTPUT.",
-        ),
-    ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the variants.")] = 0,
+    to: Annotated[FormatName, typer.Option()],
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    ensemble: Annotated[int, typer.Option(min=0, max=10000)] = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
     estimator: EstimatorOption = "auto",
     friction: FrictionOption = "auto",
     delay: DelayOption = None,
@@ -59,6 +36,13 @@ def export(
     torque over the recorded motion. Exit status 5 if the model is not good.
 
     **Examples:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to sdf --ensemble 100`
+
+    Options:
+        to: mjcf: MuJoCo's XML; sdf: Gazebo, Drake; urdf: everything else.
+        output: The file; if left out identified.xml, .sdf or .urdf, in the campaign folder or here.
+        ensemble: Number of variants as far apart as the parameters are uncertain, every one a
+            possible machine; in a folder beside OUTPUT.
+        seed: Of the variants.
     """
     reporter = make_reporter(quiet=quiet or json)
     options = options_from(estimator=estimator, friction=friction, delay=delay)

@@ -20,53 +20,14 @@ from identification.model.payload import Payload
 
 
 def gains(
-    archives: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Archives with motor currents (*.mcap). One whose cell has a [robot.payload] was "
-            "recorded with it, the others without load.",
-            show_default=False,
-            metavar="ARCHIVE...",
-        ),
-    ],
-    loaded: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--loaded",
-            help="Archive recorded with the payload of --mass; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    mass: Annotated[
-        float | None, typer.Option(help="Mass of that payload in kg.", show_default=False)
-    ] = None,
-    centre: Annotated[
-        str, typer.Option(help="Its centre of mass in the frame, x,y,z in m.")
-    ] = "0,0,0",
-    inertia: Annotated[
-        str,
-        typer.Option(
-            help="Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of "
-            "the frame."
-        ),
-    ] = "0,0,0,0,0,0",
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            help="Link of the URDF whose frame that is; the last joint's if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(help="weighted or total (least squares with errors in the currents).")
-    ] = "weighted",
-    delay: Annotated[
-        float | None,
-        typer.Option(
-            help="Time in s by which currents lag positions; the cell's if left out.",
-            show_default=False,
-        ),
-    ] = None,
+    archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE...")],
+    loaded: list[Path] | None = None,
+    mass: float | None = None,
+    centre: str = "0,0,0",
+    inertia: str = "0,0,0,0,0,0",
+    frame: str | None = None,
+    method: str = "weighted",
+    delay: float | None = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -74,6 +35,18 @@ def gains(
 
     Prints TOML to paste into a cell or a column map, with 95 % intervals. A motor whose constant
     the data cannot determine is named, and gets "nan", which neither accepts: exit status 5.
+
+    Options:
+        archives: Archives with motor currents (*.mcap). One whose cell has a [robot.payload] was
+            recorded with it, the others without load.
+        loaded: Archive recorded with the payload of --mass; may be repeated.
+        mass: Mass of that payload in kg.
+        centre: Its centre of mass in the frame, x,y,z in m.
+        inertia: Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of the
+            frame.
+        frame: Link of the URDF whose frame that is; the last joint's if left out.
+        method: weighted or total (least squares with errors in the currents).
+        delay: Time in s by which currents lag positions; the cell's if left out.
     """
     methods: dict[str, GainMethod] = {"weighted": "weighted", "total": "total"}
     if method not in methods:

@@ -30,48 +30,11 @@ from hil.progress import reporter as make_reporter
 
 def identify(
     archives: ArchivesArgument,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder for results.json, report.html and the files for other tools. If left "
-            "out: the campaign folder (with --paper its folder paper), or none for loose archives.",
-            show_default=False,
-        ),
-    ] = None,
-    predict: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="ARCHIVE",
-            help="Archive that is predicted and never fitted, whatever its kind. May be repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    paper: Annotated[
-        bool,
-        typer.Option(
-            "--paper",
-            help="As the paper does it: smooth positions and torques, filter the regressor alike.",
-        ),
-    ] = False,
-    split: Annotated[
-        float,
-        typer.Option(
-            min=0.1,
-            max=0.9,
-            help="Where there is no validation run: share of the recording that is fitted; the "
-            "rest is predicted.",
-        ),
-    ] = 0.7,
-    in_sample: Annotated[
-        bool,
-        typer.Option(
-            "--in-sample",
-            help="Fit everything and hold nothing out: all errors are in-sample, which no verdict "
-            "can call good.",
-        ),
-    ] = False,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    predict: Annotated[list[Path] | None, typer.Option(metavar="ARCHIVE")] = None,
+    paper: bool = False,
+    split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
+    in_sample: bool = False,
     estimator: EstimatorOption = "auto",
     bandwidth: BandwidthOption = "auto",
     velocity: VelocityOption = "auto",
@@ -80,14 +43,7 @@ def identify(
     delay: DelayOption = None,
     smoother: SmootherOption = "spline",
     torque_bandwidth: TorqueBandwidthOption = "auto",
-    annotate: Annotated[
-        bool,
-        typer.Option(
-            "--annotate",
-            help="Also write copies of the archives for viewers, with the predicted torque as a "
-            "third JointState channel, into the folder annotated of OUTPUT.",
-        ),
-    ] = False,
+    annotate: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -96,6 +52,18 @@ def identify(
     Excitations and imported recordings are fitted; validation runs are predicted and never
     fitted. Everything needed (URDF, friction law, drive train) travels inside the archives.
     Exit status 0 if the model is good, 5 if it is not.
+
+    Options:
+        output: Folder for results.json, report.html and the files for other tools. If left out: the
+            campaign folder (with --paper its folder paper), or none for loose archives.
+        predict: Archive that is predicted and never fitted, whatever its kind. May be repeated.
+        paper: As the paper does it: smooth positions and torques, filter the regressor alike.
+        split: Where there is no validation run: share of the recording that is fitted; the rest is
+            predicted.
+        in_sample: Fit everything and hold nothing out: all errors are in-sample, which no verdict
+            can call good.
+        annotate: Also write copies of the archives for viewers, with the predicted torque as a
+            third JointState channel, into the folder annotated of OUTPUT.
     """
     reporter = make_reporter(quiet=quiet or json)
     options = options_from(

@@ -13,7 +13,6 @@ from identification.signals.samples import Smoother
 
 LONGEST_DELAY: Final = 0.5
 """s; what lags by more belongs to another recording."""
-_DELAY_WORDS: Final[dict[str, Literal["auto", "stated"]]] = {"auto": "auto", "stated": "stated"}
 
 EstimatorOption = Annotated[
     Estimator,
@@ -55,7 +54,6 @@ DelayOption = Annotated[
         help="Time by which the torque lags the position; stated: the cell's. If left out: "
         "the cell's, unless the recordings show another one. auto: estimated for each axis and "
         "compensated.",
-        show_default=False,
     ),
 ]
 SmootherOption = Annotated[
@@ -101,7 +99,9 @@ def options_from(
         standstill=standstill,
         delay=delay_from(delay),
         smoother=smoother,
-        torque_bandwidth=torque_bandwidth_from(torque_bandwidth),
+        torque_bandwidth=None
+        if torque_bandwidth == "none"
+        else bandwidth_from(torque_bandwidth, "--torque-bandwidth"),
         **others,
     )
 
@@ -114,12 +114,9 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
     """
     if text is None:
         return None
-    if text in _DELAY_WORDS:
-        return _DELAY_WORDS[text]
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    if text in ("auto", "stated"):
+        return "auto" if text == "auto" else "stated"
+    value = _number(text)
     if not abs(value) <= LONGEST_DELAY:
         raise InputError(
             None,
@@ -130,26 +127,7 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
     return value
 
 
-def bandwidth_from(text: str) -> float | Literal["auto"]:
-    """Bandwidth of the positions in Hz as the option says it.
-
-    Raises:
-        InputError: it is none.
-    """
-    found = None if text == "none" else torque_bandwidth_from(text, "--bandwidth")
-    if found is None:
-        raise InputError(
-            None,
-            "the positions have to be smoothed",
-            field="--bandwidth",
-            remedy='give a frequency above 0 Hz, or "auto"',
-        )
-    return found
-
-
-def torque_bandwidth_from(
-    text: str, option: str = "--torque-bandwidth"
-) -> float | Literal["auto"] | None:
+def bandwidth_from(text: str, option: str = "--bandwidth") -> float | Literal["auto"]:
     """Bandwidth in Hz as the option says it.
 
     Raises:
@@ -157,17 +135,19 @@ def torque_bandwidth_from(
     """
     if text == "auto":
         return "auto"
-    if text == "none":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
+    value = _number(text)
+    if not 0.0 < value < math.inf:
         raise InputError(
             None,
             f"{text!r} is no bandwidth",
             field=option,
-            remedy='give a frequency above 0 Hz, "none" or "auto"',
+            remedy='give a frequency above 0 Hz, or "auto"',
         )
     return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

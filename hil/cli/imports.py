@@ -9,12 +9,20 @@ from typing import Annotated
 import typer
 
 from hil.archive import open_archive
-from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures, print_json
+from hil.cli.arguments import (
+    ConventionOption,
+    DhOption,
+    JsonOption,
+    exactly_one,
+    figures,
+    print_json,
+)
 from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     ColumnMap,
+    Convention,
     Effort,
     Robot,
     Use,
@@ -34,14 +42,11 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-Source = Annotated[Path, typer.Argument(help="The recording.", show_default=False)]
-Output = Annotated[
-    Path, typer.Option("--output", "-o", help="The archive to write (*.mcap).", show_default=False)
-]
-Urdf = Annotated[Path | None, typer.Option(help="URDF of the robot.", show_default=False)]
+Source = Annotated[Path, typer.Argument(help="The recording.")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="The archive to write (*.mcap).")]
+Urdf = Annotated[Path | None, typer.Option(help="URDF of the robot.")]
 CellFile = Annotated[
-    Path | None,
-    typer.Option(help="A cell file instead of --urdf and --friction.", show_default=False),
+    Path | None, typer.Option(help="A cell file instead of --urdf and --friction.")
 ]
 Gravity = Annotated[
     tuple[float, float, float] | None,
@@ -50,40 +55,32 @@ Gravity = Annotated[
         help="Gravity in the robot's base frame, m/s², for an arm on a wall, a ceiling or a slope: "
         "0 0 9.81 for one that hangs upside down; 0 0 0 if the torques are without gravity "
         "already. As of an upright arm, or as the cell says, if left out.",
-        show_default=False,
     ),
 ]
 Friction = Annotated[
-    str,
-    typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them."),
+    str, typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them.")
 ]
 Standstill = Annotated[
-    float,
-    typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted."),
+    float, typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted.")
 ]
 Locked = Annotated[
     list[str] | None,
     typer.Option(
-        "--locked",
         help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), held "
-        "there (at 0); may be repeated.",
-        show_default=False,
+        "there (at 0); may be repeated."
     ),
 ]
 LockOthers = Annotated[
     bool,
     typer.Option(
-        "--lock-others",
         help="Lock every joint of the URDF that was not recorded, at 0 or at the middle of a "
         "range without 0; the command says which. A log names those that were recorded in `joints` "
-        "of its map.",
+        "of its map."
     ),
 ]
 Held = Annotated[
     list[str] | None,
-    typer.Option(
-        "--held", help="A joint known to have stood still; may be repeated.", show_default=False
-    ),
+    typer.Option(help="A joint known to have stood still; may be repeated."),
 ]
 Kind = Annotated[
     Use,
@@ -105,23 +102,9 @@ def rosbag2(
     gravity: Gravity = None,
     friction: Friction = FRICTION,
     standstill: Standstill = 0.01,
-    topic: Annotated[
-        str | None, typer.Option(help="Topic of the joint states, if there is more than one.")
-    ] = None,
-    effort: Annotated[
-        Effort,
-        typer.Option(
-            help="What the effort field holds: torque (N·m), motor_current (A) or ignore."
-        ),
-    ] = "torque",
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="RECORDED=URDF",
-            help="A joint that the bag calls by another name than the URDF; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
+    topic: str | None = None,
+    effort: Effort = "torque",
+    rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     locked: Locked = None,
     lock_others: LockOthers = False,
     held: Held = None,
@@ -135,22 +118,20 @@ def rosbag2(
     recorded, --locked or --lock-others leaves those out of the model.
 
     **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
+
+    Options:
+        topic: Topic of the joint states, if there is more than one.
+        effort: What the effort field holds: torque (N·m), motor_current (A) or ignore.
+        rename: A joint that the bag calls by another name than the URDF; may be repeated.
     """
-    _require_one_robot(urdf, cell, dh)
+    exactly_one(urdf=urdf, cell=cell, dh=dh)
     names = _names(rename or [])
+    recorded = recorded_joints(source, topic, names) if lock_others else None
+    table = None if dh is None else convention_of(convention)
     path = import_rosbag2(
         source,
         output,
-        robot=_robot(
-            urdf,
-            cell,
-            dh,
-            convention,
-            gravity,
-            _law(friction, standstill),
-            figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)"),
-            recorded_joints(source, topic, names) if lock_others else None,
-        ),
+        robot=_robot(urdf or dh, cell, table, gravity, friction, standstill, locked, recorded),
         topic=topic,
         effort=effort,
         joint_names=names,
@@ -163,14 +144,7 @@ def rosbag2(
 def log(
     source: Source,
     output: Output,
-    columns: Annotated[
-        Path,
-        typer.Option(
-            "--map",
-            help="TOML file that says which columns or arrays hold what.",
-            show_default=False,
-        ),
-    ],
+    columns: Annotated[Path, typer.Option("--map")],
     urdf: Urdf = None,
     cell: CellFile = None,
     dh: DhOption = None,
@@ -182,14 +156,7 @@ def log(
     lock_others: LockOthers = False,
     held: Held = None,
     kind: Kind = "excitation",
-    uncoupled: Annotated[
-        bool,
-        typer.Option(
-            "--uncoupled",
-            help="Leave the inertias and the friction of coupled motors out of the model, to see "
-            "what they explain; angles and torques stay those of the map.",
-        ),
-    ] = False,
+    uncoupled: bool = False,
     json: JsonOption = False,
 ) -> None:
     """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
@@ -200,8 +167,13 @@ def log(
 
     **Example:** `hil import log log.csv --map map.toml --urdf arm.urdf -o log.mcap`, with
     `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
+
+    Options:
+        columns: TOML file that says which columns or arrays hold what.
+        uncoupled: Leave the inertias and the friction of coupled motors out of the model, to see
+            what they explain; angles and torques stay those of the map.
     """
-    _require_one_robot(urdf, cell, dh)
+    exactly_one(urdf=urdf, cell=cell, dh=dh)
     found = ColumnMap.load(columns)
     if lock_others and found.joints is None:
         raise InputError(
@@ -210,19 +182,12 @@ def log(
             field="joints",
             remedy="--lock-others needs joints = [...], the URDF's joint of each column",
         )
+    recorded = found.joints if lock_others else None
+    table = None if dh is None else convention_of(convention)
     path = import_log(
         source,
         output,
-        robot=_robot(
-            urdf,
-            cell,
-            dh,
-            convention,
-            gravity,
-            _law(friction, standstill),
-            figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)"),
-            found.joints if lock_others else None,
-        ),
+        robot=_robot(urdf or dh, cell, table, gravity, friction, standstill, locked, recorded),
         columns=found,
         held_joints=held or (),
         use=kind,
@@ -252,41 +217,37 @@ def _tell(path: Path, *, json: bool) -> None:
     say(f"wrote {path}")
 
 
-def _require_one_robot(urdf: Path | None, cell: Path | None, dh: Path | None) -> None:
-    given = [name for name, path in (("--urdf", urdf), ("--cell", cell), ("--dh", dh)) if path]
-    if len(given) != 1:
-        raise InputError(
-            None,
-            "both describe the robot" if given else "whose recording is it?",
-            field=" and ".join(given) or "--urdf",
-            remedy="leave out one of them (a cell file names its own URDF)"
-            if given
-            else "give --urdf, --cell or --dh",
-        )
-
-
 def _robot(
-    urdf: Path | None,
+    path: Path | None,
     cell: Path | None,
-    dh: Path | None,
-    convention: str | None,
+    convention: Convention | None,
     gravity: tuple[float, float, float] | None,
-    law: FrictionLaw,
-    locked: dict[str, float],
+    friction: str,
+    standstill: float,
+    locked: list[str] | None,
     recorded: tuple[str, ...] | None,
 ) -> Robot:
-    if gravity is not None and not all(math.isfinite(one) for one in gravity):
+    """The robot of a cell file, else of `path`: a URDF, or with a convention a DH table."""
+    if gravity is not None and not all(map(math.isfinite, gravity)):
         raise InputError(
             None, f"{gravity} is no vector", field="--gravity", remedy="give m/s², as in 0 0 -9.81"
         )
+    if not math.isfinite(standstill):
+        raise InputError(
+            None, f"{standstill} is no speed", field="--standstill", remedy="give rad/s, as in 0.01"
+        )
+    at = figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
+    law = FrictionLaw.from_table({**friction_from(friction), "standstill": standstill})
     if cell is not None:
-        return Robot.from_cell(cell, gravity=gravity, locked=locked, recorded=recorded)
-    down = STANDARD_GRAVITY if gravity is None else gravity
-    table = None if dh is None else convention_of(convention)
-    path = urdf or dh
+        return Robot.from_cell(cell, gravity=gravity, locked=at, recorded=recorded)
     assert path is not None
     return Robot.from_urdf(
-        path, convention=table, friction=law, gravity=down, locked=locked, recorded=recorded
+        path,
+        convention=convention,
+        friction=law,
+        gravity=STANDARD_GRAVITY if gravity is None else gravity,
+        locked=at,
+        recorded=recorded,
     )
 
 
@@ -301,11 +262,3 @@ def _names(renamed: list[str]) -> dict[str, str]:
             )
         names[recorded] = name
     return names
-
-
-def _law(terms: str, standstill: float) -> FrictionLaw:
-    if not math.isfinite(standstill):
-        raise InputError(
-            None, f"{standstill} is no speed", field="--standstill", remedy="give rad/s, as in 0.01"
-        )
-    return FrictionLaw.from_table({**friction_from(terms), "standstill": standstill})

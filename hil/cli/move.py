@@ -30,65 +30,15 @@ from hil.terminal_text import printable
 
 
 def move(
-    where: Annotated[
-        Path,
-        typer.Argument(metavar="CELL|CAMPAIGN", help="A cell file, or a campaign's folder."),
-    ] = Path("cell.toml"),
-    to: Annotated[
-        str | None,
-        typer.Option(
-            metavar="start|home|POSTURE",
-            help="home_deg of the cell; the start of the campaign's excitation (of a cell alone: "
-            'home); or angles in degrees in the frame of [limits], "0,-20,-90,0,60,0".',
-            show_default=False,
-        ),
-    ] = None,
-    joint: Annotated[
-        str | None,
-        typer.Option(
-            help="Instead of --to: one joint, by name or number from 1.", show_default=False
-        ),
-    ] = None,
-    by: Annotated[
-        float | None, typer.Option(help="How far it turns, degrees.", show_default=False)
-    ] = None,
-    speed: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            max=100.0,
-            help="Percent of the joints' speeds; the cell's approach_speed if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The archive (*.mcap), or a folder to number it in; runs/move if left out, of a "
-            "campaign its own archives.",
-            show_default=False,
-        ),
-    ] = None,
-    yes: Annotated[
-        bool,
-        typer.Option(
-            "--yes",
-            "-y",
-            help="Do not ask: the way is free, and somebody looks. What may be a real arm then "
-            "goes no faster than the cell's approach_speed.",
-        ),
-    ] = False,
+    where: Annotated[Path, typer.Argument(metavar="CELL|CAMPAIGN")] = Path("cell.toml"),
+    to: Annotated[str | None, typer.Option(metavar="start|home|POSTURE")] = None,
+    joint: str | None = None,
+    by: float | None = None,
+    speed: Annotated[float | None, typer.Option(min=0.1, max=100.0)] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y")] = False,
     accept_init: AcceptInitOption = False,
-    only_axis: Annotated[
-        bool,
-        typer.Option(
-            "--only-axis",
-            help="With --joint: the controller's program opens the axis of that joint only, and "
-            "the others have to stay closed.",
-        ),
-    ] = False,
+    only_axis: bool = False,
     json: JsonOption = False,
 ) -> None:
     """Move the arm on a straight way in joint space, slowly, and archive it.
@@ -105,6 +55,20 @@ def move(
     Exit status 0 when it arrived (or was there), 2 when what was typed cannot be used or the
     planner failed, 3 when the way is refused or nobody confirmed it,
     4 when the controller or the link failed, 130 when it was stopped.
+
+    Options:
+        where: A cell file, or a campaign's folder.
+        to: home_deg of the cell; the start of the campaign's excitation (of a cell alone: home); or
+            angles in degrees in the frame of [limits], "0,-20,-90,0,60,0".
+        joint: Instead of --to: one joint, by name or number from 1.
+        by: How far it turns, degrees.
+        speed: Percent of the joints' speeds; the cell's approach_speed if left out.
+        output: The archive (*.mcap), or a folder to number it in; runs/move if left out, of a
+            campaign its own archives.
+        yes: Do not ask: the way is free, and somebody looks. What may be a real arm then goes no
+            faster than the cell's approach_speed.
+        only_axis: With --joint: the controller's program opens the axis of that joint only, and the
+            others have to stay closed.
     """
     if (to is None) == (joint is None) or (joint is None) != (by is None):
         raise InputError(

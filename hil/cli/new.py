@@ -8,13 +8,20 @@ from typing import Annotated
 import typer
 
 from hil.campaign import stop_on_interrupt
-from hil.cli.arguments import ConventionOption, DhOption, JsonOption, figures, print_json
+from hil.cli.arguments import (
+    ConventionOption,
+    DhOption,
+    JsonOption,
+    at_most_one,
+    exactly_one,
+    figures,
+    print_json,
+)
 from hil.errors import InputError
-from hil.files import write_atomically
+from hil.files import write_atomically, writing_to
 from hil.importers import convention_of
 from hil.new import (
     Known,
-    NewCell,
     cell_of_dh,
     cell_of_urdf,
     from_archive,
@@ -30,55 +37,20 @@ PORT = 1000
 
 
 def new(
-    urdf: Annotated[Path | None, typer.Option(help="The arm's URDF.", show_default=False)] = None,
+    urdf: Path | None = None,
     dh: DhOption = None,
     convention: ConventionOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The cell file to write.")] = Path(
-        "cell.toml"
-    ),
-    from_controller: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST[:PORT]",
-            help="Take gears, calibration, coupling, current limits, following errors and cycle "
-            "from the init packet of the controller at HOST; this PC listens on PORT (1000).",
-            show_default=False,
-        ),
-    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("cell.toml"),
+    from_controller: Annotated[str | None, typer.Option(metavar="HOST[:PORT]")] = None,
     from_archive_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--from-archive",
-            metavar="ARCHIVE",
-            help="Take what an archive of this arm carries: its cell and its init packet.",
-            show_default=False,
-        ),
+        Path | None, typer.Option("--from-archive", metavar="ARCHIVE")
     ] = None,
-    bind: Annotated[
-        str, typer.Option(help="Address of this PC to listen on; 0.0.0.0 for all of them.")
-    ] = "0.0.0.0",
-    arm: Annotated[int, typer.Option(min=1, max=4, help="Arm of the controller.")] = 1,
-    wait: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to wait for the controller.")
-    ] = 300.0,
-    fix: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="JOINT[=POSITION]",
-            help="A joint that is not to move, at a position in rad or m (0 if left out); may be "
-            "repeated. Sliding joints are fixed in any case.",
-            show_default=False,
-        ),
-    ] = None,
-    design_only: Annotated[
-        bool,
-        typer.Option(
-            "--design-only",
-            help="For an arm whose motions another controller runs: no drive train and no link in "
-            "the file, what a design needs beside the URDF assumed and named.",
-        ),
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an earlier file.")] = False,
+    bind: str = "0.0.0.0",
+    arm: Annotated[int, typer.Option(min=1, max=4)] = 1,
+    wait: Annotated[float, typer.Option(min=0.0)] = 300.0,
+    fix: Annotated[list[str] | None, typer.Option(metavar="JOINT[=POSITION]")] = None,
+    design_only: bool = False,
+    force: bool = False,
     json: JsonOption = False,
 ) -> None:
     """Write a commented cell file for an arm; what nobody has said is marked "?".
@@ -93,22 +65,33 @@ def new(
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`,
     `hil new --dh table.csv --convention modified -o cell.toml`,
     `hil new --design-only --urdf robot.urdf -o cell.toml`
+
+    Options:
+        urdf: The arm's URDF.
+        output: The cell file to write.
+        from_controller: Take gears, calibration, coupling, current limits, following errors and
+            cycle from the init packet of the controller at HOST; this PC listens on PORT (1000).
+        from_archive_file: Take what an archive of this arm carries: its cell and its init packet.
+        bind: Address of this PC to listen on; 0.0.0.0 for all of them.
+        arm: Arm of the controller.
+        wait: Seconds to wait for the controller.
+        fix: A joint that is not to move, at a position in rad or m (0 if left out); may be
+            repeated. Sliding joints are fixed in any case.
+        design_only: For an arm whose motions another controller runs: no drive train and no link in
+            the file, what a design needs beside the URDF assumed and named.
+        force: Replace an earlier file.
     """
-    if from_controller is not None and from_archive_file is not None:
-        raise InputError(
-            None, "controller and archive at once", remedy="give one of the two --from options"
-        )
-    if design_only and (from_controller is not None or from_archive_file is not None):
-        raise InputError(
-            None,
-            "excludes --from-controller and --from-archive",
-            field="--design-only",
-            remedy="leave out one of them",
-        )
-    _require_free(output, force=force)
-    made = _described(
-        urdf, dh, convention, figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
+    exactly_one(urdf=urdf, dh=dh)
+    at_most_one(
+        design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
     )
+    _require_free(output, force=force)
+    fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
+    if urdf is not None:
+        made = cell_of_urdf(urdf, fixed)
+    else:
+        assert dh is not None
+        made = cell_of_dh(dh, convention_of(convention), fixed)
     if made.urdf is not None:
         _require_free(made.urdf_beside(output), force=force, own=made.urdf_path)
     known = made.known
@@ -122,13 +105,11 @@ def new(
     text, unknown = (made.for_design() if design_only else made).text(output)
     if design_only and not unknown:
         text = with_clear_home(text, made, output)
-    try:
+    with writing_to(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
-    except OSError as error:
-        raise InputError(output, f"cannot be written ({error.strerror})") from error
     if json:
         summary = {
             "cell": str(output),
@@ -147,22 +128,6 @@ def new(
         say(f"fill them in, then `hil {after} {output}`; whatever is missing is named again")
     elif design_only:
         say(f"read what is assumed in it; then `hil design {output}`")
-
-
-def _described(
-    urdf: Path | None, dh: Path | None, convention: str | None, fixed: dict[str, float]
-) -> NewCell:
-    """What the URDF or the DH parameters say."""
-    if urdf is not None and dh is None:
-        return cell_of_urdf(urdf, fixed)
-    if dh is not None and urdf is None:
-        return cell_of_dh(dh, convention_of(convention), fixed)
-    raise InputError(
-        None,
-        "both describe the arm" if urdf else "which arm is it?",
-        field="--urdf and --dh" if urdf else "--urdf",
-        remedy="leave out one of them" if urdf else "give --urdf or --dh",
-    )
 
 
 def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:

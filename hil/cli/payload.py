@@ -21,52 +21,14 @@ from hil.progress import reporter as make_reporter
 
 
 def payload(
-    bare: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Archives (*.mcap) recorded without the payload, or campaign folders.",
-            show_default=False,
-            metavar="BARE...",
-        ),
-    ],
-    loaded: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--loaded",
-            help="Archive recorded with it, or campaign folder; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            help="Link of the URDF in whose frame the figures are. If left out: tool0 or flange "
-            "where one is fixed to the last joint, else the link of that joint.",
-            show_default=False,
-        ),
-    ] = None,
+    bare: Annotated[list[Path], typer.Argument(metavar="BARE...")],
+    loaded: list[Path] | None = None,
+    frame: str | None = None,
     shape: Annotated[
-        tuple[str, float, float, float] | None,
-        typer.Option(
-            metavar="box X Y Z",
-            help="Edges in m of a uniform box along the axes of the frame: what the motion does "
-            "not determine is that of the possible body closest to it. If left out: to a point.",
-            show_default=False,
-        ),
+        tuple[str, float, float, float] | None, typer.Option(metavar="box X Y Z")
     ] = None,
-    check: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="A figure that is known, such as mass=4.0 (kg): exit status 5 if it lies outside "
-            "its 95 % interval. May be repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option(help="File for the payload as a link of a URDF.", show_default=False),
-    ] = None,
+    check: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")] = None,
+    urdf: Path | None = None,
     delay: DelayOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -76,6 +38,17 @@ def payload(
     The difference of recordings without and with it, on one model of the arm. Prints the figures
     as they are typed into a COMAU, UR and Franka controller. Exit status 5 if a figure of --check
     lies outside its interval, or no possible body fits the recordings.
+
+    Options:
+        bare: Archives (*.mcap) recorded without the payload, or campaign folders.
+        loaded: Archive recorded with it, or campaign folder; may be repeated.
+        frame: Link of the URDF in whose frame the figures are. If left out: tool0 or flange where
+            one is fixed to the last joint, else the link of that joint.
+        shape: Edges in m of a uniform box along the axes of the frame: what the motion does not
+            determine is that of the possible body closest to it. If left out: to a point.
+        check: A figure that is known, such as mass=4.0 (kg): exit status 5 if it lies outside its
+            95 % interval. May be repeated.
+        urdf: File for the payload as a link of a URDF.
     """
     box, wanted = _box(shape), figures(check or [], "--check", "mass=4.0", bare=False)
     reporter = make_reporter(quiet=quiet or json)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import json as json_format
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
+from json import dumps as json_text
 from math import isfinite, radians
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
@@ -15,12 +14,12 @@ import typer
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
-from hil.cli.arguments import JsonOption
+from hil.cli.arguments import JsonOption, exactly_one, print_json
 from hil.errors import InputError
-from hil.files import write_atomically
+from hil.files import write_atomically, writing_to
 from hil.plots import check_format, draw_plan, save
 from hil.random_motion import random_via_points
-from hil.reading import remedy_of, text_of
+from hil.reading import json_of, named_text
 from hil.terminal_text import printable
 from planner.errors import (
     InvalidPlanFile,
@@ -46,13 +45,13 @@ def read_plan_file(path: Path) -> PlanFile:
     Raises:
         InputError: it cannot be read, or is not a plan.
     """
-    text = _text(path)
+    text = named_text(path).removeprefix("\ufeff")
     try:
         if path.suffix.lower() == ".toml":
             return PlanFile.from_toml(text)
-        return PlanFile.from_dict(json.loads(text))
+        return PlanFile.from_dict(json_of(text))
     except (ValueError, AttributeError) as error:
-        raise InputError(path, str(error)) from error
+        raise InputError(path, str(error), remedy="name a plan file") from error
     except RecursionError as error:
         raise InputError(path, "is nested too deeply", remedy="name a plan file") from error
 
@@ -113,7 +112,9 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     """
     points: list[list[float]] = []
     first = True
-    for number, line in enumerate(_text(path).splitlines(), 1):
+    # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
+    text = named_text(path).removeprefix("\ufeff")
+    for number, line in enumerate(text.splitlines(), 1):
         cells = line.split("#")[0].replace(",", " ").replace(";", " ").split()
         if not cells:
             continue
@@ -145,31 +146,12 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     return frame.urdf(np.array(points))
 
 
-def moves_through(
-    points: Sequence[Array] | Array, *, fly: Fly, speed: float, acceleration: float
-) -> tuple[Move, ...]:
-    """Return one move to each point but the first."""
-    return tuple(
-        Move(target=point, speed=speed, acceleration=acceleration, fly=fly) for point in points[1:]
-    )
-
-
 def _number(cell: str) -> float | None:
-    """Return the number in a cell, or None; Python's own `1_000` is no number of a table."""
+    """The number in a cell, or None; Python's own `1_000` is no number of a table."""
     try:
         return None if "_" in cell else float(cell)
     except ValueError:
         return None
-
-
-def _text(path: Path) -> str:
-    try:
-        # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
-        return text_of(path).removeprefix("\ufeff")
-    except (OSError, UnicodeDecodeError) as error:
-        remedy = remedy_of(error, "name another file")
-        why = error.strerror if isinstance(error, OSError) else error
-        raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
 
 
 _RATES = ("velocity", "acceleration", "jerk")
@@ -178,55 +160,19 @@ _MOST_ROWS = 1_000_000
 
 
 def plan(
-    cell: Annotated[Path, typer.Argument(help="The cell file.", show_default=False)],
-    via: Annotated[
-        Path | None,
-        typer.Option(
-            help="Via points: a table in degrees, one row per point, the first is the start; or a "
-            "plan file (*.toml, *.json).",
-            show_default=False,
-        ),
-    ] = None,
-    random: Annotated[
-        int | None,
-        typer.Option(min=1, help="So many random via points instead.", show_default=False),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random via points.")] = 0,
-    speed: Annotated[
-        float, typer.Option(min=0.01, max=100.0, help="Percent of the joints' speeds.")
-    ] = 100.0,
-    acceleration: Annotated[
-        float, typer.Option(min=0.01, max=100.0, help="Percent of the joints' accelerations.")
-    ] = 100.0,
-    fly: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Fly in percent (FLY_NORM); 0 stops.")
-    ] = 50.0,
-    fly_distance: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Instead of --fly: degrees of joint space by which a via point may be missed.",
-            show_default=False,
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Write a plan file (*.toml, *.json)."),
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(help="Write a table of time, position, velocity, acceleration.")
-    ] = None,
-    rate: Annotated[
-        float | None,
-        typer.Option(help="Rows a second of that table; those of the cell's cycle if left out."),
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw the plan (*.png, *.svg, *.pdf).")
-    ] = None,
-    corner: Annotated[
-        int | None,
-        typer.Option(min=1, help="Target to draw the corner of; else where the path turns most."),
-    ] = None,
+    cell: Path,
+    via: Path | None = None,
+    random: Annotated[int | None, typer.Option(min=1)] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
+    acceleration: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
+    fly: Annotated[float, typer.Option(min=0.0, max=100.0)] = 50.0,
+    fly_distance: Annotated[float | None, typer.Option(min=0.0)] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    csv: Path | None = None,
+    rate: float | None = None,
+    picture: Path | None = None,
+    corner: Annotated[int | None, typer.Option(min=1)] = None,
     json: JsonOption = False,
 ) -> None:
     """Plan a motion through via points and say how each of them is passed. Nothing moves.
@@ -237,56 +183,23 @@ def plan(
     against itself.
 
     **Example:** `hil plan cell.toml --random 6 --fly 50 --picture plan.png`
+
+    Options:
+        cell: The cell file.
+        via: Via points: a table in degrees, one row per point, the first is the start; or a plan
+            file (*.toml, *.json).
+        random: So many random via points instead.
+        seed: Of the random via points.
+        speed: Percent of the joints' speeds.
+        acceleration: Percent of the joints' accelerations.
+        fly: Fly in percent (FLY_NORM); 0 stops.
+        fly_distance: Instead of --fly: degrees of joint space by which a via point may be missed.
+        output: Write a plan file (*.toml, *.json).
+        csv: Write a table of time, position, velocity, acceleration.
+        rate: Rows a second of that table; those of the cell's cycle if left out.
+        picture: Draw the plan (*.png, *.svg, *.pdf).
+        corner: Target to draw the corner of; else where the path turns most.
     """
-    _check_requests(output, picture, rate)
-    loaded = Cell.load(cell)
-    frame = AngleFrame.of(loaded)
-    if (via is None) == (random is None):
-        raise InputError(None, "what is to be planned?", remedy="give either --via or --random")
-    if via is not None and via.suffix.lower() in PLAN_FILES:
-        planned = planned_again(via, loaded)
-    else:
-        points = (
-            random_via_points(loaded, frame, random or 1, seed)
-            if via is None
-            else read_via_points(via, frame)
-        )
-        asked: Fly = FlyPercent(fly) if fly_distance is None else FlyDistance(radians(fly_distance))
-        moves = moves_through(points, fly=asked, speed=speed / 100, acceleration=acceleration / 100)
-        planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
-    if corner is not None and corner >= len(planned.moves):
-        raise InputError(
-            None,
-            f"target {corner} is no corner",
-            field="--corner",
-            remedy=f"there are {len(planned.moves)} targets, the last one is a stop",
-        )
-    names = loaded.joint_names
-    rows_a_second = _cycles_a_second(loaded) if rate is None else rate
-    if csv is not None:
-        _check_rows(planned.duration, rows_a_second)
-    typer.echo(
-        json_format.dumps(_summary(planned, loaded, frame))
-        if json
-        else printable(_table(planned, loaded, frame))
-    )
-    if output is not None:
-        _write_plan(output, PlanFile.of(planned, names))
-    if csv is not None:
-        _write(csv, to_csv(planned.trajectory, rows_a_second, names))
-    if picture is not None:
-        figure = draw_plan(
-            planned,
-            names,
-            frame,
-            title=loaded.name,
-            corner=None if corner is None else corner - 1,
-        )
-        save(figure, picture)
-
-
-def _check_requests(output: Path | None, picture: Path | None, rate: float | None) -> None:
-    """Refuse what could be written in no case before time is spent on planning."""
     if output is not None and output.suffix.lower() not in PLAN_FILES:
         raise InputError(
             output,
@@ -300,20 +213,54 @@ def _check_requests(output: Path | None, picture: Path | None, rate: float | Non
         raise InputError(
             None, f"{rate} rows a second make no table", field="--rate", remedy="give more than 0"
         )
-
-
-def _check_rows(duration: float, rate: float) -> None:
-    if duration * rate > _MOST_ROWS:
+    exactly_one(via=via, random=random)
+    loaded = Cell.load(cell)
+    frame = AngleFrame.of(loaded)
+    if via is not None and via.suffix.lower() in PLAN_FILES:
+        planned = planned_again(via, loaded)
+    else:
+        points = (
+            random_via_points(loaded, frame, random or 1, seed)
+            if via is None
+            else read_via_points(via, frame)
+        )
+        asked: Fly = FlyPercent(fly) if fly_distance is None else FlyDistance(radians(fly_distance))
+        moves = [
+            Move(target=point, speed=speed / 100, acceleration=acceleration / 100, fly=asked)
+            for point in points[1:]
+        ]
+        planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
+    if corner is not None and corner >= len(planned.moves):
         raise InputError(
             None,
-            f"{rate:g} rows a second of a motion of {duration:.3f} s are too many for a table",
+            f"target {corner} is no corner",
+            field="--corner",
+            remedy=f"there are {len(planned.moves)} targets, the last one is a stop",
+        )
+    names = loaded.joint_names
+    if rate is None:
+        rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
+    if csv is not None and planned.duration * rate > _MOST_ROWS:
+        raise InputError(
+            None,
+            f"{rate:g} rows a second of a motion of {planned.duration:.3f} s are too many for a "
+            "table",
             field="--rate",
             remedy=f"give a lower rate; at most {_MOST_ROWS} rows are written",
         )
-
-
-def _cycles_a_second(cell: Cell) -> float:
-    return 1000.0 if cell.file.controller is None else 1.0 / cell.period
+    if json:
+        print_json(_summary(planned, loaded, frame))
+    else:
+        typer.echo(printable(_table(planned, loaded, frame)))
+    if output is not None:
+        file = PlanFile.of(planned, names)
+        toml = output.suffix.lower() == ".toml"
+        _write(output, file.to_toml() if toml else json_text(file.to_dict()) + "\n")
+    if csv is not None:
+        _write(csv, to_csv(planned.trajectory, rate, names))
+    if picture is not None:
+        drawn = None if corner is None else corner - 1
+        save(draw_plan(planned, names, frame, title=loaded.name, corner=drawn), picture)
 
 
 def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:
@@ -378,15 +325,6 @@ def _worst(plan: MotionPlan) -> tuple[float, str, int]:
     return float(ratios.max()), _RATES[quantity], joint
 
 
-def _write_plan(path: Path, file: PlanFile) -> None:
-    if path.suffix.lower() == ".toml":
-        _write(path, file.to_toml())
-    else:
-        _write(path, json_format.dumps(file.to_dict()) + "\n")
-
-
 def _write(path: Path, text: str) -> None:
-    try:
+    with writing_to(path):
         write_atomically(path, text)
-    except OSError as error:
-        raise InputError(path, f"cannot be written ({error.strerror})") from error

@@ -29,38 +29,13 @@ LINE_PERIOD = 5.0
 
 
 def record(
-    cell: Annotated[Path, typer.Argument(help="The cell file.", show_default=False)],
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", help="The archive (*.mcap), or a folder to number it in."),
-    ] = Path("runs/record"),
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001, help="Seconds to record; until Ctrl-C if left out.", show_default=False
-        ),
-    ] = None,
-    wait: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Seconds to wait for the controller; for ever if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    kind: Annotated[
-        Literal["excitation", "validation", "standstill"],
-        typer.Option(help="What it is for: to be fitted, to be predicted, or for the noise."),
-    ] = "excitation",
+    cell: Path,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/record"),
+    duration: Annotated[float | None, typer.Option(min=0.001)] = None,
+    wait: Annotated[float | None, typer.Option(min=0.0)] = None,
+    kind: Literal["excitation", "validation", "standstill"] = "excitation",
     accept_init: AcceptInitOption = False,
-    live: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            help="Let Foxglove look meanwhile, e.g. 127.0.0.1:8765.",
-            show_default=False,
-        ),
-    ] = None,
+    live: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -82,6 +57,14 @@ def record(
     was refused (the line that begins with REFUSED says why), the controller did not come within
     --wait or ended before --duration was over, 130 when Ctrl-C cut short what --duration asked for,
     or the wait for the controller.
+
+    Options:
+        cell: The cell file.
+        output: The archive (*.mcap), or a folder to number it in.
+        duration: Seconds to record; until Ctrl-C if left out.
+        wait: Seconds to wait for the controller; for ever if left out.
+        kind: What it is for: to be fitted, to be predicted, or for the noise.
+        live: Let Foxglove look meanwhile, e.g. 127.0.0.1:8765.
     """
     loaded = Cell.load(cell)
     path = archive_path(output, kind)

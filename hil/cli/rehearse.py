@@ -17,18 +17,8 @@ from .verdict import NOT_GOOD
 
 def rehearse(
     campaign: CampaignArgument,
-    seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            help="Of what is planted in the simulated arm, its noise and its link's faults; 1 if "
-            "left out.",
-            show_default=False,
-        ),
-    ] = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Rehearse once more, even if it passed.")
-    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    again: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -42,6 +32,11 @@ def rehearse(
     and plan. It takes one or two minutes; Ctrl-C stops it, and the same command goes on.
 
     Exit status 0 if it passed, 5 if not.
+
+    Options:
+        seed: Of what is planted in the simulated arm, its noise and its link's faults; 1 if left
+            out.
+        again: Rehearse once more, even if it passed.
     """
     reporter = make_reporter(quiet=quiet or json)
     with stop_on_interrupt() as stop:

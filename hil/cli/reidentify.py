@@ -228,48 +228,12 @@ SOME_BROKEN: Final = 5
 
 
 def reidentify(
-    places: Annotated[
-        list[str],
-        typer.Argument(
-            help="Folders with archives anywhere below, archives, or URLs of either.",
-            show_default=False,
-            metavar="FOLDER...",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder for the tables (CSV, Parquet) and the trend report; none if left out.",
-            show_default=False,
-        ),
-    ] = None,
-    estimator: Annotated[
-        BatchEstimator,
-        typer.Option(help="One of those that need no sample: see `hil identify --estimator`."),
-    ] = "auto",
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes; one for each core if left out.", show_default=False),
-    ] = None,
-    cache: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FOLDER|none",
-            help="Where factors are cached. If left out: .hil-cache beside the archives, or below "
-            "the user's cache folder where those cannot be written to.",
-            show_default=False,
-        ),
-    ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Scheduler of a Dask cluster that does the work, such as tcp://host:8786.",
-            show_default=False,
-        ),
-    ] = None,
+    places: Annotated[list[str], typer.Argument(metavar="FOLDER...")],
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    estimator: BatchEstimator = "auto",
+    workers: Annotated[int | None, typer.Option(min=1)] = None,
+    cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     bandwidth: BandwidthOption = "auto",
     velocity: VelocityOption = "auto",
     friction: FrictionOption = "auto",
@@ -288,6 +252,15 @@ def reidentify(
     Exit status: 0 every archive that is meant to be fitted was used, 5 some could not be (they are
     reported with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
     moves, motions that were stopped, and copies, is left alone, and summed up by reason.
+
+    Options:
+        places: Folders with archives anywhere below, archives, or URLs of either.
+        output: Folder for the tables (CSV, Parquet) and the trend report; none if left out.
+        estimator: One of those that need no sample: see `hil identify --estimator`.
+        workers: Processes; one for each core if left out.
+        cache: Where factors are cached. If left out: .hil-cache beside the archives, or below the
+            user's cache folder where those cannot be written to.
+        dask: Scheduler of a Dask cluster that does the work, such as tcp://host:8786.
     """
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:

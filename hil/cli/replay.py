@@ -21,25 +21,8 @@ from hil.replaying import ENSEMBLE, replay_motions
 
 def replay(
     archives: ArchivesArgument,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The figure (*.png, *.svg, *.pdf); if left out replay.png, in the campaign folder "
-            "or here.",
-            show_default=False,
-        ),
-    ] = None,
-    ensemble: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=1000,
-            help="Number of variants, as far apart as the parameters are uncertain, that are "
-            "simulated as well; 0 for none.",
-        ),
-    ] = ENSEMBLE,
+    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    ensemble: Annotated[int, typer.Option(min=0, max=1000)] = ENSEMBLE,
     estimator: EstimatorOption = "auto",
     friction: FrictionOption = "auto",
     delay: DelayOption = None,
@@ -55,6 +38,12 @@ def replay(
     report of a campaign that was identified alike. Exit status 5 if the model is not good.
 
     **Example:** `hil replay runs/demo`
+
+    Options:
+        output: The figure (*.png, *.svg, *.pdf); if left out replay.png, in the campaign folder or
+            here.
+        ensemble: Number of variants, as far apart as the parameters are uncertain, that are
+            simulated as well; 0 for none.
     """
     reporter = make_reporter(quiet=quiet or json)
     folder = archives[0] if archives[0].is_dir() else Path()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -16,10 +15,7 @@ from hil.results import Results, csv_tables
 
 def report(
     campaign: CampaignArgument,
-    csv: Annotated[
-        Path | None,
-        typer.Option(help="Folder for every table of the results as CSV.", show_default=False),
-    ] = None,
+    csv: Path | None = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -27,6 +23,9 @@ def report(
 
     From the results that are there, without estimating anything; where archives have come since,
     or nothing was identified yet, as `hil identify` does it.
+
+    Options:
+        csv: Folder for every table of the results as CSV.
     """
     opened = Campaign.open(campaign)
     page = opened.report(reporter=make_reporter(quiet=quiet or json))

@@ -29,52 +29,13 @@ from hil.weighing import weigh
 
 def run(
     campaign: CampaignArgument,
-    rehearse: Annotated[
-        bool,
-        typer.Option("--rehearse", help="Rehearse the plan first, where that was not passed yet."),
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only the dry run: every motion at 20 % of its speed.")
-    ] = False,
-    accept_dry_run: Annotated[
-        bool,
-        typer.Option(
-            "--accept-dry-run",
-            help="I watched the dry run and the motions are free. On a simulated controller it "
-            "need not have been done before.",
-        ),
-    ] = False,
-    accept_torque: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--accept-torque",
-            metavar="JOINT",
-            help="With --accept-dry-run: I know why the torque of this joint ran against the "
-            "model's gravity in the dry run that was done before. Repeat it.",
-            show_default=False,
-        ),
-    ] = None,
-    no_identify: Annotated[
-        bool, typer.Option("--no-identify", help="Only run; no parameters, no report.")
-    ] = False,
-    payload: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Weigh a payload: run the excitation without and with it in turns, asking for it "
-            "to be mounted and removed, until another pair is not worth it. The recordings lie "
-            "in the folder payload/NAME of CAMPAIGN.",
-            show_default=False,
-        ),
-    ] = None,
-    live: Annotated[
-        str | None,
-        typer.Option(
-            metavar="[HOST:]PORT",
-            help="Let Foxglove look at the run as it goes on; on 127.0.0.1 unless a HOST is named.",
-            show_default=False,
-        ),
-    ] = None,
+    rehearse: bool = False,
+    dry_run: bool = False,
+    accept_dry_run: bool = False,
+    accept_torque: Annotated[list[str] | None, typer.Option(metavar="JOINT")] = None,
+    no_identify: bool = False,
+    payload: Annotated[str | None, typer.Option(metavar="NAME")] = None,
+    live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -95,6 +56,19 @@ def run(
     Exit status 0 when the model is good (with --dry-run or --no-identify: when all was run), 3
     when a gate refuses, 4 when the controller or the link failed, 5 when the model is not good or
     a motion was of no use again and again, 130 when it was stopped.
+
+    Options:
+        rehearse: Rehearse the plan first, where that was not passed yet.
+        dry_run: Only the dry run: every motion at 20 % of its speed.
+        accept_dry_run: I watched the dry run and the motions are free. On a simulated controller it
+            need not have been done before.
+        accept_torque: With --accept-dry-run: I know why the torque of this joint ran against the
+            model's gravity in the dry run that was done before. Repeat it.
+        no_identify: Only run; no parameters, no report.
+        payload: Weigh a payload: run the excitation without and with it in turns, asking for it to
+            be mounted and removed, until another pair is not worth it. The recordings lie in the
+            folder payload/NAME of CAMPAIGN.
+        live: Let Foxglove look at the run as it goes on; on 127.0.0.1 unless a HOST is named.
     """
     if dry_run and accept_dry_run:
         raise InputError(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from select import select
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -18,10 +18,9 @@ from hil.errors import InputError
 from hil.move import joint_index
 from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
-from hil.terminal_text import printable
+from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, SimulatedController
-from sim_fixtures.errors import SettingError
-from sim_fixtures.faults import Fault, FaultScriptError, parse_fault, split_faults
+from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import PATIENCE, Histogram, Tally
 
@@ -173,146 +172,85 @@ LOST_OPENINGS: Final = 20
 REOPENING: Final = 1.0
 """Seconds at least until the axes open again after such a loss."""
 
-CellArgument = Annotated[
-    Path, typer.Argument(help="Cell file with a [simulation] table.", show_default=False)
-]
-Udp = Annotated[
-    str | None,
-    typer.Option(metavar="HOST:PORT", help="Where the PC program listens.", show_default=False),
-]
-Can = Annotated[
-    str | None,
-    typer.Option(
-        metavar="INTERFACE:CHANNEL[:fd|classic]",
-        help="A CAN bus instead, by its python-can names, e.g. socketcan:can0.",
-        show_default=False,
-    ),
-]
-Cycle = Annotated[
-    int | None, typer.Option(min=1, max=2, help="Cycle in ms; the cell's if left out.")
-]
-Mode = Annotated[
-    int | None,
-    typer.Option(help="Open mode: 1, 2, 4, 5, 7, 8 or 9; the cell's if left out."),
-]
-Stagger = Annotated[
-    int, typer.Option(min=0, help="Cycles between one axis entering open mode and the next.")
-]
-OnlyAxis = Annotated[
-    int | None,
-    typer.Option("--only-axis", min=1, help="Open this axis only; the others stay closed."),
-]
-Missed = Annotated[
-    int, typer.Option(min=1, help="Missing replies in a row that end open mode (real: unknown).")
-]
-WhileSilent = Annotated[
-    Literal["hold", "continue", "drive-off"],
-    typer.Option(help="What the arm does in a cycle of open mode that no reply came in."),
-]
-Intervals = Annotated[
-    int | None,
-    typer.Option(min=1, help="Intervals of open mode until the session ends; endless if left out."),
-]
-FaultOption = Annotated[
-    list[str] | None,
-    typer.Option("--fault", metavar="SPEC", help="Something that goes wrong; may be repeated."),
-]
-Patience = Annotated[
-    float,
-    typer.Option(
-        min=0.0,
-        max=10.0,
-        help="Make a cycle longer by up to so many seconds until its answer comes. No real "
-        "controller does: for PCs that are held up now and then.",
-    ),
-]
-Duration = Annotated[
-    float | None, typer.Option(min=0.0, help="Seconds after which the session is ended.")
-]
-Priority = Annotated[
-    int | None,
-    typer.Option(min=1, max=99, help="Real-time priority (SCHED_FIFO) to ask the system for."),
-]
-
-
-WarmStart = Annotated[
-    bool, typer.Option("--warm-start", help="Begin with the init packet, as after 506.")
-]
-OwnMotion = Annotated[
-    bool,
-    typer.Option(
-        "--own-motion",
-        help="In mode 0 the controller's own program moves the arm about, until it is stopped.",
-    ),
-]
-OwnSpeed = Annotated[
-    float, typer.Option(min=0.01, max=1.0, help="Of that motion: fraction of full speed.")
-]
-Effects = Annotated[
-    bool, typer.Option("--effects", help="Switch on what the identified model leaves out.")
-]
-Seed = Annotated[int | None, typer.Option(min=0, help="Seed of noise and model errors.")]
-
-HELP: Final = """\
-Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
-
-Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
-and must do what the real controller asks of it:
-
-- answer every packet within its cycle, with the number received plus one (32767 is followed
-  by 1);
-
-- echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
-
-- answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
-
-- once every axis reports the open mode and the status byte is 5 (drive on): start from the
-  target received and answer with the next one;
-
-- ask for the end of open mode with status byte 1, then stay in step until 504.
-
-Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
-packet are ignored. A drive that was lost stays off until somebody presses the button.
-
-**Example**, two terminals on one machine:
-
-    hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
-
-    your_program --listen 2001
-
-The order does not matter: the first packet is repeated every second until it is answered.
-Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
-`kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
-"""
-
 
 def simulate(
-    cell: CellArgument,
-    udp: Udp = None,
-    can: Can = None,
-    cycle: Cycle = None,
-    mode: Mode = None,
-    stagger: Stagger = 3,
-    only_axis: OnlyAxis = None,
-    missed: Missed = 1,
-    patience: Patience = 0.0,
-    while_silent: WhileSilent = "hold",
-    warm_start: WarmStart = False,
-    intervals: Intervals = None,
-    own_motion: OwnMotion = False,
-    own_speed: OwnSpeed = 0.3,
-    effects: Effects = False,
-    fault: FaultOption = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    priority: Priority = None,
+    cell: Path,
+    udp: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
+    can: Annotated[str | None, typer.Option(metavar="INTERFACE:CHANNEL[:fd|classic]")] = None,
+    cycle: Annotated[int | None, typer.Option(min=1, max=2)] = None,
+    mode: int | None = None,
+    stagger: Annotated[int, typer.Option(min=0)] = 3,
+    only_axis: Annotated[int | None, typer.Option(min=1)] = None,
+    missed: Annotated[int, typer.Option(min=1)] = 1,
+    patience: Annotated[float, typer.Option(min=0.0, max=10.0)] = 0.0,
+    while_silent: Literal["hold", "continue", "drive-off"] = "hold",
+    warm_start: bool = False,
+    intervals: Annotated[int | None, typer.Option(min=1)] = None,
+    own_motion: bool = False,
+    own_speed: Annotated[float, typer.Option(min=0.01, max=1.0)] = 0.3,
+    effects: bool = False,
+    fault: Annotated[list[str] | None, typer.Option(metavar="SPEC")] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    duration: Annotated[float | None, typer.Option(min=0.0)] = None,
+    priority: Annotated[int | None, typer.Option(min=1, max=99)] = None,
     json: JsonOption = False,
 ) -> None:
-    """Serve one session; `HELP` is what a person reads."""
+    """Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
+
+    Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
+    and must do what the real controller asks of it:
+
+    - answer every packet within its cycle, with the number received plus one (32767 is followed
+      by 1);
+
+    - echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
+
+    - answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
+
+    - once every axis reports the open mode and the status byte is 5 (drive on): start from the
+      target received and answer with the next one;
+
+    - ask for the end of open mode with status byte 1, then stay in step until 504.
+
+    Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
+    packet are ignored. A drive that was lost stays off until somebody presses the button.
+
+    **Example**, two terminals on one machine:
+
+        hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
+
+        your_program --listen 2001
+
+    The order does not matter: the first packet is repeated every second until it is answered.
+    Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
+    `kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
+
+    Options:
+        cell: Cell file with a [simulation] table.
+        udp: Where the PC program listens.
+        can: A CAN bus instead, by its python-can names, e.g. socketcan:can0.
+        cycle: Cycle in ms; the cell's if left out.
+        mode: Open mode: 1, 2, 4, 5, 7, 8 or 9; the cell's if left out.
+        stagger: Cycles between one axis entering open mode and the next.
+        only_axis: Open this axis only; the others stay closed.
+        missed: Missing replies in a row that end open mode (real: unknown).
+        patience: Make a cycle longer by up to so many seconds until its answer comes. No real
+            controller does: for PCs that are held up now and then.
+        while_silent: What the arm does in a cycle of open mode that no reply came in.
+        warm_start: Begin with the init packet, as after 506.
+        intervals: Intervals of open mode until the session ends; endless if left out.
+        own_motion: In mode 0 the controller's own program moves the arm about, until it is stopped.
+        own_speed: Of that motion: fraction of full speed.
+        effects: Switch on what the identified model leaves out.
+        fault: Something that goes wrong; may be repeated.
+        seed: Seed of noise and model errors.
+        duration: Seconds after which the session is ended.
+        priority: Real-time priority (SCHED_FIFO) to ask the system for.
+    """
     loaded = Cell.load(cell)
     if only_axis is not None:
         joint_index(loaded, str(only_axis), "--only-axis")
-    settings = _settings(
+    settings = replace(
         controller_settings(loaded, effects=effects),
         period=loaded.period if cycle is None else cycle / 1000.0,
         open_mode=loaded.controller.mode if mode is None else mode,
@@ -321,14 +259,14 @@ def simulate(
         missed_replies=missed,
         lost_openings=LOST_OPENINGS,
         reopening_time=REOPENING,
-        while_silent=while_silent.replace("-", "_"),
+        while_silent="drive_off" if while_silent == "drive-off" else while_silent,
         cold_start=not warm_start,
         open_intervals=intervals,
         own_motion=_postures(loaded) if own_motion else (),
         own_motion_repeats=True,
         own_speed=own_speed,
     )
-    on_link, in_controller = split_faults([_fault(text) for text in fault or ()])
+    on_link, in_controller = split_faults(map(parse_fault, fault or ()))
 
     def build() -> SimulatedController:
         return simulated_controller(
@@ -352,20 +290,12 @@ def simulate(
             )
     finally:
         far_end.close()
-    _report(served, status, json=json, interrupted=pressed.interrupted)
-
-
-simulate.__doc__ = HELP
-
-
-def _report(served: Served, status: Status, *, json: bool, interrupted: bool) -> None:
-    """Print the summary; leave with the exit status that the session has earned."""
     if json:
         print_json(_figures(served))
     else:
         status.clear()
         typer.echo(printable("\n".join(_sentences(served))))
-    if not served.summary.ended and interrupted:
+    if not served.summary.ended and pressed.interrupted:
         raise typer.Exit(130)
     if served.gave_up or not served.summary.ended:
         raise typer.Exit(4)
@@ -383,34 +313,15 @@ def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     return postures
 
 
-def _settings(settings: ControllerSettings, **changes: Any) -> ControllerSettings:
-    try:
-        return replace(settings, **changes)
-    except SettingError as error:
-        raise InputError(None, str(error)) from error
-
-
-def _fault(text: str) -> Fault:
-    try:
-        return parse_fault(text)
-    except FaultScriptError as error:
-        raise InputError(None, str(error), field="--fault") from error
-
-
 def _figures(served: Served) -> dict[str, object]:
     """The summary for a script; times in µs."""
     summary = served.summary
-    counts = {
-        field.name: getattr(summary, field.name)
-        for field in fields(summary)
-        if isinstance(getattr(summary, field.name), int)
-    }
     times = {"stretch_max_us": round(1e6 * summary.stretch_max, 1)}
     for name, each in (("answer", summary.answer), ("cost", summary.cost)):
         for part, seconds in zip(("p50", "p99", "max"), _parts(each), strict=True):
             times[f"{name}_{part}_us"] = round(1e6 * seconds, 1)
     return {
-        **counts,
+        **{name: count for name, count in vars(summary).items() if isinstance(count, int)},
         "foreign": served.foreign,
         "intervals": served.intervals,
         "starts": served.starts,
@@ -423,6 +334,10 @@ def _figures(served: Served) -> dict[str, object]:
 def _sentences(served: Served) -> list[str]:
     """The summary for a person."""
     summary = served.summary
+    stretched = (
+        f"; {plural(summary.stretched, 'cycle')} stretched to wait for an answer, by up to "
+        f"{1e3 * summary.stretch_max:.1f} ms, as no real controller does"
+    )
     if not summary.cycles:
         return [f"no PC program answered; the first packet was sent {_times(summary.knocks)}"]
     end = "the session has ended (504)" if summary.ended else "the session was given up"
@@ -431,7 +346,7 @@ def _sentences(served: Served) -> list[str]:
         f"open mode was reached {_times(served.intervals)}",
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from elsewhere" + _stretched(summary),
+        f"{served.foreign} from elsewhere{stretched if summary.stretched else ''}",
         f"answers came after {_spread(summary.answer)}",
         f"controller and arm took {_spread(summary.cost)} to compute a cycle; "
         f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
@@ -445,22 +360,8 @@ def _parts(times: Histogram) -> tuple[float, float, float]:
 
 
 def _spread(times: Histogram) -> str:
-    median, most, longest = map(_us, _parts(times))
+    median, most, longest = (f"{1e6 * seconds:.0f} µs" for seconds in _parts(times))
     return f"{median} (median), {most} (99 %), {longest} (longest)"
-
-
-def _stretched(summary: Tally) -> str:
-    if not summary.stretched:
-        return ""
-    cycles = "1 cycle was" if summary.stretched == 1 else f"{summary.stretched} cycles were"
-    return (
-        f"; {cycles} stretched to wait for an answer, by up to {1e3 * summary.stretch_max:.1f} ms, "
-        "as no real controller does"
-    )
-
-
-def _us(seconds: float) -> str:
-    return f"{1e6 * seconds:.0f} µs"
 
 
 def _times(count: int) -> str:

@@ -24,56 +24,15 @@ _DEFAULT: Final = signal.SIG_DFL
 
 
 def study(
-    output: Annotated[
-        Path,
-        typer.Option("--output", "-o", help="Folder for the whole study.", show_default=True),
-    ] = Path("runs/study"),
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="Short searches, few repetitions and motions: minutes."),
-    ] = False,
-    campaign: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Study these recorded campaigns, of one arm, instead of the simulated NS 16. "
-            "May be repeated: the first two are compared as A and B are.",
-            show_default=False,
-        ),
-    ] = None,
-    cell: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Cell file of another simulated arm than the paper's NS 16.",
-            show_default=False,
-        ),
-    ] = None,
-    repetitions: Annotated[
-        int | None,
-        typer.Option(min=2, help="Executions of each excitation; 30 if left out, 4 with --quick."),
-    ] = None,
-    motions: Annotated[
-        int | None,
-        typer.Option(
-            min=5, help="Held-out motions of each class; 30 if left out, 10 with --quick."
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="One seed, one study; 1 if left out.")
-    ] = None,
-    effects: Annotated[
-        bool,
-        typer.Option(
-            "--effects/--no-effects",
-            help="Run everything again with what the model leaves out: torque ripple, friction "
-            "drift, elasticity, delay.",
-        ),
-    ] = True,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, max=256, help="Processes; one for each processor if left out."),
-    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/study"),
+    quick: bool = False,
+    campaign: Annotated[list[Path] | None, typer.Option(metavar="FOLDER")] = None,
+    cell: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    repetitions: Annotated[int | None, typer.Option(min=2)] = None,
+    motions: Annotated[int | None, typer.Option(min=5)] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    effects: Annotated[bool, typer.Option("--effects/--no-effects")] = True,
+    workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -88,6 +47,19 @@ def study(
     - `hil study --quick --output runs/quick`: the whole way in minutes
     - `hil study --output runs/study`: as the paper's, some 40 minutes on two free processors
     - `hil study --campaign runs/a --campaign runs/b`: two recorded campaigns
+
+    Options:
+        output: Folder for the whole study.
+        quick: Short searches, few repetitions and motions: minutes.
+        campaign: Study these recorded campaigns, of one arm, instead of the simulated NS 16. May be
+            repeated: the first two are compared as A and B are.
+        cell: Cell file of another simulated arm than the paper's NS 16.
+        repetitions: Executions of each excitation; 30 if left out, 4 with --quick.
+        motions: Held-out motions of each class; 30 if left out, 10 with --quick.
+        seed: One seed, one study; 1 if left out.
+        effects: Run everything again with what the model leaves out: torque ripple, friction drift,
+            elasticity, delay.
+        workers: Processes; one for each processor if left out.
     """
     reporter = make_reporter(quiet=quiet or json)
     count = workers or len(os.sched_getaffinity(0))
