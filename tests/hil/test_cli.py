@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +45,22 @@ def test_help_says_where_to_start() -> None:
         asked = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
         assert asked.exit_code == 0
         assert COMMANDS.purposes[command].replace("`", "") in " ".join(asked.stdout.split())
+
+
+def leaves(command: Any) -> Iterator[Any]:
+    """Commands without commands below them."""
+    below = getattr(command, "commands", None)
+    yield from [leaf for one in below.values() for leaf in leaves(one)] if below else [command]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_option_is_explained(command: str) -> None:
+    """By its own text or in the docstring of the command, of which nothing else is left over."""
+    for leaf in leaves(COMMANDS[command]):
+        assert all(option.help for option in leaf.params), leaf.name
+        assert "Options:" not in leaf.help
+        entries = re.findall(r"^        (\w+): ", leaf.callback.__doc__, re.MULTILINE)
+        assert {*entries} <= {option.name for option in leaf.params}
 
 
 def test_the_package_says_what_its_names_are_for() -> None:
@@ -187,7 +206,7 @@ def test_a_log_with_a_column_map_becomes_an_archive(tmp_path: Path) -> None:
     [
         (["identify", "nothing.mcap"], "nothing.mcap"),
         (["identify", str(CELL_PATH)], "cell.toml"),
-        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf, --cell or --dh"),
+        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell or --dh"),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
             ["import", "csv", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],

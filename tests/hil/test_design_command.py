@@ -356,7 +356,10 @@ def test_a_view_that_cannot_be_shown_is_refused_before_the_search(invoke, settin
     ("arguments", "words"),
     [
         ([], "for which cell"),
-        ([CELL_PATH, "--method", "b", "--settings", "SETTINGS"], "either --method or --settings"),
+        (
+            [CELL_PATH, "--method", "b", "--settings", "SETTINGS"],
+            "--method and --settings: exclude each other",
+        ),
         ([CELL_PATH, "--resume", "--force"], "exclude each other"),
         ([CELL_PATH, "--resume", "-o", "NOWHERE"], "holds no design to go on with"),
         ([CELL_PATH, "--settings", "NOWHERE"], "cannot be read"),
@@ -454,7 +457,7 @@ def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeyp
     invoke(CELL_PATH, "--resume", "-o", copied)
     monkeypatch.setattr("hil.cli.design.WEAK", 1.0)
     monkeypatch.setattr("hil.cli.design.weakest", lambda *_: ("I6zz", "f1_6"))
-    assert "hardly tells apart I6zz, f1_6: take more via points" in (
+    assert "hardly separates I6zz, f1_6: take more via points" in (
         invoke(CELL_PATH, "--resume", "-o", copied).output
     )
 

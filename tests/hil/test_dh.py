@@ -169,8 +169,8 @@ class TestRefusals:
         [
             (["--dh", "dh.csv"], "--convention: is not given; --dh needs standard"),
             (["--dh", "dh.csv", "--convention", "craig"], "'craig' is unknown"),
-            (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: both describe"),
-            ([], "--urdf: which arm is it"),
+            (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: exclude each other"),
+            ([], "--urdf or --dh: one of them is needed"),
         ],
     )
     def test_options_that_do_not_fit(self, options: list[str], sentence: str) -> None:

@@ -54,7 +54,7 @@ def write_log(path: Path, header: str, columns: int) -> Path:
                 "--cell",
                 "c.toml",
             ],
-            "leave out one",
+            "--urdf and --cell: exclude each other",
         ),
     ],
 )

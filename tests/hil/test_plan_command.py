@@ -152,8 +152,8 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ([], "either --via or --random"),
-        (["--random", "3", "--via", "VIA"], "either --via or --random"),
+        ([], "--via or --random: one of them is needed"),
+        (["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
         (["--via", "missing.csv"], "cannot be read"),
         (["--via", "VIA", "--corner", "3"], "no corner"),
         (["--via", "VIA", "--picture", "plan.bmp"], "no format"),

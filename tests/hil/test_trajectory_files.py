@@ -79,7 +79,7 @@ class TestDesignOnlyCell:
     def test_a_controller_beside_it_is_refused(self, tmp_path: Path) -> None:
         words = ["new", "--design-only", "--from-controller", "h", "--urdf", "a.urdf"]
         result = CliRunner().invoke(app, words)
-        assert "--design-only: excludes --from-controller" in str(result.exception)
+        assert "--design-only and --from-controller: exclude each other" in str(result.exception)
 
 
 @pytest.fixture(scope="module")
@@ -194,4 +194,6 @@ class TestCommand:
 
     def test_quick_and_a_method_are_refused_together(self) -> None:
         words = ["design", str(CELL_PATH), "--quick", "--method", "b"]
-        assert "--quick: names a method" in str(CliRunner().invoke(app, words).exception)
+        assert "--method and --quick: exclude each other" in str(
+            CliRunner().invoke(app, words).exception
+        )
