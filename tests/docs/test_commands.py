@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from hil import Campaign, Cell
@@ -21,12 +22,12 @@ from hil.progress import Silent
 from tests.docs.typed import PAGES, ROOT, commands, parse
 
 TYPED_ELSEWHERE = {
-    "bring-your-own-robot.md": "tests/hil/test_bring_your_own_robot.py",
     "campaign.md": "tests/hil/test_campaign_day.py",
-    "first-hour.md": "tests/hil/test_first_hour.py",
     "payload.md": "tests/hil/test_payload_command.py",
-    "other-robots.md": "tests/docs/test_other_robots.py",
-    "simulators.md": "tests/docs/test_simulators_page.py",
+    **dict.fromkeys(
+        ("bring-your-own-robot.md", "first-hour.md", "other-robots.md", "simulators.md"),
+        "tests/docs/test_typed_pages.py",
+    ),
 }
 """Pages whose commands another test types, one after the other."""
 
@@ -171,6 +172,25 @@ def test_the_command_line_understands_every_command(page: Path) -> None:
             ), words
         elif words[0] == "python" and words[1].startswith("examples/"):
             assert (ROOT / words[1]).exists()
+
+
+OF_OTHER_PROGRAMS = {"archive-format.md", "batch.md", "can.md", "connect.md",
+                     "how-it-is-tested.md", "performance.md", "simulate.md"}  # fmt: skip
+"""Pages that name options of other programs too."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_option_that_a_page_mentions_exists(page: Path) -> None:
+    if page.name not in OF_OTHER_PROGRAMS:
+        named = re.findall(r"(?<![\w-])--[a-z]+(?:-[a-z]+)*", page.read_text("utf-8"))
+        assert {*named} - {"--help"} <= options(typer.main.get_command(app))
+
+
+def options(command: Any) -> set[str]:
+    """Those of a command, and of all below it."""
+    below = getattr(command, "commands", {}).values()
+    own = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    return own.union(*map(options, below))
 
 
 def test_what_is_typed_elsewhere_is() -> None:

@@ -1,0 +1,236 @@
+"""Pages that are run from their first block to their last, each with what it needs beside it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pinocchio as pin
+import pytest
+from typer.testing import CliRunner
+
+from hil import Campaign, Cell
+from hil.archive import open_archive
+from hil.campaign import design
+from hil.cell.errors import WHERE, UnknownFieldsError
+from hil.cell.text import with_values
+from hil.cli import app
+from hil.demo_link import free_port
+from hil.progress import Silent
+from hil.results import Results
+from tests.docs.typed import ROOT, commands
+from tests.hil.simulated_logs import simulate
+from tests.hil.test_gains_command import CENTRE, MASS, archive
+from tests.motion_table import MotionTable
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text("utf-8")
+
+
+def blocks(text: str) -> list[tuple[str, str]]:
+    """Language and content of each block, in order."""
+    return re.findall(r"```(sh|python|toml)\n(.*?)```", text, re.DOTALL)
+
+
+def typed(block: str, allowed: tuple[int, ...] = (0,)) -> list[str]:
+    """Type the lines of a block but `hil demo`, which the test replaces; their commands."""
+    ran = []
+    for line in block.splitlines():
+        program, *arguments = shlex.split(line)
+        assert program == "hil"
+        ran.append(arguments[0])
+        if arguments[0] != "demo":
+            result = CliRunner().invoke(app, arguments)
+            assert result.exit_code in allowed, (line, result.output, result.exception)
+    return ran
+
+
+def saved(block: str) -> None:
+    """Write a block of TOML to the file that its first line names."""
+    Path(block.splitlines()[0].removeprefix("# ")).write_text(block)
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout."""
+    (tmp_path / "runs").mkdir()
+    for name in ("examples", "sim_fixtures"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class TestBringYourOwnRobot:
+    TEXT = page("bring-your-own-robot.md")
+    BALANCER = TEXT.split("## An arm with a balancer")[1].split("\n## ")[0]
+
+    def test_every_block_runs(self, workplace: Path, identified_campaign: Campaign) -> None:
+        """After `hil demo`, with recordings with and without a payload."""
+        (workplace / "runs" / "demo").symlink_to(identified_campaign.folder.root)
+        times = np.arange(0.0, 20.0, 8e-3)
+        load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
+        archive(workplace, "empty", simulate("ur5_robot.urdf", times, seed=1))
+        archive(workplace, "full", simulate("ur5_robot.urdf", times, seed=2, load=load))
+        ran = []
+        for language, block in blocks(self.TEXT.replace(self.BALANCER, "")):
+            if language == "python":
+                exec(compile(block, "docs/bring-your-own-robot.md", "exec"), {})
+            elif language == "toml":
+                saved(block)
+            else:
+                ran += typed(block, (0, 5))
+        assert ran == ["demo", "import", "import", "identify", "gains"]
+        (run,) = Results.load(workplace / "result" / "results.json").validation
+        assert run.archive == "other.mcap"
+        assert run.overall_relative_error < 0.1  # of a motion of seconds, with its noise
+        assert (workplace / "result" / "report.html").is_file()
+
+    @pytest.mark.slow
+    def test_a_known_balancer_predicts_another_motion(self, workplace: Path) -> None:
+        """At most 14.0 % of the unseen motion's torque, over all joints and every row."""
+        data = ROOT.parent / "shared" / "data" / "kr300"
+        if not data.is_dir():
+            pytest.skip(f"there is no recording {data}")
+        files = {"one.csv": "A.csv", "other.csv": "B.csv"}
+        for name in ("one.csv", "other.csv", "map.toml", "robot.urdf"):
+            (workplace / name).symlink_to(data / files.get(name, name))
+        (cell,) = re.findall(r"```toml\n(.*?)```", self.BALANCER, re.DOTALL)
+        Path("heavy.toml").write_text(cell)
+        lines = re.findall(r"^hil .*$", self.BALANCER, re.MULTILINE)
+        for line in lines:
+            identifies = line.startswith("hil identify")
+            typed(f"{line} --output found" if identifies else line, (5,) if identifies else (0,))
+        (unseen,) = Results.load(workplace / "found" / "results.json").validation
+        assert unseen.all_rows_relative_error <= 0.14
+
+
+def log_of(motion: str, path: str) -> None:
+    """What an arm of the URDF, with friction, logs of a designed motion: twice, with noise."""
+    cell = Cell.load("cell.toml")
+    trajectory = MotionTable.of(Path("runs/motion", motion).read_text())
+    once = np.arange(0.0, trajectory.duration + 0.5, 2e-3)
+    times = np.arange(2 * len(once)) * 2e-3
+    q, qd, qdd = (np.tile(one, (2, 1)) for one in trajectory.sample(once))
+    n = len(cell.joint_names)
+    values = cell.parameter_values(
+        rotor_inertia=np.full(n, 0.3), coulomb=np.full(n, 5.0), viscous=np.full(n, 3.0),
+        third=np.zeros(n),
+    )  # fmt: skip
+    noise = np.random.default_rng(len(motion)).standard_normal((2, *q.shape))
+    torque = cell.model.torque(values, q, qd, qdd) + 0.2 * noise[0]
+    table = np.column_stack([times, q + 1e-5 * noise[1], torque])
+    np.savetxt(path, table, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
+
+
+def test_other_robots_from_a_urdf_to_a_good_model(workplace: Path) -> None:
+    for language, block in blocks(page("other-robots.md")):
+        if language == "toml":
+            saved(block)
+            log_of("excitation.csv", "log.csv")
+            log_of("validation_000.csv", "other.csv")
+        else:
+            typed(block)
+    assert Results.load(Path("result/results.json")).verdict.good
+    assert "<robot" in Path("result/arm.urdf").read_text()
+
+
+def test_simulators_run_what_was_exported(workplace: Path) -> None:
+    pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    cell = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
+    cell = cell.with_campaign(repetitions=2, validation_runs=1)
+    demo = Campaign.create(workplace / "runs" / "demo", cell, design(cell, Silent()))
+    demo.run(unrehearsed=True, durable=False)
+    names: dict[str, object] = {}
+    for language, block in blocks(page("simulators.md")):
+        if language == "python":
+            exec(compile(block, "docs/simulators.md", "exec"), names)
+        else:
+            typed(block)
+    assert matplotlib.image.imread("rollout.png").std() > 0.0
+    assert len(names["models"]) == 100  # type: ignore[arg-type]
+    error = abs(names["simulated"] - names["position"])  # type: ignore[operator]
+    assert error.max() < 0.1, error.max()  # rad: of a motion of more than one
+
+
+class TestFirstHour:
+    TEXT = page("first-hour.md")
+    STEPS = commands(ROOT / "docs" / "first-hour.md")
+
+    def edit(self, path: Path, **instead: int) -> None:
+        """What the page says is to be written into `[controller]` of the copy."""
+        (block,) = re.findall(r"```toml\n(.*?)```", self.TEXT, re.DOTALL)
+        link = tomllib.loads(block) | instead
+        values = {f"controller.{key}": value for key, value in link.items()}
+        path.write_text(with_values(path.read_text("utf-8"), values))
+
+    def hil(self, arguments: list[str]) -> subprocess.Popen[str]:
+        assert arguments[0] == "hil"
+        return subprocess.Popen(
+            [sys.executable, "-m", *arguments], stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    @pytest.mark.slow
+    def test_the_commands_run_in_their_order(self, workplace: Path) -> None:
+        """Against a simulated controller, which waits for this computer."""
+        simulate, *steps = self.STEPS
+        assert [step[1] for step in steps] == [
+            "new", "sim_fixtures/ns16/cell.toml", "doctor", "record", "plot", "move", "plot", "move"
+        ]  # fmt: skip
+        port = str(free_port())
+        for step in steps:
+            if step[0] == "cp":
+                for name in step[1:-1]:
+                    shutil.copy(name, step[-1])
+                self.edit(Path("cell.toml"), port=int(port))
+                continue
+            controller = None
+            if step[1] in {"new", "record", "move"}:
+                far = [part.replace("2001", port) for part in simulate]
+                controller = self.hil([*far, "--patience", "0.5"])
+            done = self.hil([part.replace("2001", port) for part in step])
+            said, _ = done.communicate(timeout=180)
+            if controller is not None:
+                controller.terminate()
+                controller.communicate(timeout=60)
+                time.sleep(0.1)
+            # doctor --quick is provisional: 5, whatever this computer can do.
+            assert done.returncode == (5 if step[1] == "doctor" else 0), (step, said)
+            if step[1] == "new":
+                with pytest.raises(UnknownFieldsError) as unknown:
+                    Cell.load("cell.toml")
+                assert len(unknown.value.fields) == 12
+                assert "twelve fields" in self.TEXT
+        moves = [open_archive(path) for path in sorted(Path("moves").glob("*.mcap"))]
+        assert [(move.kind, move.complete) for move in moves] == [("move", True)] * 2
+        assert open_archive("archives/standstill_000_a1.mcap").complete
+        assert Path("standstill.png").exists() and Path("first_move.png").exists()
+
+    def test_the_copied_cell_reaches_the_controller_of_the_page(self, workplace: Path) -> None:
+        (copy,) = (step for step in self.STEPS if step[0] == "cp")
+        for name in copy[1:-1]:
+            shutil.copy(name, workplace)
+        self.edit(Path("cell.toml"))
+        cell = Cell.load("cell.toml")
+        assert cell.only_simulated
+        (simulate,) = (step for step in self.STEPS if step[1] == "simulate")
+        assert simulate[-1] == f"{cell.controller.host}:{cell.controller.port}"
+
+    def test_the_list_names_every_field_that_hil_new_leaves_open(self) -> None:
+        items = re.findall(r"(?m)^- (`.*?):", self.TEXT)
+        said = {field for item in items for field in re.findall(r"`(\w+)`", item)}
+        elsewhere = {  # from URDF and init packet
+            "lower_deg", "upper_deg", "velocity_deg", "gear_ratio", "calibration", "k54", "k64",
+            "k65", "current_limit", "following_error", "cycle_ms", "host", "mesh_folders",
+        }  # fmt: skip
+        assert len(said) == 12
+        assert {name.partition(".")[2] for name in WHERE} - elsewhere == said
