@@ -259,8 +259,8 @@ def plan(
     if csv is not None:
         _write(csv, to_csv(planned.trajectory, rate, names))
     if picture is not None:
-        drawn = None if corner is None else corner - 1
-        save(draw_plan(planned, names, frame, title=loaded.name, corner=drawn), picture)
+        target = None if corner is None else corner - 1
+        save(draw_plan(planned, names, frame, title=loaded.name, corner=target), picture)
 
 
 def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:
