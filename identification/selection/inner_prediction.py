@@ -198,13 +198,16 @@ class Folds:
         others = [factor for index, factor in enumerate(self.fitted) if index != k]
         return sum(others[1:], others[0])
 
-    def errors(self, estimate: Callable[[int, Factor], Array]) -> Errors:
-        """Errors of predictions by ``estimate(k, factor without stretch k)``."""
-        squares = np.zeros((FOLDS, self.predicted[0].n_joints))
-        for k, target in enumerate(self.predicted):
+    def errors(
+        self, estimate: Callable[[int, Factor], Array], rows: Literal["all", "fitted"] = "all"
+    ) -> Errors:
+        """Errors of predictions by ``estimate(k, factor without stretch k)`` on these rows."""
+        targets = self.predicted if rows == "all" else self.fitted
+        squares = np.zeros((FOLDS, targets[0].n_joints))
+        for k, target in enumerate(targets):
             augmented = np.append(-estimate(k, self.without(k)), 1.0)
             squares[k] = np.einsum("i,jik,k->j", augmented, target.gram, augmented)
-        torque = np.array([target.gram[:, -1, -1] for target in self.predicted])
+        torque = np.array([target.gram[:, -1, -1] for target in targets])
         if not torque.any():
             return Errors(math.nan, math.nan)
         return Errors(
@@ -309,7 +312,8 @@ def _with_delay(
     for delay in delays:
         late = _with(first, torque_delay=delay)
         swept, behind = _sweep(trial, late, questions)
-        found = trial.decide(DELAY, [swept, now], TIE)
+        sliding = [_with(one, left_out="slow") for one in (swept, now)]
+        found = trial.decide(DELAY, sliding, TIE, rows="fitted")
         compared.append(found.choice)
         if not found.choice.chosen:
             first, now, choices = late, swept, behind
@@ -362,7 +366,7 @@ class _Trial:
         self._ready = ready
         self._samples: dict[Preprocessing, list[Samples]] = {}
         self._folds: dict[tuple[Columns, Preprocessing], Folds] = {}
-        self._errors: dict[tuple[Columns, Preprocessing, Shrinkage], Errors] = {}
+        self._errors: dict[tuple[Columns, Preprocessing, Shrinkage, str], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
         self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
         self._without_centre: set[tuple[tuple[str, ...], float]] = set()
@@ -374,13 +378,14 @@ class _Trial:
         share: float | None = None,
         *,
         by_joint: bool = False,
+        rows: Literal["all", "fitted"] = "all",
     ) -> _Decision:
         """Take the first candidate, or the best one if it predicts better by that share.
 
         By `WORTHWHILE` without one.
         """
         share = WORTHWHILE if share is None else share
-        each = [self.errors(one) for one in candidates]
+        each = [self.errors(one, rows) for one in candidates]
         errors = [one.by_joint if by_joint else one.overall for one in each]
         best = int(np.nanargmin(errors)) if np.any(np.isfinite(errors)) else 0
         chosen = best if errors[best] < (1.0 - share) * errors[0] else 0
@@ -391,13 +396,14 @@ class _Trial:
         """The one that predicts best on average over the joints."""
         return min(candidates, key=lambda one: self.errors(one).by_joint)
 
-    def errors(self, settings: Settings) -> Errors:
-        """Errors of predicting each stretch from the others."""
-        if settings.key not in self._errors:
-            self._errors[settings.key] = self._predicted(settings)
-        return self._errors[settings.key]
+    def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
+        """Errors of predicting these rows of each stretch from the others."""
+        key = *settings.key, rows
+        if key not in self._errors:
+            self._errors[key] = self._predicted(settings, rows)
+        return self._errors[key]
 
-    def _predicted(self, settings: Settings) -> Errors:
+    def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
         machine = settings.model.parameter_names, shrinkage.prior_weight
         if shrinkage.strength > 0.0 and machine in self._without_centre:
@@ -420,7 +426,7 @@ class _Trial:
             return shrunk_values(factor.weighted(weights), self._centres[key], shrinkage.strength)
 
         try:
-            return folds.errors(estimate)
+            return folds.errors(estimate, rows)
         except SolverError:  # after a long search, which is not repeated
             self._without_centre.add(machine)
         except IdentificationError:
