@@ -303,20 +303,21 @@ def _with_delay(
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Compensate a delay that was found to be significant, unless that predicts worse.
 
-    All else is chosen anew beside it: presliding, for one, stands in for a part of a delay.
+    Compared are sliding rows: at reversals a presliding displacement stands in for a delay. All
+    else is chosen anew beside it.
 
     Returns:
         The settings before and after the sweep, and its choices.
     """
     compared: list[Choice] = []
     for delay in delays:
-        late = _with(first, torque_delay=delay)
-        swept, behind = _sweep(trial, late, questions)
-        sliding = [_with(one, left_out="slow") for one in (swept, now)]
-        found = trial.decide(DELAY, sliding, TIE, rows="fitted")
+        sliding = _with(now, left_out="slow")
+        late = _with(sliding, torque_delay=delay)
+        found = trial.decide(DELAY, [late, sliding], TIE, rows="fitted")
         compared.append(found.choice)
         if not found.choice.chosen:
-            first, now, choices = late, swept, behind
+            first = _with(first, torque_delay=delay)
+            now, choices = _sweep(trial, first, questions)
     return first, now, [*compared, *choices]
 
 

@@ -18,8 +18,9 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Settings, choose_settings
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, prepare
+from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.independent.simulated_arm import Noise, SimulatedArm, ns16, panda, record
 
 Array = NDArray[np.float64]
@@ -96,6 +97,28 @@ class TestDelayOfABriskMotion:
         share, unsure = np.mean(shares), 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
         assert near >= 0.95 * SEEDS
         assert 0.93 - unsure < share < 0.98 + unsure
+
+
+class TestDelayBesideOtherSettings:
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", [2, 3, 4])
+    def test_a_presliding_displacement_does_not_replace_it(self, seed: int) -> None:
+        """On all rows 1e-5 rad without a delay predict better than 1e-6 rad with the true one."""
+        arm = ns16()
+        model, recording = model_of(arm), recorded(arm, seed, "coloured", 0.0013, BRISK)
+        found = estimate_delays(recording, model)
+
+        def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+            return [prepare(recording, model, options=how)]
+
+        best, _ = choose_settings(
+            ready,
+            Settings(model, Preprocessing()),
+            {"delay", "bandwidth", "presliding", "rows"},
+            lambda *_: (),
+            (found.common,),
+        )
+        assert best.preprocessing.torque_delay == found.common
 
 
 class TestDelayOfASlowMotion:
