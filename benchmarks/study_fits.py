@@ -157,7 +157,7 @@ class Study:
         result = consistent_estimate(self.model, found.factor, found.pooled)
         rotors = [
             value
-            for name, value in zip(result.standard_names, result.standard, strict=True)
+            for name, value in zip(self.model.standard_names, result.standard, strict=True)
             if name.endswith("m") and name.startswith("I")
         ]
         friction = [

@@ -37,7 +37,7 @@ from hil.results import (
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.consistent import Consistency, link_parameters
+from identification.estimators.consistent import Consistency
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.shrinkage import Shrinkage, fitted_values
@@ -181,10 +181,8 @@ def consistency_result(
 
 
 def _links(model: RobotModel, check: ConsistencyCheck) -> list[LinkResult]:
-    standard = dict(
-        zip(check.consistent.standard_names, check.consistent.standard.tolist(), strict=True)
-    )
-    inertial = link_parameters(model, check.consistent.standard)
+    standard = dict(zip(model.standard_names, check.consistent.standard.tolist(), strict=True))
+    inertial = check.consistent.standard[model.layout.links]
     return [
         LinkResult(
             joint=joint,

@@ -26,13 +26,14 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.factor.factor import (
     WORST_CONDITION,
     Estimate,
@@ -52,7 +53,6 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
-
 _STEPS: Final = 200
 _HALVINGS: Final = 40
 # Of all weights on the way together. Data that machines fit need some hundred; those that none fits
@@ -69,6 +69,28 @@ _ROUNDING: Final = 1e-12
 _ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
 _WEIGHT_STEP: Final = 10.0
 _SAME_WEIGHT: Final = 1e-9
+_N_LINK: Final = len(LINK_SYMBOLS)
+# Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
+# is makes a one: keeps it positive definite, and moves a rotor that is larger than its standard
+# deviation by less than half a per cent of that.
+_ROTOR_BARRIER: Final = 1e-2
+# Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
+# more than the solver's error, so that the result can be relied on to be inside.
+_INSIDE: Final = 1e-6
+# Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
+# a pseudo-inertia at the edge is singular to rounding then.
+_MOST_ROWS: Final = 100_000
+# A solution outside by more than this is no solution.
+_TOLERANCE: Final = 1e-4
+# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
+# so near the conic solver is quicker; and the change of that weight at which they end.
+_NEAR_STEPS: Final = 10
+_NEAR_NEWTON: Final = 20
+_NEAR_WEIGHT: Final = 0.01
+
+
+class SolverError(IdentificationError):
+    """The semidefinite program has no usable solution."""
 
 
 class Cone(NamedTuple):
@@ -91,6 +113,11 @@ class Cone(NamedTuple):
         """Return the S_i (b, k, k)."""
         return np.asarray(np.tensordot(u[self.places], self.entries, axes=1))
 
+    @property
+    def unit(self) -> Array:
+        """Variables of the unit matrix (d,)."""
+        return np.asarray(np.einsum("kaa->k", self.entries))
+
     def value(self, u: Array) -> float:
         """Return ``sum_i pull tr S_i - barrier log det S_i``, infinite outside."""
         matrices = self.matrices(u)
@@ -105,7 +132,7 @@ class Cone(NamedTuple):
 
     def add_derivatives(self, u: Array, weight: float, gradient: Array, hessian: Array) -> None:
         """Add those of ``weight * value`` to gradient (v,) and Hessian (v, v)."""
-        pull = self.pull * np.einsum("kaa->k", self.entries)
+        pull = self.pull * self.unit
         for places, inverse in zip(self.places, np.linalg.inv(self.matrices(u)), strict=True):
             turned = np.einsum("ab,kbc->kac", inverse, self.entries)
             gradient[places] += weight * (pull - self.barrier * np.einsum("kaa->k", turned))
@@ -123,7 +150,6 @@ class Smooth(NamedTuple):
         cones: matrices that stay positive definite.
         centre: of the last variables, those behind the links.
         not_negative: indices of variables behind the links, in no cone.
-        equal: rows of equations on variables of the links, ``equal u = 1`` (e, v).
     """
 
     R: Array
@@ -132,7 +158,6 @@ class Smooth(NamedTuple):
     cones: tuple[Cone, ...]
     centre: Array
     not_negative: NDArray[np.intp]
-    equal: Array
 
     def value(self, u: Array) -> float:
         """Return the objective, infinite outside."""
@@ -170,25 +195,24 @@ class Minimum(NamedTuple):
 
 def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
     """Return the minimum, by Newton's method from a `start` (v,) inside."""
+    bounded = problem.not_negative
     u = start.copy()
-    u[problem.not_negative] = np.maximum(u[problem.not_negative], 0.0)
-    u += np.linalg.pinv(problem.equal) @ (1.0 - problem.equal @ u)
+    u[bounded] = np.maximum(u[bounded], 0.0)
     if not np.isfinite(problem.value(u)):
         return Minimum(start, converged=False)
     decrement, steps = np.inf, 0
     while steps < most_steps:
         steps += 1
         gradient, hessian = problem.derivatives(u)
-        bounded = problem.not_negative
         held = bounded[(u[bounded] <= _ON_BOUND) & (gradient[bounded] > 0.0)]
         u[held] = 0.0
-        step = _newton_step(problem, gradient, hessian, held)
+        step = _newton_step(gradient, hessian, held)
         # One that is on its bound, and would leave it by itself but not with the others, stays.
         while len(
             pushed := np.setdiff1d(bounded[(u[bounded] <= 0.0) & (step[bounded] < 0.0)], held)
         ):
             held = np.union1d(held, pushed)
-            step = _newton_step(problem, gradient, hessian, held)
+            step = _newton_step(gradient, hessian, held)
         decrement = -float(gradient @ step)
         moved = _descend(problem, u, step, decrement)
         if moved is None:
@@ -225,21 +249,14 @@ def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float])
     return found._replace(converged=False)
 
 
-def _newton_step(problem: Smooth, gradient: Array, hessian: Array, held: NDArray[np.intp]) -> Array:
+def _newton_step(gradient: Array, hessian: Array, held: NDArray[np.intp]) -> Array:
     """Return the step to the minimum of the quadratic model, variables in `held` at rest."""
     free = np.setdiff1d(np.arange(len(gradient)), held)
     scale = 1.0 / np.sqrt(np.diag(hessian)[free])
     curvature = hessian[np.ix_(free, free)] * np.outer(scale, scale)
-    rows = problem.equal[:, free] * scale
-    rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(float).tiny)
-    e = len(rows)
-    system = np.block([[curvature, rows.T], [rows, np.zeros((e, e))]])
-    right = np.concatenate([-scale * gradient[free], np.zeros(e)])
     step = np.zeros(len(gradient))
-    try:
-        step[free] = scale * np.linalg.solve(system, right)[: len(free)]
-    except np.linalg.LinAlgError:
-        return step
+    with suppress(np.linalg.LinAlgError):
+        step[free] = scale * np.linalg.solve(curvature, -scale * gradient[free])
     return step
 
 
@@ -255,59 +272,17 @@ def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array 
     return None
 
 
-_N_LINK: Final = len(LINK_SYMBOLS)
-# Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
-# is makes a one: keeps it positive definite, and moves a rotor that is larger than its standard
-# deviation by less than half a per cent of that.
-_ROTOR_BARRIER: Final = 1e-2
-# Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
-# more than the solver's error, so that the result can be relied on to be inside.
-_INSIDE: Final = 1e-6
-# Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
-# a pseudo-inertia at the edge is singular to rounding then.
-_MOST_ROWS: Final = 100_000
-# A solution outside by more than this is no solution.
-_TOLERANCE: Final = 1e-4
-
-
-# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
-# so near the conic solver is quicker; and the change of that weight at which they end.
-_NEAR_STEPS: Final = 10
-_NEAR_NEWTON: Final = 20
-_NEAR_WEIGHT: Final = 0.01
-
-
-class InfeasibleError(IdentificationError):
-    """No physically consistent parameters meet the bounds that were asked for."""
-
-
-class SolverError(IdentificationError):
-    """The solver of the semidefinite program gave no usable answer.
-
-    Attributes:
-        status: what the solver called it.
-    """
-
-    def __init__(self, message: str, *, status: str) -> None:
-        super().__init__(message)
-        self.status = status
-
-
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """What a consistent estimate is asked for beyond consistency.
+    """What a consistent estimate is drawn to where the data leave it open.
 
     Attributes:
         prior_weight: how many rows of data (each at its noise) the nominal parameters count for.
-        total_mass: of all moving links together [kg], if it is known.
-        largest_mass: upper bound per link [kg], shape (n,), infinite for none.
         nominal: standard parameters to stay close to, shape (s,), those of the model without it.
             Rotor inertias count; a URDF has none, so the model's are zero.
     """
 
     prior_weight: float = 1.0
-    total_mass: float | None = None
-    largest_mass: Array | None = None
     nominal: Array | None = None
 
     def __post_init__(self) -> None:
@@ -316,8 +291,10 @@ class Consistency:
                 f"the prior weight is {self.prior_weight!r}; it must be finite and positive, for"
                 " the data alone leave standard parameters open"
             )
-        if self.total_mass is not None and not (0.0 < self.total_mass < math.inf):
-            raise InfeasibleError(f"a total mass of {self.total_mass!r} kg is no mass")
+
+    def of(self, model: RobotModel) -> Array:
+        """The nominal standard parameters (s,) for a model."""
+        return model.nominal if self.nominal is None else model.layout.checked(self.nominal)
 
 
 class SquareRoot(NamedTuple):
@@ -358,33 +335,23 @@ class Program:
         bodies: reference of each link.
         to_standard: physical standard parameters from u (s, v).
         to_others: parameters of physical friction, springs and balancers from u (k, v).
-        rows: R and z in u.
-        cones: pseudo-inertias, and the rotors' inertia matrix where joints are coupled.
-        centre: what squares of the variables behind the links are counted from (v - 10 n,).
-        not_negative: indices into u.
-        masses: mass of each link from u (n, v).
+        smooth: what is minimised.
     """
 
     bodies: ReferenceBodies
     to_standard: Array
     to_others: Array
-    rows: SquareRoot
-    cones: tuple[Cone, ...]
-    centre: Array
-    not_negative: NDArray[np.intp]
-    masses: Array
+    smooth: Smooth
 
     @classmethod
     def of(cls, model: RobotModel, root: SquareRoot, options: Consistency) -> Program:
         """Set up the program for weighted normal equations.
 
         Raises:
-            ShapeError: nominal parameters or bounds do not fit the model.
-            InfeasibleError: the bounds on the masses contradict each other.
+            ShapeError: nominal parameters do not fit the model.
         """
-        _check_bounds(model, options)
-        nominal = model.nominal if options.nominal is None else np.asarray(options.nominal)
-        bodies = reference_bodies(link_parameters(model, nominal), model.chain.translation)
+        nominal = options.of(model)
+        bodies = reference_bodies(nominal[model.layout.links], model.chain.translation)
         n, b = model.n_joints, model.base.rank
         layout, losses = model.layout, dissipation(model.friction)
         others = np.concatenate([layout.rotors, layout.couplings])
@@ -408,52 +375,37 @@ class Program:
         alone = rotors[: len(layout.rotors)]
         if coupled is not None:
             alone = np.setdiff1d(alone, coupled.places)
-        links = np.arange(_N_LINK * n).reshape(n, _N_LINK)
-        return cls(
-            bodies=bodies,
-            to_standard=to_standard,
-            to_others=to_others,
-            rows=SquareRoot(root.R @ mapping, root.z),
-            cones=(Cone(links, _SYMMETRIC),) + (() if coupled is None else (coupled,)),
+        links = Cone(np.arange(_N_LINK * n).reshape(n, _N_LINK), _SYMMETRIC)
+        positive = rest[: len(losses.combine)][losses.not_negative]
+        smooth = Smooth(
+            R=root.R @ mapping,
+            z=root.z,
+            weight=options.prior_weight,
+            cones=(links,) if coupled is None else (links, coupled),
             centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
-            not_negative=np.concatenate([alone, rest[: len(losses.combine)][losses.not_negative]]),
-            masses=to_standard[layout.links[:, -1]],
+            not_negative=np.concatenate([alone, positive]),
         )
-
-    def reference(self, options: Consistency, largest: Array) -> Array:
-        """Return the u of the reference bodies, as heavy as the bounds ask for."""
-        u = np.zeros(self.rows.R.shape[1])
-        links = u[: _N_LINK * len(self.masses)].reshape(-1, _N_LINK)  # a view
-        links[:] = _UNIT_ENTRIES
-        mass = np.minimum(self.masses @ u, largest)
-        if options.total_mass is not None:
-            free = mass < largest
-            rest = options.total_mass - mass[~free].sum()
-            mass[free] *= rest / mass[free].sum()
-        links *= (mass / (self.masses @ u))[:, None]
-        for cone in self.cones[1:]:
-            u[cone.places] = np.einsum("kaa->k", cone.entries)  # the unit matrix
-        return u
+        return cls(bodies, to_standard, to_others, smooth)
 
     def physical(self, u: Array) -> tuple[Array, Array]:
         """Return standard parameters (s,) and those of friction, springs and balancers (k,).
 
         A solver holds inequalities to its tolerance. What is left beyond them is moved back.
         """
-        u = u.copy()
-        u[self.not_negative] = np.maximum(u[self.not_negative], 0.0)
-        links = u[: _N_LINK * len(self.masses)].reshape(-1, _N_LINK)  # a view
-        smallest = np.linalg.eigvalsh(np.tensordot(links, _SYMMETRIC, axes=1))[:, 0]
+        u, (links, *coupled) = u.copy(), self.smooth.cones
+        u[self.smooth.not_negative] = np.maximum(u[self.smooth.not_negative], 0.0)
+        smallest = np.linalg.eigvalsh(links.matrices(u))[:, :1]
         lift = np.where(smallest > -_TOLERANCE, np.maximum(_INSIDE - smallest, 0.0), 0.0)
-        links += lift[:, None] * _UNIT_ENTRIES
-        for cone in self.cones[1:]:
+        u[links.places] += lift * links.unit
+        for cone in coupled:
             below = -np.linalg.eigvalsh(cone.matrices(u))[:, :1]
             lift = np.where(below < _TOLERANCE, np.maximum(below, 0.0), 0.0)
-            u[cone.places] += lift * np.einsum("kaa->k", cone.entries)
+            u[cone.places] += lift * cone.unit
         return self.to_standard @ u, self.to_others @ u
 
 
 def _symmetric_basis() -> Array:
+    """Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4)."""
     rows, columns = np.triu_indices(4)
     basis = np.zeros((_N_LINK, 4, 4))
     basis[np.arange(_N_LINK), rows, columns] = 1.0
@@ -461,23 +413,17 @@ def _symmetric_basis() -> Array:
     return basis
 
 
-# Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4).
 _SYMMETRIC: Final = _symmetric_basis()
-# The entries of the unit matrix, shape (10,).
-_UNIT_ENTRIES: Final = np.eye(4)[np.triu_indices(4)]
 
 
-def solve_program(
-    program: Program, options: Consistency, rows: int, near: Array | None = None
-) -> tuple[Array, str]:
+def solve_program(program: Program, rows: int, near: Array | None = None) -> tuple[Array, str]:
     """Return the solution u to rounding, and how it was found: a status in words.
 
-    The prior counts for `prior_weight` rows at their noise. Where no machine fits the data to
+    The prior counts for its weight of rows at their noise. Where no machine fits the data to
     their noise, the error of the best one is the noise, and the weight grows with it.
 
     Args:
         program: what to solve.
-        options: prior and bounds.
         rows: number of rows in the weighted normal equations.
         near: solution of much the same program (v,): Newton's method starts there, and ends when
             the prior's weight has settled to a hundredth; quick, and good for comparisons.
@@ -485,109 +431,66 @@ def solve_program(
     Raises:
         SolverError: neither the solver nor Newton's method found an answer.
     """
+    smooth = program.smooth
 
     def weight(u: Array) -> float:
-        excess = program.rows.excess(u) / min(max(rows, 1), _MOST_ROWS)
-        return options.prior_weight * max(1.0, excess)
+        excess = float(np.sum((smooth.R @ u - smooth.z) ** 2)) / min(max(rows, 1), _MOST_ROWS)
+        return smooth.weight * max(1.0, excess)
 
-    largest = np.full(len(program.masses), np.inf)
-    if options.largest_mass is not None:
-        largest = options.largest_mass
-    if near is not None and options.largest_mass is None:
-        free = _smooth(program, options, largest, np.zeros(len(largest), dtype=np.bool_))
+    if near is not None:
         found = Minimum(near, converged=True)
         for _ in range(_NEAR_STEPS):
             last = weight(found.u)
-            found = polish(free._replace(weight=last), found.u, _NEAR_NEWTON)
+            found = polish(smooth._replace(weight=last), found.u, _NEAR_NEWTON)
             if not found.converged:
                 break
             if abs(weight(found.u) - last) <= _NEAR_WEIGHT * last:
                 return found.u, "optimal (Newton, from a near solution)"
-    start, status = _solve_cone(program, options)
+    start, status = _solve_cone(smooth)
     if start is not None:
-        at_bound = program.masses @ start >= largest * (1.0 - _ON_BOUND)
-        found = polish(_smooth(program, options, largest, at_bound), start)
-        if found.converged and weight(found.u) == options.prior_weight:
+        found = polish(smooth, start)
+        if found.converged and weight(found.u) == smooth.weight:
             return found.u, "optimal"
-    at_bound = np.zeros(len(largest), dtype=np.bool_)
-    for _ in range(len(largest) + 1):
-        reference = program.reference(options, np.where(at_bound, largest, np.inf))
-        found = follow_path(_smooth(program, options, largest, at_bound), reference, weight)
-        beyond = program.masses @ found.u > largest * (1.0 + _ON_BOUND)
-        if not np.any(beyond):
-            if found.converged:
-                return found.u, "optimal (Newton: no machine fits these data to their noise)"
-            break
-        at_bound = at_bound | beyond
+    reference = np.zeros(smooth.R.shape[1])
+    for cone in smooth.cones:
+        reference[cone.places] = cone.unit
+    found = follow_path(smooth, reference, weight)
+    if found.converged:
+        return found.u, "optimal (Newton: no machine fits these data to their noise)"
     raise SolverError(
         f"no solution was found, the conic solver stopped with: {status}; with a prior weight"
-        f" above {options.prior_weight:g} there may be one",
-        status=status,
+        f" above {smooth.weight:g} there may be one"
     )
 
 
-def _solve_cone(program: Program, options: Consistency) -> tuple[Array | None, str]:
+def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
     """Return the conic solver's solution u, if it has one, and its word for it."""
     import cvxpy  # a third of a second to import, and only this estimate needs it
 
     cp: Any = cvxpy  # its names come from star imports, which a type checker does not follow
-    u = cp.Variable(program.rows.R.shape[1])
-    n = len(program.masses)
-    first = _N_LINK * n
-    prior: Any = cp.sum_squares(u[first:] - program.centre)
-    constraints: list[Any] = [u[program.not_negative] >= 0.0]
-    for link in range(n):
-        entries = _SYMMETRIC.reshape(_N_LINK, 16).T @ u[_N_LINK * link : _N_LINK * (link + 1)]
-        matrix = cp.reshape(entries, (4, 4), order="C")
-        prior = prior + cp.trace(matrix) - cp.log_det(matrix)
-        constraints.append(matrix >> _INSIDE * np.eye(4))
-    for cone in program.cones[1:]:
+    u = cp.Variable(smooth.R.shape[1])
+    first = len(smooth.centre)
+    prior: Any = cp.sum_squares(u[smooth.R.shape[1] - first :] - smooth.centre)
+    constraints: list[Any] = [u[smooth.not_negative] >= 0.0]
+    for cone in smooth.cones:
         size = cone.entries.shape[1]
-        entries = cone.entries.reshape(-1, size * size).T @ u[cone.places[0]]
-        prior = prior - cone.barrier * cp.log_det(cp.reshape(entries, (size, size), order="C"))
-    error = cp.sum_squares(program.rows.R @ u - program.rows.z)
-    if options.total_mass is not None:
-        constraints.append(program.masses.sum(axis=0) @ u / options.total_mass == 1.0)
-    if options.largest_mass is not None:
-        bounded = np.isfinite(options.largest_mass)
-        constraints.append(program.masses[bounded] @ u <= options.largest_mass[bounded])
-    problem = cp.Problem(cp.Minimize(error + options.prior_weight * prior), constraints)
+        for places in cone.places:
+            entries = cone.entries.reshape(-1, size * size).T @ u[places]
+            matrix = cp.reshape(entries, (size, size), order="C")
+            prior = prior - cone.barrier * cp.log_det(matrix)
+            if cone.pull:
+                prior = prior + cone.pull * cp.trace(matrix)
+                constraints.append(matrix >> _INSIDE * np.eye(size))
+    error = cp.sum_squares(smooth.R @ u - smooth.z)
+    problem = cp.Problem(cp.Minimize(error + smooth.weight * prior), constraints)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is told by its status
+        warnings.simplefilter("ignore")  # an inaccurate solution is named by its status
         try:
             problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
             return None, f"failed ({failure})"
-    # "Infeasible" cannot be true: bounds that contradict each other were refused before.
     usable = problem.status in ("optimal", "optimal_inaccurate") and u.value is not None
     return (np.asarray(u.value, dtype=np.float64) if usable else None), str(problem.status)
-
-
-def _smooth(
-    program: Program, options: Consistency, largest: Array, at_bound: NDArray[np.bool_]
-) -> Smooth:
-    """Return the program for Newton's method, with some links (n,) as heavy as they may be."""
-    equal = list(program.masses[at_bound] / largest[at_bound, None])
-    if options.total_mass is not None:
-        equal.append(program.masses.sum(axis=0) / options.total_mass)
-    return Smooth(
-        R=program.rows.R,
-        z=program.rows.z,
-        weight=options.prior_weight,
-        cones=program.cones,
-        centre=program.centre,
-        not_negative=program.not_negative,
-        equal=np.array(equal).reshape(-1, program.rows.R.shape[1]),
-    )
-
-
-def link_parameters(model: RobotModel, standard: Array) -> Array:
-    """Return the ten parameters of each link (n, 10).
-
-    Raises:
-        ShapeError: the standard parameters are not (s,).
-    """
-    return np.asarray(model.layout.checked(standard)[model.layout.links])
 
 
 def _rotor_units(model: RobotModel, root: SquareRoot, nominal: Array) -> Array:
@@ -631,40 +534,11 @@ def _whole_torque_units(root: SquareRoot, directions: Array) -> Array:
     return np.where(usable, whole / np.where(usable, columns, 1.0), 1.0)
 
 
-def _check_bounds(model: RobotModel, options: Consistency) -> None:
-    """Raise `InfeasibleError` for bounds that no set of masses can meet."""
-    largest = options.largest_mass
-    if largest is None:
-        return
-    if largest.shape != (model.n_joints,):
-        raise ShapeError("largest_mass", largest.shape, f"({model.n_joints},)")
-    for joint, bound in zip(model.joint_names, largest, strict=True):
-        if not bound > 0.0:
-            raise InfeasibleError(f"the link of joint {joint!r} may weigh {bound} kg at most")
-    if options.total_mass is not None and float(largest.sum()) <= options.total_mass:
-        raise InfeasibleError(
-            f"links of at most {float(largest.sum()):g} kg together cannot weigh"
-            f" {options.total_mass:g} kg"
-        )
-
-
-__all__ = [
-    "Consistency",
-    "ConsistentEstimate",
-    "InfeasibleError",
-    "SolverError",
-    "SquareRoot",
-    "consistent_estimate",
-    "square_root",
-]
-
-
 @dataclass(frozen=True, eq=False)
 class ConsistentEstimate:
     """Parameters that a machine can have, and what it cost the fit.
 
     Attributes:
-        standard_names: (s,).
         standard: standard parameters (s,), every pseudo-inertia positive definite, no rotor
             inertia negative. Where the data leave a choice they are close to the nominal ones.
         friction: coefficients (k,), see `RobotModel.friction_part`.
@@ -673,10 +547,6 @@ class ConsistentEstimate:
             covariance of its own, and one that binds makes the true spread smaller.
         unconstrained: the estimate without inequalities, as it was given.
         margin: smallest eigenvalue of each link's pseudo-inertia (n,), SI units, positive.
-        excess: weighted squared torque error above the unconstrained minimum, in units in which
-            a row of pure noise has 1.
-        residual_rms: torque error per joint on the fitted samples (n,) [N·m or N].
-        unconstrained_rms: the same of the unconstrained estimate.
         relative_error: ||tau - tau_hat|| / ||tau|| over all fitted rows.
         unconstrained_relative_error: the same of the unconstrained estimate.
         reference: per link, what stood for its nominal body, in words (n,).
@@ -684,15 +554,11 @@ class ConsistentEstimate:
         solution: in the coordinates of the program (v,).
     """
 
-    standard_names: tuple[str, ...]
     standard: Array
     friction: Array
     estimate: Estimate
     unconstrained: Estimate
     margin: Array
-    excess: float
-    residual_rms: Array
-    unconstrained_rms: Array
     relative_error: float
     unconstrained_relative_error: float
     reference: tuple[str, ...]
@@ -729,11 +595,10 @@ def consistent_estimate(
         factor: the samples.
         unconstrained: the least-squares estimate of the same samples, to compare with.
         weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
-        options: prior and bounds.
+        options: the prior.
         near: `solution` of much the same samples, see :func:`solve_program`.
 
     Raises:
-        InfeasibleError: the mass bounds contradict each other.
         SolverError: the solver found no usable answer.
         ShapeError: an array does not have the shape it should have.
     """
@@ -742,23 +607,19 @@ def consistent_estimate(
     if weights is None:
         weights = joint_weights(factor)
     equations = factor.weighted(weights)
-    root = square_root(equations)
-    program = Program.of(model, root, options)
-    solution, status = solve_program(program, options, equations.n, near)
+    program = Program.of(model, square_root(equations), options)
+    solution, status = solve_program(program, equations.n, near)
     standard, others = program.physical(solution)
-    found = margin(link_parameters(model, standard))
+    found = margin(standard[model.layout.links])
     if not np.all(found > 0.0):
         worst = model.joint_names[int(np.argmin(found))]
         raise SolverError(
             f"the solver ({status}) left the link of joint {worst!r} impossible, its pseudo-inertia"
-            f" has the eigenvalue {found.min():.3g}",
-            status=status,
+            f" has the eigenvalue {found.min():.3g}"
         )
     values = np.concatenate([model.base.grouping @ standard, others])
-    rms, relative = _errors(factor, values)
-    free_rms, free_relative = _errors(factor, unconstrained.values)
+    rms = np.sqrt(factor.squared_errors(values) / np.maximum(factor.samples, 1))
     return ConsistentEstimate(
-        standard_names=model.standard_names,
         standard=standard,
         friction=values[model.friction_part],
         estimate=replace(
@@ -770,21 +631,11 @@ def consistent_estimate(
         ),
         unconstrained=unconstrained,
         margin=found,
-        excess=root.excess(values),
-        residual_rms=rms,
-        unconstrained_rms=free_rms,
-        relative_error=relative,
-        unconstrained_relative_error=free_relative,
+        relative_error=float(np.nan_to_num(factor.relative_error(values))),
+        unconstrained_relative_error=float(
+            np.nan_to_num(factor.relative_error(unconstrained.values))
+        ),
         reference=program.bodies.words,
         status=status,
         solution=solution,
     )
-
-
-def _errors(factor: Factor, values: Array) -> tuple[Array, float]:
-    """Return the RMS torque error per joint (n,), and the relative error over all rows."""
-    augmented = np.append(-values, 1.0)
-    squares = np.maximum(np.einsum("i,jik,k->j", augmented, factor.gram, augmented), 0.0)
-    torque = float(factor.gram[:, -1, -1].sum())
-    rms = np.sqrt(squares / np.maximum(factor.samples, 1))
-    return rms, float(np.sqrt(squares.sum() / torque)) if torque > 0.0 else 0.0

@@ -22,7 +22,6 @@ from identification.estimators.consistent import (
     Consistency,
     Program,
     SquareRoot,
-    link_parameters,
     solve_program,
 )
 from identification.factor.factor import Estimate
@@ -69,16 +68,15 @@ def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int
     if not 1 <= count <= MOST:
         raise IdentificationError(f"{count} variants were asked for; ask for 1 to {MOST}")
     spread, measure = _roots(estimate.covariance)
-    options = Consistency()
-    program = Program.of(model, SquareRoot(measure, measure @ estimate.values), options)
-    near, _ = solve_program(program, options, _ROWS)
+    program = Program.of(model, SquareRoot(measure, measure @ estimate.values), Consistency())
+    near, _ = solve_program(program, _ROWS)
     random = np.random.default_rng(seed)
     standard, values = [], []
     for _ in range(count):
         aim = estimate.values + spread @ random.standard_normal(spread.shape[1])
-        one = replace(program, rows=program.rows._replace(z=measure @ aim))
-        bodies, others = one.physical(solve_program(one, options, _ROWS, near)[0])
-        if not np.all(margin(link_parameters(model, bodies)) > 0.0):
+        one = replace(program, smooth=program.smooth._replace(z=measure @ aim))
+        bodies, others = one.physical(solve_program(one, _ROWS, near)[0])
+        if not np.all(margin(bodies[model.layout.links]) > 0.0):
             raise IdentificationError("a variant was left with an impossible body")
         standard.append(bodies)
         values.append(np.concatenate([model.base.grouping @ bodies, others]))

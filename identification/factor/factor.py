@@ -249,6 +249,22 @@ class Factor(JointFactor):
             A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
         )
 
+    def squared_errors(self, values: Array) -> Array:
+        """Sum of the squared torque errors of parameters (p,) on each joint (n,)."""
+        augmented = np.append(-values, 1.0)
+        squares = np.einsum("i,jik,k->j", augmented, self.gram, augmented)
+        return np.asarray(np.maximum(squares, 0.0))
+
+    def relative_errors(self, values: Array) -> Array:
+        """||e|| / ||tau|| of parameters (p,) on each joint (n,), NaN without torque."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(self.squared_errors(values) / self.gram[:, -1, -1])
+
+    def relative_error(self, values: Array) -> float:
+        """||e|| / ||tau|| of parameters (p,) over all joints, NaN without torque."""
+        power = float(self.gram[:, -1, -1].sum())
+        return float(np.sqrt(self.squared_errors(values).sum() / power)) if power > 0.0 else np.nan
+
     def rows(self, weights: Array) -> tuple[Array, Array]:
         """Directions that hold nothing but the rounding of the Gram matrix are left out."""
         return rows_of(self.weighted(weights))

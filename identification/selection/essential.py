@@ -14,6 +14,10 @@ of the best model so far
 
 What was refused is tried once more when nothing else can go.
 
+The held-out motion decides which parameters stay, so its error flatters the model that is left.
+What the choice is worth on motion that had no say is found beside it: parameters chosen inside the
+fitted motion alone, on its last part, fitted to all of it and tried on the held-out motion.
+
 All of it works on factors: a step is the solution of the remaining normal equations, an error a
 quadratic form. The samples are not read again.
 """
@@ -39,17 +43,21 @@ from identification.factor.factor import (
     joint_weights,
     residual_variance,
     solve,
+    undetermined_names,
 )
-from identification.factor.phases import PhaseFactor, joined
+from identification.factor.phases import PhaseFactor, joined, merged
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
-
-
 Indices = NDArray[np.intp]
 
-_LEVEL: Final = 0.95
+_CHANCE: Final = 0.05
 _TINY: Final = 1e-300
+# Of the fitted motion, the share that parameters are fitted to when the rest chooses them.
+_FITTED_SHARE: Final = 0.7
+# Blocks below which an error is no evidence on anything.
+_FEWEST_BLOCKS: Final = 10
+_MOST_BLOCKS: Final = 150
 
 
 @dataclass(frozen=True)
@@ -71,35 +79,28 @@ class CutRule:
     noticeable: float = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class EliminationStep:
+# A rule that no held-out error can stop: the cut is that of Pham and Gautier alone.
+_BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
+
+
+class EliminationStep(NamedTuple):
     """The model after one more parameter was removed.
 
     Attributes:
         removed: the parameter, None for the model it all begins with.
-        relative_std: the parameter's classical standard deviation over its value, before it was
-            removed; infinite for one that the data do not determine.
         left: number of parameters left.
         spread: largest over smallest relative standard deviation of those left.
         largest_relative_std: of those left, classical; infinite with one that is not determined.
-        condition: of the weighted regressor with columns of unit length.
         in_sample: relative torque error ||e|| / ||tau|| over all joints on the fitted motion.
         held_out: the same on the motion that was held out.
-        held_out_joint: the same per joint (n,), NaN for one that has no row there.
-        rise: weighted squared held-out error less that of the best step before, in standard
-            deviations of this difference; negative where this step is the better one.
     """
 
     removed: str | None
-    relative_std: float
     left: int
     spread: float
     largest_relative_std: float
-    condition: float
     in_sample: float
     held_out: float
-    held_out_joint: Array
-    rise: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +137,79 @@ class Elimination:
         return self.steps[self.cut]
 
 
+class BlindChoice(NamedTuple):
+    """Parameters that were chosen inside the fitted motion, tried on the held-out motion.
+
+    Attributes:
+        left: how many were chosen.
+        essential: relative torque error of these on the held-out motion.
+        full: that of all parameters.
+    """
+
+    left: int
+    essential: float
+    full: float
+
+
+class EssentialChoice(NamedTuple):
+    """Which parameters a robot needs, and how far that can be relied on.
+
+    Attributes:
+        elimination: all steps and the cut, chosen on all held-out motion.
+        by_spread: the last step by the rule of relative standard deviations alone (Pham and
+            Gautier 1991), for comparison.
+        blind: what a choice without a look at the held-out motion is worth; None where the fitted
+            motion is too short for one.
+    """
+
+    elimination: Elimination
+    by_spread: EliminationStep
+    blind: BlindChoice | None
+
+
+def choose_essential(
+    model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
+) -> EssentialChoice:
+    """Choose the essential parameters, and say what the choice is worth.
+
+    Args:
+        model: the robot.
+        training: the samples that are fitted.
+        held_out: of each held-out recording.
+
+    Raises:
+        IdentificationError: nothing was fitted or held out.
+    """
+    if not held_out:
+        raise IdentificationError("there is no held-out motion to choose parameters on")
+    weights = joint_weights(training.total)
+    # Of many recordings neighbouring blocks are added up: what they are for, telling chance from a
+    # rise of the error, needs some hundred of them and costs time with each.
+    longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)
+    unseen = joined([factor.merged(longer) for factor in held_out]).occupied()
+    return EssentialChoice(
+        elimination=eliminate(model, training, unseen, weights=weights),
+        by_spread=eliminate(model, training, unseen, weights=weights, rule=_BY_SPREAD).chosen,
+        blind=_blind(model, training, unseen.total, weights),
+    )
+
+
+def _blind(
+    model: RobotModel, training: PhaseFactor, unseen: Factor, weights: Array
+) -> BlindChoice | None:
+    used = training.occupied()
+    cut = round(_FITTED_SHARE * len(used))
+    if len(used) - cut < _FEWEST_BLOCKS:
+        return None
+    first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
+    chosen = eliminate(model, first, last, weights=weights).estimate.names
+    columns = np.array([model.parameter_names.index(name) for name in chosen], dtype=np.intp)
+    values = np.zeros(model.n_parameters)
+    values[columns] = solve(training.restricted(columns).total.weighted(weights)).values
+    full = solve(training.total.weighted(weights)).values
+    return BlindChoice(len(columns), unseen.relative_error(values), unseen.relative_error(full))
+
+
 def eliminate(
     model: RobotModel,
     training: PhaseFactor,
@@ -155,11 +229,9 @@ def eliminate(
         rule: when to stop.
 
     Raises:
-        IdentificationError: one of the factors has no rows or other parameters than the model.
+        IdentificationError: one of the factors has no rows.
     """
     for factor, what in ((training, "fitted"), (held_out, "held-out")):
-        if factor.parameter_names != model.parameter_names:
-            raise IdentificationError(f"the {what} samples belong to a model of other parameters")
         if not factor.samples.any():
             raise IdentificationError(f"there is not one usable {what} sample")
     total = training.total
@@ -181,25 +253,20 @@ def eliminate(
 
 
 class _Subset(NamedTuple):
-    """The fit with some of the parameters, and its errors.
+    """The fit with some of the parameters, and its errors."""
 
-    Attributes:
-        left: indices of the parameters (k,).
-        solution: of the normal equations in these.
-        relative: their relative standard deviations (k,), infinite where undetermined.
-        values: for the full model (p,), zero elsewhere.
-        blocks: weighted squared held-out error by blocks of time (B,).
-        held_out: relative held-out error over all joints.
-        held_out_joint: per joint (n,), zero for one without rows.
-    """
+    left: Indices  # (k,)
+    solution: Solution  # of the normal equations in these
+    relative: Array  # standard deviations (k,), infinite where undetermined
+    values: Array  # for the full model (p,), zero elsewhere
+    blocks: Array  # weighted squared held-out error by blocks of time (B,)
+    held_out: float  # relative error over all joints
+    held_out_joint: Array  # (n,), zero for one without rows
 
-    left: Indices
-    solution: Solution
-    relative: Array
-    values: Array
-    blocks: Array
-    held_out: float
-    held_out_joint: Array
+    @property
+    def spread(self) -> float:
+        """Largest over smallest relative standard deviation."""
+        return float(self.relative.max() / max(self.relative.min(), _TINY))
 
 
 class _Path:
@@ -221,32 +288,28 @@ class _Path:
         self.refused: list[int] = []
         self.steps: list[EliminationStep] = []
         self.best = self.current = self._subset(np.arange(total.n_parameters))
-        self._take(self.current, None, np.nan)
+        self._take(self.current, None)
 
     def guarded(self) -> None:
         """Remove until those that may go are known comparably well, or nothing may go."""
-        self._remove_what_may_go()
+        before: list[int] | None = None
         # What another parameter stood in for may have become superfluous without it.
-        before: list[int] = []
         while before != self.refused:
             before, self.refused = self.refused, []
-            self._remove_what_may_go()
-
-    def _remove_what_may_go(self) -> None:
-        while self._spread(self.current) >= self._rule.spread and len(self.current.left) > 1:
-            index, relative_std = self._worst()
-            smaller = self._without(index)
-            if np.isfinite(relative_std) and self._is_worse(smaller):
-                self.refused.append(index)
-            else:
-                self._take(smaller, index, relative_std)
+            while self._free_spread() >= self._rule.spread and len(self.current.left) > 1:
+                index, relative_std = self._worst()
+                smaller = self._without(index)
+                if np.isfinite(relative_std) and self._is_worse(smaller):
+                    self.refused.append(index)
+                else:
+                    self._take(smaller, index)
 
     def to_the_end(self) -> None:
         """Remove by relative standard deviation alone until one parameter is left."""
         self.refused = []
         while self.steps[-1].left > 1:
-            index, relative_std = self._worst()
-            self._take(self._without(index), index, relative_std)
+            index, _ = self._worst()
+            self._take(self._without(index), index)
 
     def _worst(self) -> tuple[int, float]:
         """Index and relative standard deviation of what to take out next.
@@ -267,18 +330,24 @@ class _Path:
         return self._subset(self.current.left[self.current.left != index])
 
     def _subset(self, left: Indices) -> _Subset:
-        whole = self._equations
+        whole, values = self._equations, np.zeros(len(self._equations.b))
         solution = solve(
             NormalEquations(whole.A[np.ix_(left, left)], whole.b[left], whole.yy, whole.n)
         )
+        values[left] = solution.values
         variance = np.maximum(np.diag(solution.inverse), 0.0)
         relative = np.sqrt(variance) / np.maximum(np.abs(solution.values), _TINY)
         relative[~solution.determined] = np.inf
-        values = np.zeros(len(whole.b))
-        values[left] = solution.values
-        overall, joint = _relative_errors(self._unseen, values)
-        blocks = _squared(self._blocks, values)
-        return _Subset(left, solution, relative, values, blocks, overall, joint)
+        augmented = np.append(-values, 1.0)
+        return _Subset(
+            left,
+            solution,
+            relative,
+            values,
+            np.maximum((self._blocks @ augmented) @ augmented, 0.0),
+            self._unseen.relative_error(values),
+            np.nan_to_num(self._unseen.relative_errors(values)),
+        )
 
     def _is_worse(self, smaller: _Subset) -> bool:
         """Whether a removal raises the held-out error, by more than the rule gives away."""
@@ -286,28 +355,24 @@ class _Path:
             return False
         overall = (smaller.held_out - self.best.held_out) / self._rule.overall
         axis = (smaller.held_out_joint - self.best.held_out_joint) / self._rule.axis
-        share = max(overall, float(axis.max()))
-        certain = _rise(smaller.blocks - self.best.blocks)[1]
-        return share > (self._rule.noticeable if certain else 1.0)
+        certain = _is_certain(smaller.blocks - self.best.blocks)
+        return max(overall, float(axis.max())) > (self._rule.noticeable if certain else 1.0)
 
-    def _spread(self, subset: _Subset) -> float:
+    def _free_spread(self) -> float:
         """Relative standard deviation of the worst that may go over that of the best known."""
-        free = subset.relative[~np.isin(subset.left, self.refused)]
-        return float(free.max(initial=0.0) / max(subset.relative.min(), _TINY))
+        current = self.current
+        free = current.relative[~np.isin(current.left, self.refused)]
+        return float(free.max(initial=0.0) / max(current.relative.min(), _TINY))
 
-    def _take(self, subset: _Subset, index: int | None, relative_std: float) -> None:
+    def _take(self, subset: _Subset, index: int | None) -> None:
         self.steps.append(
             EliminationStep(
                 removed=None if index is None else self._total.parameter_names[index],
-                relative_std=relative_std,
                 left=len(subset.left),
-                spread=float(subset.relative.max() / max(subset.relative.min(), _TINY)),
+                spread=subset.spread,
                 largest_relative_std=float(subset.relative.max()),
-                condition=subset.solution.condition,
-                in_sample=_relative_errors(self._total, subset.values)[0],
+                in_sample=self._total.relative_error(subset.values),
                 held_out=subset.held_out,
-                held_out_joint=np.where(self._unseen.samples > 0, subset.held_out_joint, np.nan),
-                rise=_rise(subset.blocks - self.best.blocks)[0],
             )
         )
         self.current = subset
@@ -315,42 +380,25 @@ class _Path:
             self.best = subset
 
 
-def _squared(gram: Array, values: Array) -> Array:
-    """Squared error of parameters (p,) by each Gram matrix (B, p + 1, p + 1), shape (B,)."""
-    augmented = np.append(-values, 1.0)
-    return np.asarray(np.maximum((gram @ augmented) @ augmented, 0.0))
+def _is_certain(difference: Array) -> bool:
+    """Whether a sum of differences of squared errors, by blocks (B,), is above zero beyond chance.
 
-
-def _relative_errors(factor: Factor, values: Array) -> tuple[float, Array]:
-    """Relative torque error over all joints, and of each (n,)."""
-    squared, power = _squared(factor.gram, values), factor.gram[:, -1, -1]
-    return (
-        float(np.sqrt(squared.sum() / max(power.sum(), _TINY))),
-        np.sqrt(squared / np.maximum(power, _TINY)),
-    )
-
-
-def _rise(difference: Array) -> tuple[float, bool]:
-    """Sum of a difference of squared errors, by blocks (B,), over its standard deviation.
-
-    Also whether it is more than chance: Student's t with as many blocks as are left when they
-    are merged until neighbours hardly correlate.
+    Student's t with as many blocks as are left when they are merged until neighbours hardly
+    correlate.
     """
     if not difference.any():
-        return 0.0, False
-    length = block_length(difference[:, None])
-    merged = np.add.reduceat(difference, np.arange(0, len(difference), length))
-    count = len(merged)
+        return False
+    blocks = merged(difference, block_length(difference[:, None]))
+    count = len(blocks)
     if count < 2:
-        return 0.0, False
-    rise = float(merged.sum() / max(np.sqrt(count * merged.var(ddof=1)), _TINY))
-    return rise, rise > _chance(count - 1)
+        return False
+    deviation = max(np.sqrt(count * blocks.var(ddof=1)), _TINY)
+    return bool(blocks.sum() / deviation > _limit(count - 1))
 
 
 @lru_cache
-def _chance(freedom: int) -> float:
-    """What Student's t exceeds one time in twenty."""
-    return float(student_limit(1.0 - _LEVEL, freedom))
+def _limit(freedom: int) -> float:
+    return float(student_limit(_CHANCE, freedom))
 
 
 def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:
@@ -375,12 +423,11 @@ def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], ru
 
 def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: Indices) -> Estimate:
     """Estimate of some of the parameters, as a model of its own."""
-    names = tuple(model.parameter_names[k] for k in left)
     part = training.restricted(left)
     total = part.total
     solution = solve(total.weighted(weights))
     result = Estimate(
-        names=names,
+        names=part.parameter_names,
         units=tuple(model.units[k] for k in left),
         values=solution.values,
         covariance=solution.inverse,
@@ -388,128 +435,7 @@ def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: In
         samples=total.samples,
         method="",
         condition=solution.condition,
-        undetermined=tuple(
-            name for name, known in zip(names, solution.determined, strict=True) if not known
-        ),
+        undetermined=undetermined_names(part.parameter_names, solution.determined),
     )
     robust = with_block_covariance(result, part, weights)
     return replace(robust, method=f"essential parameters by {robust.method}")
-
-
-# A rule that no held-out error can stop: the cut is that of Pham and Gautier alone.
-_BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
-# Of the fitted motion, the share that parameters are fitted to when the rest chooses them.
-_FITTED_SHARE: Final = 0.7
-# Blocks below which an error is no evidence on anything.
-_FEWEST_BLOCKS: Final = 10
-_MOST_BLOCKS: Final = 150
-
-
-@dataclass(frozen=True)
-class BlindChoice:
-    """Parameters that were chosen inside the fitted motion, tried on the held-out motion.
-
-    Attributes:
-        left: how many were chosen.
-        essential: relative torque error of these on the held-out motion.
-        full: that of all parameters.
-    """
-
-    left: int
-    essential: float
-    full: float
-
-
-@dataclass(frozen=True, eq=False)
-class EssentialChoice:
-    """Which parameters a robot needs, and how far that can be relied on.
-
-    Attributes:
-        elimination: all steps and the cut, chosen on all held-out motion.
-        by_spread: the last step by the rule of relative standard deviations alone (Pham and
-            Gautier 1991), for comparison.
-        by_spread_names: the parameters that this rule leaves.
-        blind: what a choice without a look at the held-out motion is worth; None where the fitted
-            motion is too short for one.
-    """
-
-    elimination: Elimination
-    by_spread: EliminationStep
-    by_spread_names: tuple[str, ...]
-    blind: BlindChoice | None
-
-
-def choose_essential(
-    model: RobotModel,
-    training: PhaseFactor,
-    held_out: Sequence[PhaseFactor],
-    *,
-    weights: Array | None = None,
-    rule: CutRule = CutRule(),
-) -> EssentialChoice:
-    """Choose the essential parameters, and say what the choice is worth.
-
-    Args:
-        model: the robot.
-        training: the samples that are fitted.
-        held_out: of each held-out recording.
-        weights: per joint (n,); by default the inverse residual variances of an ordinary fit.
-        rule: when to stop.
-
-    Raises:
-        IdentificationError: nothing was fitted or held out, or factors of another model.
-    """
-    if not held_out:
-        raise IdentificationError("there is no held-out motion to choose parameters on")
-    if weights is None:
-        weights = joint_weights(training.total)
-    elimination = eliminate(model, training, _joined(held_out), weights=weights, rule=rule)
-    blind = eliminate(model, training, _joined(held_out), weights=weights, rule=_BY_SPREAD)
-    return EssentialChoice(
-        elimination=elimination,
-        by_spread=blind.chosen,
-        by_spread_names=blind.estimate.names,
-        blind=_blind(model, training, held_out, weights, rule),
-    )
-
-
-def relative_error(factor: Factor, values: Array) -> float:
-    """Relative torque error ||e|| / ||tau|| of parameters (p,) over all joints of a factor."""
-    augmented = np.append(-values, 1.0)
-    squares = float(np.einsum("i,jik,k->", augmented, factor.gram, augmented))
-    power = float(factor.gram[:, -1, -1].sum())
-    return float(np.sqrt(max(squares, 0.0) / power)) if power > 0.0 else np.nan
-
-
-def _blind(
-    model: RobotModel,
-    training: PhaseFactor,
-    held_out: Sequence[PhaseFactor],
-    weights: Array,
-    rule: CutRule,
-) -> BlindChoice | None:
-    used = training.occupied()
-    cut = round(_FITTED_SHARE * len(used))
-    if len(used) - cut < _FEWEST_BLOCKS:
-        return None
-    first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
-    chosen = eliminate(model, first, last, weights=weights, rule=rule).estimate.names
-    columns = np.array([model.parameter_names.index(name) for name in chosen], dtype=np.intp)
-    values = np.zeros(model.n_parameters)
-    values[columns] = solve(training.restricted(columns).total.weighted(weights)).values
-    unseen = _joined(held_out).total
-    return BlindChoice(
-        left=len(columns),
-        essential=relative_error(unseen, values),
-        full=relative_error(unseen, solve(training.total.weighted(weights)).values),
-    )
-
-
-def _joined(factors: Sequence[PhaseFactor]) -> PhaseFactor:
-    """Blocks of several motions one after the other, without empty ones.
-
-    Of many recordings neighbouring blocks are added up: what they are for, telling chance from a
-    rise of the error, needs some hundred of them and costs time with each.
-    """
-    longer = max(1, sum(len(factor) for factor in factors) // _MOST_BLOCKS)
-    return joined([factor.merged(longer) for factor in factors]).occupied()

@@ -275,7 +275,7 @@ class TestAutomaticEstimator:
         """Data that no machine fits are estimated all the same, and the reason stands beside it."""
 
         def none(*_: object) -> None:
-            raise SolverError("no solution was found", status="inaccurate")
+            raise SolverError("no solution was found")
 
         monkeypatch.setattr("hil.identify.estimating.consistent_centre", none)
         settings = replace(prepared.settings, shrinkage=Shrinkage(0.1))
