@@ -183,7 +183,7 @@ def sizes(path: Path) -> list[dict[str, Any]]:
     decompressor = zstandard.ZstdDecompressor()
     with path.open("rb") as stream:
         chunks = [
-            container.chunk_data(record, decompressor=decompressor)
+            container.chunk_data(container.chunk(record), record.offset)
             for record in container.records(stream, path.stat().st_size)
             if record.opcode == container.CHUNK
         ]

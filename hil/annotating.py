@@ -115,8 +115,7 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
     measured = profile(len(names))[MEASURED]
     once = description_messages(archive.attachments.get("robot.urdf", b""))
     content: list[bytes] = []
-    writer = McapWriter(content.append)
-    writer.start(PROFILE, LIBRARY)
+    writer = McapWriter(content.append, PROFILE, LIBRARY)
     for channel, message in once.items():
         writer.add_message(register(writer, channel), first, 0, message)
     events = register(writer, EVENT_CHANNEL)

@@ -63,7 +63,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
     with replacing(path, path.with_suffix(path.suffix + ".tmp")) as temporary:
         _write_through(temporary, content)
-    _sync_folder(path.parent)
+    _sync(path.parent)
 
 
 @contextmanager
@@ -135,7 +135,7 @@ def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> 
             _replace_all(folder, contents, Path(stage))
     except OSError as error:
         raise OutputError(folder, f"cannot be written to ({error.strerror})") from error
-    _sync_folder(folder)
+    _sync(folder)
 
 
 def _replace_all(folder: Path, contents: Mapping[str, str | bytes | None], stage: Path) -> None:
@@ -188,11 +188,20 @@ def _write_through(path: Path, content: str | bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _sync_folder(path: Path) -> None:
-    """Have the names in a folder outlive a loss of power, where its file system can do that."""
+def sync_folder(path: Path) -> None:
+    """Have the names in a folder outlive a loss of power.
+
+    Raises:
+        OSError: its file system cannot do that.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync(path: Path) -> None:
+    """The same where it can be done."""
     with suppress(OSError):
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync_folder(path)

@@ -10,45 +10,34 @@ sequences, but they stay the same over a recording, so it has a constant layout 
 from __future__ import annotations
 
 import re
-import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any, Final
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Rows = NDArray[np.void]
 
-ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
+ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR without parameter list, little endian
+LARGEST_MESSAGE: Final = 1 << 20
+"""Bytes; the longest of ours has some ten thousand. A layout takes memory in proportion."""
 
 _PRIMITIVES = {
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "<i2",
-    "uint16": "<u2",
-    "int32": "<i4",
-    "uint32": "<u4",
-    "int64": "<i8",
-    "uint64": "<u8",
-    "float32": "<f4",
-    "float64": "<f8",
+    **dict.fromkeys(("bool", "byte", "char"), np.dtype("u1")),
+    **{f"int{8 * size}": np.dtype(f"<i{size}") for size in (1, 2, 4, 8)},
+    **{f"uint{8 * size}": np.dtype(f"<u{size}") for size in (1, 2, 4, 8)},
+    **{f"float{8 * size}": np.dtype(f"<f{size}") for size in (4, 8)},
 }
-_FIELD = re.compile(r"(?P<type>[\w/]+)(?P<bound><=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<name>\w+)$")
+_FIELD = re.compile(r"(?P<type>[\w/]+)(<=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<name>\w+)$")
 _CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
 _SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
 _LARGEST = 4096  # elements; what is larger is an image or a cloud of points
 _MOST_PLACES = 10_000  # in one message where a type is laid out
 _DEEPEST = 32  # types within types
 _LONGEST_COUNT = 9  # digits
-
-
-LARGEST_MESSAGE: Final = 1 << 20
-"""Bytes; the longest of ours has some ten thousand. A layout takes memory in proportion."""
+_SEQUENCE = -1
 
 
 class LayoutError(ValueError):
@@ -63,13 +52,13 @@ class MessageLayout:
         dtype: the fields that change from message to message; the structure is as long as a
             message.
         template: one message with every constant byte in place.
-        constant: shape (size,) bool, the bytes that are the same in every message (padding is not
-            among them: writers may leave anything there).
+        constant: the bytes that are the same in every message (padding is not among them: writers
+            may leave anything there).
     """
 
     dtype: np.dtype[np.void]
     template: bytes
-    constant: NDArray[np.bool_]
+    constant: tuple[slice, ...]
 
     @property
     def size(self) -> int:
@@ -83,13 +72,7 @@ class MessageLayout:
     def holds_in(self, messages: NDArray[np.uint8]) -> bool:
         """Whether the constant bytes of messages, shape (k, size), are those of the template."""
         expected = np.frombuffer(self.template, np.uint8)
-        return all((messages[:, run] == expected[run]).all() for run in self._constant_runs)
-
-    @cached_property
-    def _constant_runs(self) -> list[slice]:
-        """The constant bytes as slices."""
-        edges = np.flatnonzero(np.diff(self.constant.astype(np.int8), prepend=0, append=0))
-        return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
+        return all((messages[:, part] == expected[part]).all() for part in self.constant)
 
 
 class LayoutBuilder:
@@ -97,49 +80,29 @@ class LayoutBuilder:
 
     def __init__(self) -> None:
         self._template = bytearray(ENCAPSULATION)
-        self._constant = [True] * len(ENCAPSULATION)
-        self._names: list[str] = []
-        self._formats: list[Any] = []
-        self._offsets: list[int] = []
+        self._constant = [slice(0, len(ENCAPSULATION))]
+        self._fields: list[tuple[str, Any, int]] = []
 
-    @property
-    def size(self) -> int:
-        """Bytes laid out so far."""
-        return len(self._template)
-
-    def _align(self, size: int) -> None:
-        padding = -(len(self._template) - len(ENCAPSULATION)) % size
-        self._extend(bytes(padding), constant=False)
-
-    def _extend(self, data: bytes, *, constant: bool) -> None:
-        self._template += data
-        self._constant += [constant] * len(data)
-
-    def _check_room(self, size: int) -> None:
-        if self.size + size > LARGEST_MESSAGE:
-            raise LayoutError(f"its messages are longer than {LARGEST_MESSAGE} bytes")
+    def next_place(self, size: int) -> int:
+        """Where a number of `size` bytes would begin."""
+        return len(self._template) + -(len(self._template) - len(ENCAPSULATION)) % size
 
     def variable(self, name: str, primitive: str, count: int | None = None) -> None:
         """Place a number, or an array of `count` numbers, that changes with each message."""
-        item = np.dtype(_PRIMITIVES[primitive])
-        self._check_room(item.itemsize * (count or 1))
-        self._align(item.itemsize)
-        self._names.append(name)
-        self._formats.append(item if count is None else (item, (count,)))
-        self._offsets.append(len(self._template))
-        self._extend(bytes(item.itemsize * (1 if count is None else count)), constant=False)
+        item = _PRIMITIVES[primitive]
+        size = item.itemsize * (1 if count is None else count)
+        place = self._extend(item.itemsize, size)
+        self._fields.append((name, item if count is None else (item, (count,)), place))
 
     def count(self, value: int) -> None:
         """Place the constant length of a sequence."""
-        self._align(4)
-        self._extend(struct.pack("<I", value), constant=True)
+        self._fix(4, value.to_bytes(4, "little"))
 
     def string(self, value: str) -> None:
         """Place a constant string."""
         data = value.encode() + b"\0"
-        self._check_room(len(data))
         self.count(len(data))
-        self._extend(data, constant=True)
+        self._fix(1, data)
 
     def sequence(self, name: str, primitive: str, count: int) -> None:
         """Place a sequence of constant length; one of length zero has no column."""
@@ -147,29 +110,50 @@ class LayoutBuilder:
         if count:
             self.variable(name, primitive, count)
 
-    def header(self) -> None:
-        """Place a std_msgs/Header without frame."""
-        self.variable("sec", "int32")
-        self.variable("nanosec", "uint32")
-        self.string("")
-
     def build(self) -> MessageLayout:
         """The layout of the fields placed so far.
 
         Raises:
             LayoutError: two fields have one name.
         """
-        if len(set(self._names)) != len(self._names):
+        names, formats, offsets = ([field[k] for field in self._fields] for k in range(3))
+        if len(set(names)) != len(names):
             raise LayoutError("two of its fields have one name")
-        dtype = np.dtype(
-            {
-                "names": self._names,
-                "formats": self._formats,
-                "offsets": self._offsets,
-                "itemsize": len(self._template),
-            }
-        )
-        return MessageLayout(dtype, bytes(self._template), np.array(self._constant))
+        size = len(self._template)
+        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        return MessageLayout(dtype, bytes(self._template), tuple(self._constant))
+
+    def _extend(self, alignment: int, size: int) -> int:
+        place = self.next_place(alignment)
+        if place + size > LARGEST_MESSAGE:
+            raise LayoutError(f"its messages are longer than {LARGEST_MESSAGE} bytes")
+        self._template += bytes(place + size - len(self._template))
+        return place
+
+    def _fix(self, alignment: int, data: bytes) -> None:
+        part = slice(self._extend(alignment, len(data)), len(self._template))
+        self._template[part] = data
+        last = self._constant[-1]
+        if last.stop == part.start:
+            self._constant[-1] = slice(last.start, part.stop)
+        else:
+            self._constant.append(part)
+
+
+def joint_state_layout(
+    names: Sequence[str], *, position: int, velocity: int, effort: int
+) -> MessageLayout:
+    """Lay out a sensor_msgs/JointState with these names and lengths of its arrays."""
+    builder = LayoutBuilder()
+    builder.variable("sec", "int32")
+    builder.variable("nanosec", "uint32")
+    builder.string("")
+    builder.count(len(names))
+    for name in names:
+        builder.string(name)
+    for quantity, count in (("position", position), ("velocity", velocity), ("effort", effort)):
+        builder.sequence(quantity, "float64", count)
+    return builder.build()
 
 
 @lru_cache(maxsize=64)
@@ -181,21 +165,10 @@ def fixed_layout(definition: str) -> MessageLayout:
     Raises:
         LayoutError: the size of a field depends on the message, or one is of no known type.
     """
-    walk = _Walk(_types("", definition), None)
-    walk.fields("", "")
-    layout = walk.builder.build()
+    layout = _laid_out("", definition, None)
     names = layout.dtype.names or ()
     layout.dtype.names = tuple(name.removeprefix("header/stamp/") for name in names)
     return layout
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One line of a definition: `count` None for a single value, -1 for a sequence."""
-
-    kind: str
-    name: str
-    count: int | None
 
 
 def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
@@ -204,88 +177,81 @@ def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
     Args:
         kind: name of the type.
         definition: its ros2msg text with all dependencies.
-        message: in plain little-endian CDR.
+        message: in little-endian CDR.
 
     Raises:
         LayoutError: the definition cannot be understood, or the message does not keep it.
     """
     if message[:4] != ENCAPSULATION:
         raise LayoutError("its messages are not little-endian CDR")
-    walk = _Walk(_types(kind, definition), message)
-    walk.fields(_short(kind), "")
-    return walk.builder.build()
+    return _laid_out(kind, definition, message)
 
 
-class _Walk:
-    """Goes through one message along its definition, and lays out what it meets.
+def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayout:
+    """Go through a message along its definition, and lay out what is there.
 
     Without a message, strings are empty, and there must be no sequence.
     """
+    types, builder, places = _types(kind, definition), LayoutBuilder(), 0
 
-    def __init__(self, types: Mapping[str, tuple[_Field, ...]], message: bytes | None) -> None:
-        self.builder = LayoutBuilder()
-        self._types = types
-        self._message = message
-        self._places = 0
+    def part(place: int, size: int) -> bytes:
+        found = b"" if message is None else message[place : place + size]
+        if message is not None and len(found) < size:
+            raise LayoutError("its messages end before their last field")
+        return found
 
-    def fields(self, kind: str, path: str, depth: int = 0) -> None:
-        """Lay out the fields of a type; types may hold themselves, or nothing."""
-        if kind not in self._types:
+    def string() -> str:
+        place = builder.next_place(4)
+        text = part(place + 4, int.from_bytes(part(place, 4), "little"))
+        if message is not None and not text.endswith(b"\0"):
+            raise LayoutError("a string has no end")
+        try:
+            return text[:-1].decode()
+        except UnicodeDecodeError as error:
+            raise LayoutError("a string is not UTF-8") from error
+
+    def place_fields(kind: str, path: str, depth: int) -> None:
+        nonlocal places
+        if kind not in types:
             raise LayoutError(f"its definition lacks {kind}")
-        self._places += 1
-        if depth > _DEEPEST or self._places > _MOST_PLACES:
+        places += 1  # types may hold themselves, or nothing
+        if depth > _DEEPEST or places > _MOST_PLACES:
             raise LayoutError(f"its definition nests {kind} too deep or too often")
-        for one in self._types[kind]:
-            self._field(one, path + one.name, depth)
+        for field in types[kind]:
+            place_field(field, path + field.name, depth)
 
-    def _field(self, field: _Field, path: str, depth: int) -> None:
-        count = self._count() if field.count == -1 else field.count
+    def place_field(field: _Field, path: str, depth: int) -> None:
+        count = field.count
+        if count == _SEQUENCE:
+            if message is None:
+                raise LayoutError("a sequence is not of constant size")
+            count = int.from_bytes(part(builder.next_place(4), 4), "little")
+            builder.count(count)
         if field.kind in _PRIMITIVES:
             if count is not None and count > _LARGEST:
                 raise LayoutError(f"{path} has {count} elements")
             if count != 0:
-                self._check_left(np.dtype(_PRIMITIVES[field.kind]).itemsize * (count or 1))
-                self.builder.variable(path, field.kind, count)
+                size = _PRIMITIVES[field.kind].itemsize
+                part(builder.next_place(size), size * (count or 1))
+                builder.variable(path, field.kind, count)
             return
         for index in range(1 if count is None else count):
             place = path if count is None else f"{path}/{index}"
-            if field.kind in ("string", "wstring"):
-                self._string(field.kind, place)
+            if field.kind == "string":
+                builder.string(string())
             else:
-                self.fields(_short(field.kind), f"{place}/", depth + 1)
+                place_fields(field.kind, f"{place}/", depth + 1)
 
-    def _count(self) -> int:
-        if self._message is None:
-            raise LayoutError("a sequence is not of constant size")
-        count = self._number(self._message)
-        self.builder.count(count)
-        return count
+    place_fields(_short(kind), "", 0)
+    return builder.build()
 
-    def _string(self, kind: str, path: str) -> None:
-        if kind == "wstring":
-            raise LayoutError(f"{path} is a wstring")
-        if self._message is None:
-            self.builder.string("")
-            return
-        length = self._number(self._message)
-        start = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4 + 4
-        text = self._message[start : start + length]
-        if len(text) < length or not text.endswith(b"\0"):
-            raise LayoutError(f"{path} does not fit into the message")
-        try:
-            self.builder.string(text[:-1].decode())
-        except UnicodeDecodeError as error:
-            raise LayoutError(f"{path} is not UTF-8") from error
 
-    def _number(self, message: bytes) -> int:
-        """The length that stands at the next place for one."""
-        at = self.builder.size + -(self.builder.size - len(ENCAPSULATION)) % 4
-        self._check_left(4)
-        return int.from_bytes(message[at : at + 4], "little")
+class _Field(NamedTuple):
+    """One line of a definition: `count` is None of a single value."""
 
-    def _check_left(self, size: int) -> None:
-        if self._message is not None and self.builder.size + size > len(self._message):
-            raise LayoutError("its messages end before their last field")
+    kind: str
+    name: str
+    count: int | None
 
 
 def _short(kind: str) -> str:
@@ -294,46 +260,35 @@ def _short(kind: str) -> str:
 
 
 @lru_cache(maxsize=64)
-def _types(kind: str, definition: str) -> dict[str, tuple[_Field, ...]]:
+def _types(kind: str, definition: str) -> Mapping[str, Sequence[_Field]]:
     """Fields by type, of a definition with its dependencies."""
     own, *others = _SEPARATOR.split(definition)
-    package = _short(kind).partition("/")[0]
-    types = {_short(kind): tuple(_fields(own, package))}
+    parts = [(kind, own)]
     for part in others:
         head, _, text = part.partition("\n")
-        name = _short(head.removeprefix("MSG:").strip())
-        types[name] = tuple(_fields(text, name.partition("/")[0]))
+        parts.append((head.removeprefix("MSG:").strip(), text))
+    types = {}
+    for name, text in parts:
+        lines = (line.partition("#")[0].strip() for line in text.splitlines())
+        package = _short(name).partition("/")[0]
+        types[_short(name)] = [
+            _field(line, package) for line in lines if line and not _CONSTANT.match(line)
+        ]
     return types
 
 
-def _fields(text: str, package: str) -> Iterator[_Field]:
-    for line in text.splitlines():
-        stated = line.partition("#")[0].strip()
-        if not stated or _CONSTANT.match(stated):
-            continue
-        # A default value may follow the name.
-        match = _FIELD.match(" ".join(stated.split()[:2]))
-        if match is None:
-            raise LayoutError(f"its definition has the line {stated!r}")
-        kind, count = match["type"], match["count"]
-        if kind in ("time", "duration"):
-            raise LayoutError("its definition is that of ROS 1")
-        if kind not in _PRIMITIVES and kind not in ("string", "wstring") and "/" not in kind:
-            kind = f"{package}/{kind}"
-        fixed = int(count[:_LONGEST_COUNT]) if count is not None and count.isdecimal() else -1
-        yield _Field(kind, match["name"], None if count is None else fixed)
-
-
-def joint_state_layout(
-    names: Sequence[str], *, position: int, velocity: int, effort: int
-) -> MessageLayout:
-    """Lay out a sensor_msgs/JointState with these names and lengths of its arrays."""
-    builder = LayoutBuilder()
-    builder.header()
-    builder.count(len(names))
-    for name in names:
-        builder.string(name)
-    builder.sequence("position", "float64", position)
-    builder.sequence("velocity", "float64", velocity)
-    builder.sequence("effort", "float64", effort)
-    return builder.build()
+def _field(line: str, package: str) -> _Field:
+    match = _FIELD.match(" ".join(line.split()[:2]))  # a default value may follow the name
+    if match is None:
+        raise LayoutError(f"its definition has the line {line!r}")
+    kind, count = match["type"], match["count"]
+    if kind in ("time", "duration"):
+        raise LayoutError("its definition is that of ROS 1")
+    if kind == "wstring":
+        raise LayoutError(f"its field {match['name']} is a wstring")
+    if kind not in _PRIMITIVES and kind != "string":
+        kind = _short(kind) if "/" in kind else f"{package}/{kind}"
+    if count is None:
+        return _Field(kind, match["name"], None)
+    fixed = int(count[:_LONGEST_COUNT]) if count.isdecimal() else _SEQUENCE
+    return _Field(kind, match["name"], fixed)

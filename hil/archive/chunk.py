@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -43,72 +43,50 @@ _STAMP_AT = slice(4, 4 + _STAMP.itemsize)  # in the data of a message, behind it
 _LONGEST_PATTERN = 16  # messages
 
 
-def stamps(data: Bytes) -> NDArray[np.int64]:
-    """Time stamps in the data of messages (k, size), shape (k,) [ns]."""
-    stamp = data[:, _STAMP_AT].view(_STAMP)[:, 0]
-    found = np.multiply(stamp["sec"], 10**9, dtype=np.int64)
-    found += stamp["nanosec"]
-    return np.asarray(found)
-
-
 @dataclass(frozen=True, eq=False)
 class Messages:
     """The messages of one channel in one chunk, or in several that follow each other.
 
     Attributes:
-        heads: what precedes their data, in order, each an array (k, 31) of bytes.
-        parts: their data, each an array (k, size) of messages of one size.
-        starts: where in the chunk the first of each part begins, and how far the next is.
+        parts: their records in order, each an array (k, size) of bytes of messages of one size.
+        places: where in the chunk the records of each part begin, (k,).
     """
 
-    heads: list[Bytes] = field(default_factory=list)
     parts: list[Bytes] = field(default_factory=list)
-    starts: list[tuple[int, int]] = field(default_factory=list)
+    places: list[NDArray[np.int64]] = field(default_factory=list)
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
 
     def of_heads(self, name: str) -> NDArray[Any]:
         """A field of `HEAD`, of all messages."""
-        found = [head.view(HEAD)[:, 0][name] for head in self.heads]
-        return found[0] if len(found) == 1 else np.concatenate(found)
+        heads = [part[:, : HEAD.itemsize].view(HEAD)[:, 0][name] for part in self.parts]
+        return np.concatenate(heads)
 
     @property
-    def places(self) -> NDArray[np.int64]:
-        """Where in the chunk each begins, shape (k,)."""
-        places = [
-            start + step * np.arange(len(part))
-            for (start, step), part in zip(self.starts, self.parts, strict=True)
-        ]
-        return np.concatenate(places)
+    def data(self) -> list[Bytes]:
+        """The data of the messages of each part, (k, size)."""
+        return [part[:, HEAD.itemsize :] for part in self.parts]
 
     @cached_property
     def stamps(self) -> NDArray[np.int64]:
         """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
-        if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
+        if any(data.shape[1] < _STAMP_AT.stop for data in self.data):
             return np.zeros(0, np.int64)
-        found = [stamps(part) for part in self.parts]
-        return found[0] if len(found) == 1 else np.concatenate(found)
+        stamps = [data[:, _STAMP_AT].view(_STAMP)[:, 0] for data in self.data]
+        stamp = np.concatenate(stamps)
+        return np.asarray(stamp["sec"] * np.int64(10**9) + stamp["nanosec"])
 
     def all(self) -> list[bytes]:
         """The data of each message."""
-        return [bytes(message) for part in self.parts for message in part]
-
-    def first(self) -> bytes:
-        """The data of the first message."""
-        return bytes(self.parts[0][0])
+        return [bytes(message) for data in self.data for message in data]
 
     def matrix(self, size: int) -> Bytes | None:
         """The data as bytes (k, size); None when there is a message of another size."""
-        if any(part.shape[1] != size for part in self.parts):
+        data = self.data
+        if any(part.shape[1] != size for part in data):
             return None
-        return self.parts[0] if len(self.parts) == 1 else np.concatenate(self.parts)
-
-    def append(self, head: Bytes, data: Bytes, start: int, step: int) -> None:
-        """Append messages, the first of which begins at `start`, the next `step` behind it."""
-        self.heads.append(head)
-        self.parts.append(data)
-        self.starts.append((start, step))
+        return data[0] if len(data) == 1 else np.concatenate(data)
 
 
 class KnownChannels:
@@ -166,8 +144,7 @@ class _Place(NamedTuple):
 
     channel: int
     words: tuple[tuple[slice, int], ...]
-    head: slice
-    data: slice
+    record: slice
 
 
 class ChunkParser:
@@ -177,25 +154,8 @@ class ChunkParser:
         self.known = KnownChannels()
         self._pattern: list[_Place] = []
 
-    def repeats(self, chunk: bytes) -> bool:
-        """Whether a chunk may be nothing but the known pattern, to judge by its length."""
-        return bool(self._pattern) and len(chunk) % self._pattern[-1].data.stop == 0
-
-    def repeated(self, chunks: Sequence[bytes]) -> dict[int, Messages] | None:
-        """The messages of chunks by channel if they repeat the known pattern and nothing else.
-
-        The chunks must each be of a length that `repeats`.
-        """
-        data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
-        rows = self._run(data, 0)
-        if rows is None or rows.size != len(data):
-            return None
-        found: dict[int, Messages] = {}
-        self._add(rows, 0, found)
-        return found
-
     def messages(self, chunk: bytes, offset: int) -> dict[int, Messages]:
-        """The messages of a chunk by channel.
+        """The messages of a chunk by channel; of several chunks that follow each other likewise.
 
         Args:
             chunk: decompressed records.
@@ -209,8 +169,12 @@ class ChunkParser:
         at = 0
         while at < len(chunk):
             rows = self._run(chunk, at)
-            if rows is not None and len(rows):
-                self._add(rows, at, found)
+            if len(rows):
+                first = at + rows.shape[1] * np.arange(len(rows))
+                for place in self._pattern:
+                    messages = found.setdefault(place.channel, Messages())
+                    messages.parts.append(rows[:, place.record])
+                    messages.places.append(first + place.record.start)
                 at += rows.size
                 continue
             opcode, end = container.bounds(chunk, at, offset)
@@ -222,17 +186,15 @@ class ChunkParser:
                     recent.clear()
                     continue
                 recent.append(head)
-                row = np.frombuffer(chunk, np.uint8, end - at, at)[None]
-                _, _, channel = _FIXED.unpack(head)
-                messages = found.setdefault(channel, Messages())
-                messages.append(row[:, : HEAD.itemsize], row[:, HEAD.itemsize :], at, 0)
+                messages = found.setdefault(_FIXED.unpack(head)[2], Messages())
+                messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
+                messages.places.append(np.array([at]))
             else:
-                body = chunk[at + container.RECORD.size : end]
-                self.known.take(Record(offset, opcode, body, len(body)))
+                self.known.take(Record(offset, opcode, chunk[at + container.RECORD.size : end]))
             at = end
         return found
 
-    def by_topic(self, found: dict[int, Messages], offset: int) -> dict[str, Messages]:
+    def by_topic(self, found: Mapping[int, Messages], offset: int) -> dict[str, Messages]:
         """The same by topic.
 
         Raises:
@@ -243,28 +205,18 @@ class ChunkParser:
             raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
         return {self.known.channels[number].topic: messages for number, messages in found.items()}
 
-    def _run(self, chunk: bytes, at: int) -> Bytes | None:
+    def _run(self, chunk: bytes, at: int) -> Bytes:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
-        if not self._pattern:
-            return None
-        size = self._pattern[-1].data.stop
+        size = self._pattern[-1].record.stop if self._pattern else len(chunk) + 1
         count = (len(chunk) - at) // size
-        if not count:
-            return None
-        rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(-1, size)
+        rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(count, size)
         matching = np.ones(count, np.bool_)
         for place in self._pattern:
             for where, word in place.words:
                 matching &= rows[:, where].view(_WORD)[:, 0] == word
         return rows if matching.all() else rows[: int(matching.argmin())]
 
-    def _add(self, rows: Bytes, at: int, found: dict[int, Messages]) -> None:
-        for place in self._pattern:
-            messages = found.setdefault(place.channel, Messages())
-            start = at + place.head.start
-            messages.append(rows[:, place.head], rows[:, place.data], start, rows.shape[1])
-
-    def _learn(self, heads: list[bytes]) -> bool:
+    def _learn(self, heads: Sequence[bytes]) -> bool:
         """Take one round of heads for the pattern, if no channel comes twice in it."""
         places, start = [], 0
         for head in heads:
@@ -276,8 +228,8 @@ class ChunkParser:
                 )
                 for at in _WORDS_AT
             )
-            data, end = start + HEAD.itemsize, start + container.RECORD.size + length
-            places.append(_Place(channel, words, slice(start, data), slice(data, end)))
+            end = start + container.RECORD.size + length
+            places.append(_Place(channel, words, slice(start, end)))
             start = end
         changed = len({place.channel for place in places}) == len(places)
         changed &= places != self._pattern

@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 from collections.abc import Collection, Iterator
+from functools import lru_cache
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import lz4.frame
 import zstandard
@@ -39,32 +41,28 @@ MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
 MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
 LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
+FARTHEST = 1 << 62  # bytes, less than the end of any file
 
-HEADER = 0x01
-FOOTER = 0x02
-SCHEMA = 0x03
-CHANNEL = 0x04
-MESSAGE = 0x05
-CHUNK = 0x06
-MESSAGE_INDEX = 0x07
-CHUNK_INDEX = 0x08
-ATTACHMENT = 0x09
-ATTACHMENT_INDEX = 0x0A
-STATISTICS = 0x0B
-METADATA = 0x0C
-METADATA_INDEX = 0x0D
-SUMMARY_OFFSET = 0x0E
-DATA_END = 0x0F
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
+SUMMARY_OFFSET, DATA_END = 14, 15
+EVERY_OPCODE = frozenset(range(256))
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
 _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
+_CRC = struct.Struct("<I")
 _NO_CRC = 0
-_BUT_END = frozenset(range(256)) - {DATA_END}
-_KINDS: dict[int, type[McapRecord]] = {SCHEMA: Schema, CHANNEL: Channel, METADATA: Metadata}
+_KINDS: dict[int, type[McapRecord]] = {
+    SCHEMA: Schema,
+    CHANNEL: Channel,
+    METADATA: Metadata,
+    CHUNK_INDEX: ChunkIndex,
+    METADATA_INDEX: MetadataIndex,
+    ATTACHMENT_INDEX: AttachmentIndex,
+}
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
-FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 
 class Damage(Exception):  # noqa: N818 - handed on as a finding, too
@@ -82,27 +80,26 @@ class Damage(Exception):  # noqa: N818 - handed on as a finding, too
 
 
 class Record(NamedTuple):
-    """One record of the data section."""
+    """One record of a file, a chunk or a summary."""
 
     offset: int
     opcode: int
     body: bytes
-    length: int
-
-    @property
-    def end(self) -> int:
-        """Where the next record begins."""
-        return self.offset + RECORD.size + self.length
 
     @property
     def size(self) -> int:
         """Bytes with its head."""
-        return RECORD.size + self.length
+        return RECORD.size + len(self.body)
+
+    @property
+    def end(self) -> int:
+        """Where the next record begins."""
+        return self.offset + self.size
 
     @property
     def data(self) -> bytes:
         """Its bytes as they stand in the file."""
-        return RECORD.pack(self.opcode, self.length) + self.body
+        return RECORD.pack(self.opcode, len(self.body)) + self.body
 
 
 class _Body(ReadDataStream):
@@ -118,18 +115,18 @@ class _Body(ReadDataStream):
         return super().read(length)
 
 
-def parsed(kind: type[_Parsed], body: bytes, offset: int) -> _Parsed:
-    """Read the body of a record that stands at `offset`.
+def parsed(kind: type[_Parsed], record: Record) -> _Parsed:
+    """Read the body of a record.
 
     Raises:
         Damage: it is not one of this kind.
     """
     try:
-        found: _Parsed = kind.read(_Body(body))  # type: ignore[attr-defined]
+        found: _Parsed = kind.read(_Body(record.body))  # type: ignore[attr-defined]
     except EndOfFile:
-        raise Damage(offset, "is shorter than its fields") from None
+        raise Damage(record.offset, "is shorter than its fields") from None
     except UnicodeDecodeError:
-        raise Damage(offset, "holds text that is not UTF-8") from None
+        raise Damage(record.offset, "holds text that is not UTF-8") from None
     return found
 
 
@@ -146,13 +143,12 @@ def bounds(data: bytes, at: int, offset: int) -> tuple[int, int]:
     Raises:
         Damage: it is cut off.
     """
-    if len(data) - at < RECORD.size:
-        raise Damage(offset, "(chunk) ends within a record")
-    opcode, length = RECORD.unpack_from(data, at)
-    end = at + RECORD.size + length
-    if end > len(data):
-        raise Damage(offset, "(chunk) ends within a record")
-    return opcode, end
+    if len(data) - at >= RECORD.size:
+        opcode, length = RECORD.unpack_from(data, at)
+        end = at + RECORD.size + length
+        if end <= len(data):
+            return opcode, end
+    raise Damage(offset, "(chunk) ends within a record")
 
 
 def split(data: bytes, offset: int) -> Iterator[Record]:
@@ -164,8 +160,7 @@ def split(data: bytes, offset: int) -> Iterator[Record]:
     at = 0
     while at < len(data):
         opcode, end = bounds(data, at, offset)
-        body = data[at + RECORD.size : end]
-        yield Record(at, opcode, body, len(body))
+        yield Record(at, opcode, data[at + RECORD.size : end])
         at = end
 
 
@@ -175,16 +170,15 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
     Raises:
         Damage: it is not there.
     """
-    if not RECORD.size <= length <= LARGEST_RECORD or offset > FARTHEST:
-        raise Damage(offset, "is not of the length that the index says")
-    stream.seek(offset)
-    data = stream.read(length)
-    if len(data) != length:
-        raise Damage(offset, "is cut off")
-    opcode, body_length = RECORD.unpack_from(data)
-    if body_length != length - RECORD.size:
-        raise Damage(offset, "is not of the length that the index says")
-    return Record(offset, opcode, data[RECORD.size :], body_length)
+    if RECORD.size <= length <= LARGEST_RECORD and offset <= FARTHEST:
+        stream.seek(offset)
+        data = stream.read(length)
+        if len(data) < length:
+            raise Damage(offset, "is cut off")
+        opcode, body_length = RECORD.unpack_from(data)
+        if body_length == length - RECORD.size:
+            return Record(offset, opcode, data[RECORD.size :])
+    raise Damage(offset, "is not of the length that the index says")
 
 
 def records(
@@ -203,9 +197,9 @@ def records(
     """
     if stream.read(len(MAGIC)) != MAGIC:
         raise Damage(0, "is not the beginning of an MCAP file")
-    offset = len(MAGIC)
+    offset, opcode = len(MAGIC), -1
     read, seek = stream.read, stream.seek
-    while True:
+    while opcode != DATA_END:
         head = read(RECORD.size)
         if not head:
             raise Damage(offset, "is missing: the file ends before its footer")
@@ -216,26 +210,15 @@ def records(
             raise Damage(offset, "is zeros, where one must begin")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
-        if length > LARGEST_RECORD and opcode not in skip:
-            raise Damage(offset, f"claims {length} bytes of content")
         if opcode in skip:
             seek(length, os.SEEK_CUR)
+        elif length > LARGEST_RECORD:
+            raise Damage(offset, f"claims {length} bytes of content")
         else:
-            yield Record(offset, opcode, read(length), length)
+            yield Record(offset, opcode, read(length))
         offset += RECORD.size + length
-        if opcode == DATA_END:
-            if check_end:
-                _check_end(read(min(size - offset, LARGEST_RECORD)), offset)
-            return
-
-
-def data_end(stream: BinaryIO, size: int) -> int | None:
-    """Where the summary must begin, found from head to head; None where the way is broken."""
-    stream.seek(0)
-    try:
-        return next(records(stream, size, skip=_BUT_END, check_end=False)).end
-    except Damage:
-        return None
+    if check_end:
+        _check_end(read(min(size - offset, LARGEST_RECORD)), offset)
 
 
 def _check_end(tail: bytes, offset: int) -> None:
@@ -243,10 +226,9 @@ def _check_end(tail: bytes, offset: int) -> None:
     if len(tail) < FOOTER_SIZE + len(MAGIC) or not tail.endswith(MAGIC):
         raise Damage(offset, "(index and footer) is cut off")
     footer = tail[-FOOTER_SIZE - len(MAGIC) : -len(MAGIC)]
-    opcode, length = RECORD.unpack_from(footer)
-    (crc,) = struct.unpack_from("<I", footer, FOOTER_SIZE - 4)
-    covered = tail[: -len(MAGIC) - 4]
-    if opcode != FOOTER or length != 20 or (crc != _NO_CRC and crc32(covered) != crc):
+    covered, (crc,) = tail[: -len(MAGIC) - _CRC.size], _CRC.unpack(footer[-_CRC.size :])
+    is_footer = RECORD.unpack_from(footer) == (FOOTER, FOOTER_SIZE - RECORD.size)
+    if not is_footer or (crc != _NO_CRC and crc32(covered) != crc):
         raise Damage(offset, "(index and footer) fails its checksum")
 
 
@@ -260,21 +242,20 @@ def item(record: Record) -> McapRecord:
         return attachment(record)
     if record.opcode not in _KINDS:
         raise Damage(record.offset, "is of another kind")
-    return parsed(_KINDS[record.opcode], record.body, record.offset)
+    return parsed(_KINDS[record.opcode], record)
 
 
 def attachment(record: Record) -> Attachment:
     """An attachment, its checksum verified."""
-    found = parsed(Attachment, record.body, record.offset)
-    (crc,) = struct.unpack("<I", record.body[-4:])
-    if crc != crc32(record.body[:-4]):
+    found = parsed(Attachment, record)
+    if _CRC.unpack(record.body[-_CRC.size :]) != (crc32(record.body[: -_CRC.size]),):
         raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
     return found
 
 
 def metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Name and entries of a metadata record."""
-    found = parsed(Metadata, record.body, record.offset)
+    found = parsed(Metadata, record)
     return found.name, found.metadata
 
 
@@ -294,67 +275,49 @@ def chunk(record: Record) -> Chunk:
     return Chunk(compression, data, end, start, crc, size)
 
 
-def chunk_data(
-    record: Record, *, decompressor: zstandard.ZstdDecompressor, head: Chunk | None = None
-) -> bytes:
-    """Decompress the records of a chunk, which may be parsed already; verify their checksum."""
-    head = head or chunk(record)
-    data = decompressed(head, record.offset, decompressor)
-    if crc32(data) != head.uncompressed_crc:
-        missing = head.uncompressed_crc == _NO_CRC
-        raise Damage(record.offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
+def chunk_data(chunk: Chunk, offset: int) -> bytes:
+    """The records of a chunk that stands at `offset`, decompressed, their checksum verified."""
+    data = decompressed(chunk, offset)
+    if crc32(data) != chunk.uncompressed_crc:
+        missing = chunk.uncompressed_crc == _NO_CRC
+        raise Damage(offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
     return data
 
 
-def decompressed(
-    chunk: Chunk,
-    offset: int,
-    decompressor: zstandard.ZstdDecompressor,
-    *,
-    largest: int = LARGEST_CHUNK,
-) -> bytes:
+def decompressed(chunk: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
     """The records of a chunk that stands at `offset`; their checksum is not looked at.
+
+    At most one byte more than declared is decompressed: a corrupt frame fills no memory.
 
     Raises:
         Damage: they are more than `largest` bytes or inflated beyond measure, not as many as
             stated, or cannot be decompressed.
     """
-    size = chunk.uncompressed_size
-    if size > min(largest, MOST_INFLATION * len(chunk.data)):
+    size, data = chunk.uncompressed_size, chunk.data
+    if size > min(largest, MOST_INFLATION * len(data)):
         raise Damage(offset, f"(chunk) claims {size} bytes of content")
-    data = _decompressed(chunk, offset, decompressor)
-    if len(data) != size:
-        raise Damage(offset, "(chunk) has another length than it claims")
-    return data
-
-
-def _decompressed(chunk: Chunk, offset: int, decompressor: zstandard.ZstdDecompressor) -> bytes:
-    """Decompress to at most one byte more than declared: a corrupt frame fills no memory."""
-    size = chunk.uncompressed_size
     try:
         if chunk.compression == "zstd":
-            if zstandard.frame_content_size(chunk.data) not in (-1, size):
+            if zstandard.frame_content_size(data) not in (-1, size):
                 raise Damage(offset, "(chunk) has another length than it claims")
-            return decompressor.decompress(chunk.data, max_output_size=max(1, size))
-        if chunk.compression == "lz4":
-            frame = lz4.frame.LZ4FrameDecompressor()
-            return bytes(frame.decompress(chunk.data, max_length=size + 1))
+            decompressor = _decompressor(threading.get_ident())
+            data = decompressor.decompress(data, max_output_size=max(1, size))
+        elif chunk.compression == "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif chunk.compression:
+            raise Damage(
+                offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4"
+            )
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
-    if chunk.compression == "":
-        return chunk.data
-    raise Damage(offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4")
+    if len(data) != size:
+        raise Damage(offset, "(chunk) has another length than it claims")
+    return bytes(data)
 
 
-def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """The record that ends a file; None where it does not."""
-    if size < FOOTER_SIZE + len(MAGIC):
-        return None
-    stream.seek(size - FOOTER_SIZE - len(MAGIC))
-    data = stream.read(FOOTER_SIZE + len(MAGIC))
-    if not data.endswith(MAGIC) or RECORD.unpack_from(data) != (FOOTER, FOOTER_SIZE - RECORD.size):
-        return None
-    return parsed(Footer, data[RECORD.size :], size)
+@lru_cache(maxsize=16)
+def _decompressor(thread: int) -> zstandard.ZstdDecompressor:  # noqa: ARG001 - one of each thread
+    return zstandard.ZstdDecompressor()
 
 
 class Summary:
@@ -368,7 +331,7 @@ class Summary:
         self._records = [*split(data, 0)]
 
     @classmethod
-    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Self | None:
+    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
         """Read it; None where there is none, or where it is not whole.
 
         Args:
@@ -377,15 +340,19 @@ class Summary:
             start: where the data section ends, of a file in which records may have moved; what
                 the summary lists may then be elsewhere.
         """
-        footer = _footer(stream, size)
-        if footer is None:
-            return None
-        start = footer.summary_start if start is None else start
         last = size - FOOTER_SIZE - len(MAGIC)
+        if last < 0:
+            return None
+        stream.seek(last)
+        tail = stream.read(size - last)
+        if not tail.endswith(MAGIC) or RECORD.unpack_from(tail) != (FOOTER, 20):
+            return None
+        footer = parsed(Footer, Record(last, FOOTER, tail[RECORD.size : FOOTER_SIZE]))
+        start = footer.summary_start if start is None else start
         if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD or not footer.summary_crc:
             return None
         stream.seek(start)
-        data = stream.read(last + FOOTER_SIZE - 4 - start)
+        data = stream.read(last + FOOTER_SIZE - _CRC.size - start)
         if crc32(data) != footer.summary_crc:
             return None
         try:
@@ -393,31 +360,29 @@ class Summary:
         except Damage:
             return None
 
-    def _bodies(self, opcode: int) -> list[bytes]:
-        return [record.body for record in self._records if record.opcode == opcode]
-
     @property
     def definitions(self) -> list[Record]:
         """Schema and channel records."""
         return [record for record in self._records if record.opcode in (SCHEMA, CHANNEL)]
 
+    def _entries(self, opcode: int) -> list[Any]:
+        return [item(record) for record in self._records if record.opcode == opcode]
+
     @property
     def metadata(self) -> list[tuple[int, int]]:
         """Offset and length of the metadata records."""
-        found = [parsed(MetadataIndex, body, 0) for body in self._bodies(METADATA_INDEX)]
-        return [(one.offset, one.length) for one in found]
+        return [(one.offset, one.length) for one in self._entries(METADATA_INDEX)]
 
     @property
     def others(self) -> list[tuple[int, int]]:
         """Offset and length of metadata and attachments."""
-        found = [parsed(AttachmentIndex, body, 0) for body in self._bodies(ATTACHMENT_INDEX)]
-        return sorted([*self.metadata, *((one.offset, one.length) for one in found)])
+        attachments = self._entries(ATTACHMENT_INDEX)
+        return sorted([*self.metadata, *((one.offset, one.length) for one in attachments)])
 
     @property
     def chunks(self) -> list[ChunkIndex]:
         """In the order of the file."""
-        chunks = [parsed(ChunkIndex, body, 0) for body in self._bodies(CHUNK_INDEX)]
-        return sorted(chunks, key=lambda entry: entry.chunk_start_offset)
+        return sorted(self._entries(CHUNK_INDEX), key=lambda entry: entry.chunk_start_offset)
 
     @property
     def places(self) -> list[tuple[int, int]]:

@@ -38,24 +38,23 @@ from numpy.typing import NDArray
 from hil.archive import container
 from hil.archive.cdr import Rows
 from hil.archive.chunk import HEAD, Messages
-from hil.archive.container import MAGIC, MESSAGE, Record, encoded
+from hil.archive.container import MAGIC, MESSAGE, RECORD, Record, encoded
 
 _ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _HEAD = struct.Struct("<BQHIQQ")
 _MESSAGE_INDEX = struct.Struct("<BQHI")
-_COMPRESSION = "zstd"
 _LEVEL = -1
 """Of Zstandard. Against the usual 3 it costs 4 % in size, and saves a third of the time both of
 writing and of reading (`python -m benchmarks.archive --sizes`)."""
 
-Entries = Mapping[int, Sequence[NDArray[np.void]]]
+Entries = Mapping[int, NDArray[np.void]]
 """Stamps and offsets of the messages of a chunk by channel, in the order of the first ones."""
 
 
 def entries_of(found: Mapping[int, Messages]) -> Entries:
     """The entries of messages that were read."""
     return {
-        number: [_entries(messages.of_heads("log_time"), messages.places)]
+        number: _entries(messages.of_heads("log_time"), np.concatenate(messages.places))
         for number, messages in found.items()
     }
 
@@ -68,9 +67,7 @@ def _entries(stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.
 
 def span(entries: Entries) -> tuple[int, int]:
     """First and last stamp [ns], zeros of a chunk without messages."""
-    stamps = [part["stamp"] for parts in entries.values() for part in parts if len(part)]
-    if not stamps:
-        return 0, 0
+    stamps = [part["stamp"] for part in entries.values() if len(part)] or [np.zeros(1, np.uint64)]
     return int(min(part.min() for part in stamps)), int(max(part.max() for part in stamps))
 
 
@@ -86,13 +83,14 @@ class McapWriter:
 
     Args:
         write: takes the next bytes of the file.
+        profile, library: of its header.
 
     Attributes:
         position: where the next record begins.
         checksums: of the chunks written so far, CRC-32 of their records.
     """
 
-    def __init__(self, write: Callable[[bytes], object]) -> None:
+    def __init__(self, write: Callable[[bytes], object], profile: str, library: str) -> None:
         self.position = 0
         self.checksums: list[int] = []
         self._write = write
@@ -105,30 +103,36 @@ class McapWriter:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        self._times: list[int] = []
-
-    def start(self, profile: str, library: str) -> None:
-        """Begin the file."""
         self._put(MAGIC)
-        self._put(encoded(Header(profile, library)))
+        self.put(encoded(Header(profile, library)))
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Add a metadata record, in front of the chunk in progress."""
-        item = Metadata(name, dict(entries))
-        self._add(item, encoded(item))
+        self.put(encoded(Metadata(name, dict(entries))))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Add an attachment without times, in front of the chunk in progress."""
-        item = Attachment(0, 0, name, media_type, data)
-        self._add(item, encoded(item))
+        self.put(encoded(Attachment(0, 0, name, media_type, data)))
 
-    def copy(self, record: Record) -> None:
-        """Add a record of another file: attachment, metadata, schema or channel.
+    def put(self, data: bytes) -> None:
+        """Add a record that is no chunk, given with its head, and list it in the summary.
 
         Raises:
-            Damage: it is none of these.
+            Damage: its body is not of its kind.
         """
-        self._add(container.item(record), record.data)
+        record, place = Record(self.position, data[0], data[RECORD.size :]), self.position
+        if record.opcode == container.METADATA:
+            name, _ = container.metadata(record)
+            self._metadata.append(MetadataIndex(place, len(data), name))
+        elif record.opcode == container.ATTACHMENT:
+            item = container.attachment(record)
+            times, size = (item.log_time, item.create_time), len(item.data)
+            self._attachments.append(
+                AttachmentIndex(place, len(data), *times, size, item.name, item.media_type)
+            )
+        elif record.opcode in (container.SCHEMA, container.CHANNEL):
+            self.note(container.item(record))
+        self._put(data)
 
     def register(
         self, topic: str, message_encoding: str, schema: str, encoding: str, definition: bytes
@@ -143,18 +147,19 @@ class McapWriter:
             self._append(encoded(item))
         return number
 
-    def note(self, item: Schema | Channel) -> None:
+    def note(self, item: McapRecord) -> None:
         """List a schema or channel in the summary; it stands in a chunk."""
         if isinstance(item, Schema):
             self._schemas.setdefault(item.id, item)
-        else:
+        elif isinstance(item, Channel):
             self._channels.setdefault(item.id, item)
 
     def add_message(self, channel: int, stamp: int, sequence: int, data: bytes) -> None:
         """Add one message at `stamp` [ns] to the chunk in progress."""
-        length = HEAD.itemsize - container.RECORD.size + len(data)
-        entries = _entries(np.array([stamp]), np.array([self._size]))
-        self._entries.setdefault(channel, []).append(entries)
+        length = HEAD.itemsize - RECORD.size + len(data)
+        self._entries.setdefault(channel, []).append(
+            _entries(np.array([stamp]), np.array([self._size]))
+        )
         self._append(_HEAD.pack(MESSAGE, length, channel, sequence, stamp, stamp) + data)
 
     def add_rows(
@@ -181,7 +186,7 @@ class McapWriter:
         for place, (channel, rows) in enumerate(zip(channels, messages, strict=True)):
             record = records[str(place)]
             record["opcode"] = MESSAGE
-            record["length"] = HEAD.itemsize - container.RECORD.size + rows.itemsize
+            record["length"] = HEAD.itemsize - RECORD.size + rows.itemsize
             record["channel"] = channel
             record["sequence"] = sequence
             record["log_time"] = record["publish_time"] = stamp
@@ -194,9 +199,12 @@ class McapWriter:
         """End the chunk in progress, if it has messages."""
         if not self._entries:
             return
-        data, entries = b"".join(self._parts), self._entries
+        data = b"".join(self._parts)
+        entries = {number: np.concatenate(parts) for number, parts in self._entries.items()}
         self._parts, self._size, self._entries = [], 0, {}
-        self.add_chunk(chunk_of(data, entries), entries)
+        first, last = span(entries)
+        packed = zstandard.compress(data, _LEVEL)
+        self.add_chunk(Chunk("zstd", packed, last, first, crc32(data), len(data)), entries)
 
     def add_chunk(self, chunk: Chunk, entries: Entries) -> None:
         """Add a whole chunk and its message indexes, in front of the chunk in progress.
@@ -209,15 +217,14 @@ class McapWriter:
         self._put(record)
         end = self.position
         offsets: dict[int, int] = {}
-        for channel, parts in entries.items():
+        for channel, part in entries.items():
             offsets[channel] = self.position
-            data = b"".join(part.tobytes() for part in parts)
-            self._counts[channel] = self._counts.get(channel, 0) + len(data) // _ENTRY.itemsize
-            length = _MESSAGE_INDEX.size - container.RECORD.size + len(data)
+            data = part.tobytes()
+            self._counts[channel] = self._counts.get(channel, 0) + len(part)
+            length = _MESSAGE_INDEX.size - RECORD.size + len(data)
             head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, length, channel, len(data))
             self._put(head + data)
         first, last = span(entries)
-        self._times = [min([first, *self._times]), max([last, *self._times])]
         self.checksums.append(chunk.uncompressed_crc)
         self._chunks.append(
             ChunkIndex(
@@ -238,22 +245,14 @@ class McapWriter:
         self.flush()
         self._put(encoded(DataEnd(0)))
         start = self.position
-        summary, offsets_start = self.summary()
-        # The checksum of the index covers the footer up to the checksum itself.
-        covered = summary + encoded(Footer(start, offsets_start, 0))[: -struct.calcsize("<I")]
-        self._put(covered + struct.pack("<I", crc32(covered)) + MAGIC)
-
-    def summary(self) -> tuple[bytes, int]:
-        """The summary, were it to begin here, and where its last group begins."""
-        first, last = self._times or (0, 0)
         statistics = Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
             chunk_count=len(self._chunks),
             message_count=sum(self._counts.values()),
-            message_end_time=last,
-            message_start_time=first,
+            message_end_time=max((one.message_end_time for one in self._chunks), default=0),
+            message_start_time=min((one.message_start_time for one in self._chunks), default=0),
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
@@ -268,21 +267,12 @@ class McapWriter:
         summary, offsets = b"", b""
         for opcode, records in groups:
             data = b"".join(map(encoded, records))
-            offsets += encoded(SummaryOffset(opcode, self.position + len(summary), len(data)))
+            offsets += encoded(SummaryOffset(opcode, start + len(summary), len(data)))
             summary += data
-        return summary + offsets, self.position + len(summary)
-
-    def _add(self, item: McapRecord, data: bytes) -> None:
-        place = self.position, len(data)
-        if isinstance(item, Metadata):
-            self._metadata.append(MetadataIndex(*place, item.name))
-        elif isinstance(item, Attachment):
-            times, size = (item.log_time, item.create_time), len(item.data)
-            index = AttachmentIndex(*place, *times, size, item.name, item.media_type)
-            self._attachments.append(index)
-        elif isinstance(item, Schema | Channel):
-            self.note(item)
-        self._put(data)
+        # The checksum of the index covers the footer up to the checksum itself.
+        footer = encoded(Footer(start, start + len(summary), 0))
+        covered = (summary + offsets + footer)[: -struct.calcsize("<I")]
+        self._put(covered + struct.pack("<I", crc32(covered)) + MAGIC)
 
     def _append(self, records: bytes) -> None:
         self._parts.append(records)
@@ -293,24 +283,10 @@ class McapWriter:
         self.position += len(data)
 
 
-def chunk_of(data: bytes, entries: Entries) -> Chunk:
-    """The chunk of these records, compressed as ours are."""
-    first, last = span(entries)
-    return Chunk(
-        _COMPRESSION, zstandard.compress(data, _LEVEL), last, first, crc32(data), len(data)
-    )
-
-
 @cache
 def _records_dtype(sizes: tuple[int, ...]) -> np.dtype[np.void]:
     """The message records of one instant, one of each data size [bytes], without padding."""
+    head = [(name, HEAD[name]) for name in HEAD.names or ()]
     return np.dtype(
-        [
-            (str(place), np.dtype([*_head_fields(), ("data", f"V{size}")]))
-            for place, size in enumerate(sizes)
-        ]
+        [(str(place), np.dtype([*head, ("data", f"V{size}")])) for place, size in enumerate(sizes)]
     )
-
-
-def _head_fields() -> list[tuple[str, np.dtype[np.generic]]]:
-    return [(name, HEAD[name]) for name in HEAD.names or ()]

@@ -10,7 +10,7 @@ from typing import Any
 
 from hil.archive.header import WORDS, ArchiveHeader, ArchiveOutcome, motion_name
 from hil.archive.reader import Archive, open_archive
-from hil.archive.survey import survey
+from hil.archive.repair import survey
 
 _MOST_EVENTS = 20
 _SHOWN_ELSEWHERE = frozenset(
@@ -88,7 +88,7 @@ def overview(path: str | PathLike[str]) -> Overview:
         per_minute=found.size / duration * 60.0 if duration else None,
         chunks=found.chunks,
         channels=tuple(
-            (topic, found.schema_name(topic), count)
+            (topic, getattr(found.parser.known.schema(topic), "name", ""), count)
             for topic, count in sorted(found.counts.items())
         ),
         attachments={name: len(data) for name, data in archive.attachments.items()},

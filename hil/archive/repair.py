@@ -1,91 +1,236 @@
-"""Makes of a torn or damaged archive one that every reader accepts.
+"""Says what of a torn or damaged archive stands, and makes of it one that every reader accepts.
 
-What stands is copied record by record; message indexes and summary are made anew, and the outcome
-says what is lost. Nothing is invented: what cannot be verified is left out.
+The reader stops at the first damage; a survey goes on, so that what follows can be saved. What
+stands has passed the same checks (`hil.archive.scan`) and is copied record by record; message
+indexes and summary are made anew, and the outcome says what is lost. Nothing is invented: what
+cannot be verified is left out.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
-from tempfile import NamedTemporaryFile
-from typing import IO, BinaryIO
+from typing import BinaryIO, NamedTuple
 
-import zstandard
-from mcap.records import Chunk
+from mcap.records import Header
 
 from hil.archive import container, header, schema
-from hil.archive.chunk import ChunkParser
-from hil.archive.container import Record
-from hil.archive.header import ArchiveOutcome
-from hil.archive.mcap_writer import Entries, McapWriter, entries_of, span
+from hil.archive.chunk import ChunkParser, Messages
+from hil.archive.container import Damage, Record, Summary
+from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
+from hil.archive.mcap_writer import McapWriter, entries_of, span
 from hil.archive.reader import open_archive
-from hil.archive.survey import Survey, survey
-from hil.archive.writer import sync_folder
+from hil.archive.scan import NUMBERS, Expected, Scan
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+from hil.files import replacing, sync_folder
 from hil.reading import opened
 
 Write = Callable[[bytes], object]
-_NAMED = 40  # characters that the temporary file takes over of the name
+_ASPECTS = {
+    container.METADATA: "metadata",
+    container.ATTACHMENT: "attachments",
+    container.CHUNK: "chunks",
+}
+_BUT_END = container.EVERY_OPCODE - {container.DATA_END}
 
 
-def write_anew(source: Path, target: Path, fill: Callable[[BinaryIO, Write], None]) -> None:
-    """Make an archive of another one; `target` is at any moment what it was, or whole.
+class Fault(NamedTuple):
+    """Something that is not as it must be.
 
-    File and folder are on the disk when this returns, and the file has the mode of its source.
+    Attributes:
+        aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
+        text: what is wrong, as a sentence without its end.
+        loss: whether content is lost by it; otherwise it follows from what is there.
+    """
+
+    aspect: str
+    text: str
+    loss: bool
+
+
+Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
+
+
+class Survey(Scan):
+    """What stands of a file, and what does not; message indexes and summary are not looked at.
 
     Args:
-        source: the archive to make it of.
-        target: the file to write or to replace, which may be the source.
-        fill: writes the content, given the source and what takes the bytes of the new file.
+        path: the file.
+        stream: the same, open.
+        visit: called with each chunk that stands.
+
+    Attributes:
+        path: the file.
+        size: its length.
+        written_by: profile and library, None where the record is damaged.
+        pieces: records that stand, but for header and outcome, in the order of the file: opcode,
+            offset and length with the head.
+        definitions: schemas and channels in the summary.
+        faults: what is wrong.
+    """
+
+    def __init__(self, path: Path, stream: BinaryIO, visit: Visit | None = None) -> None:
+        self.path = path
+        self.size = os.fstat(stream.fileno()).st_size
+        self.written_by: tuple[str, str] | None = None
+        self.pieces: list[tuple[int, int, int]] = []
+        self.faults: list[Fault] = []
+        self._visit = visit
+        self._record = Record(0, 0, b"")  # the one that is examined
+        self._lost_since = False
+        self._ended = False
+        # Found from head to head, since a chunk of another length may have come before it.
+        walk = container.records(stream, self.size, skip=_BUT_END, check_end=False)
+        try:
+            end: int | None = next(walk).end
+        except Damage:
+            end = None
+        self._summary = Summary.read(stream, self.size, start=end)
+        self.definitions = self._summary.definitions if self._summary else []
+        super().__init__(Expected.read(stream, self.size, self._summary), gapless=False)
+        self._run(stream)
+
+    @property
+    def losses(self) -> list[str]:
+        """What is lost, and where; empty if everything that was written is there."""
+        if not any(fault.loss for fault in self.faults):
+            return []
+        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
+        return self.outcome is not None and not self.outcome.belongs_to(self.header)
+
+    @property
+    def samples(self) -> int:
+        """Samples that stand."""
+        return max(self.counts.get(topic, 0) for topic in NUMBERS)
+
+    @property
+    def samples_lost(self) -> int | None:
+        """Samples that do not, None where nobody can say."""
+        stated = None if self.outcome is None else self.outcome.samples
+        if not self.losses:
+            return 0
+        return None if stated is None else max(0, stated - self.samples)
+
+    def _run(self, stream: BinaryIO) -> None:
+        seen: set[int] = set()
+        stream.seek(0)
+        walk = container.records(
+            stream, self.size, skip=(container.MESSAGE_INDEX,), check_end=False
+        )
+        try:
+            for record in walk:
+                seen.add(record.offset)
+                self._examine(record)
+        except Damage as damage:
+            self._lost_since = True  # and what is lost, counts and outcome will tell
+            self._fault("container", damage, loss=False)
+        for place in self._listed_places():
+            if place[0] not in seen:  # the walk did not get there
+                seen.add(place[0])
+                try:
+                    record = container.record_at(stream, *place)
+                except Damage as damage:
+                    self._fault("container", damage, loss=True)
+                else:
+                    self._examine(record)
+        if self.metadata is not None:
+            if self.written_by != (schema.PROFILE, schema.LIBRARY):
+                self._fault("container", "the header is not that of the profile", loss=False)
+            if self.mixed:
+                self._fault("outcome", "the outcome is that of another recording", loss=True)
+            for aspect, text in self.shortfalls():
+                self._fault(aspect, text, loss=True)
+
+    def _listed_places(self) -> list[tuple[int, int]]:
+        try:
+            return self._summary.places if self._summary else []
+        except Damage:
+            return []
+
+    def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
+        self._lost_since |= loss
+        if isinstance(problem, Damage):
+            problem = f"the record at byte {problem.offset} {problem.reason}"
+        fault = Fault(aspect, problem, loss)
+        if fault not in self.faults:
+            self.faults.append(fault)
+
+    def _examine(self, record: Record) -> None:
+        self._record, ours = record, (self.metadata, self.outcome)
+        try:
+            if record.opcode == container.HEADER:
+                head = container.parsed(Header, record)
+                self.written_by = head.profile, head.library
+            self.take(record)
+        except Damage as damage:
+            aspect = _ASPECTS.get(record.opcode, "container")
+            self._fault(aspect, damage, loss=record.opcode != container.HEADER)
+            return
+        content = (*_ASPECTS, container.SCHEMA, container.CHANNEL)
+        is_ours = ours != (self.metadata, self.outcome)
+        if record.opcode in content and not is_ours and self.metadata is not None:
+            self.pieces.append((record.opcode, record.offset, record.size))
+
+    def visit(self, found: Mapping[str, Messages], offset: int) -> None:  # noqa: ARG002
+        """Have a chunk checked."""
+        self._lost_since = False
+        if self._visit is not None:
+            self._visit(self, self._record, found)
+
+    def numbered(self, data: bytes, offset: int) -> dict[int, Messages]:
+        """The messages of a chunk; channels that no record before announces are in the summary."""
+        if self._ended:
+            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
+        return numbered(self.parser, data, offset, self.definitions)[0]
+
+    def missing(self, gaps: Mapping[str, int], offset: int) -> None:
+        """Note that messages are missing; a gap in samples must show in the samples behind it."""
+        unseen = any(gap and topic in NUMBERS for topic, gap in gaps.items())
+        if unseen and schema.CYCLE not in self.parser.known.topics:
+            self._ended = True
+            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
+        if not self._lost_since and not self.expected.repaired:
+            damage = Damage(offset, "(chunk) does not continue the one before")
+            self._fault("sequence", damage, loss=True)
+
+
+def numbered(
+    parser: ChunkParser, data: bytes, offset: int, definitions: Sequence[Record]
+) -> tuple[dict[int, Messages], Sequence[Record]]:
+    """The messages of a chunk by channel, and the definitions that no record before announces."""
+    found = parser.messages(data, offset)
+    if found.keys() <= parser.known.channels.keys():
+        return found, ()
+    for item in definitions:
+        parser.known.take(item)
+    return found, definitions
+
+
+def survey(path: str | PathLike[str], visit: Visit | None = None) -> Survey:
+    """Go through a whole file, past its damages.
+
+    Args:
+        path: the file.
+        visit: called with each chunk that stands, with its messages by topic.
 
     Raises:
-        ArchiveWriteError: the disk refuses.
-        ArchiveError: what was written cannot be read back; it is thrown away.
+        ArchiveError: it cannot be read.
     """
+    path = Path(path)
     try:
-        with source.open("rb") as stream, _beside(target) as output:
-            os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
-            fill(stream, output.write)
-            output.flush()
-            os.fsync(output.fileno())
-            back = open_archive(output.name, fields=())
-            if not back.complete:
-                raise ArchiveError(
-                    source,
-                    f"cannot be written anew: {back.damage}",
-                    remedy="it is as it was, and what opens of it can be read: restore it from a "
-                    "copy, or record again",
-                )
-            Path(output.name).replace(target)
-        sync_folder(target.parent)
+        with opened(path) as stream:
+            return Survey(path, stream, visit)
     except OSError as error:
-        raise ArchiveWriteError(
-            target,
-            f"cannot be written: {error.strerror}",
-            remedy="what was there is as it was: make room or make its folder writable, "
-            "and do it again",
-        ) from error
-
-
-@contextlib.contextmanager
-def _beside(target: Path) -> Iterator[IO[bytes]]:
-    """A new file in the folder of another, of a name that nobody else has or can foresee."""
-    with NamedTemporaryFile(
-        dir=target.parent, prefix=f".{target.name[:_NAMED]}.", suffix=".part", delete=False
-    ) as output:
-        try:
-            yield output
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                Path(output.name).unlink()
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
 
 
 @dataclass(frozen=True)
@@ -150,113 +295,9 @@ def repair(
     whole = not found.faults and is_indexed(found)
     written = None
     if not whole or (output is not None and not in_place):
-        write_anew(path, target, partial(copy_of, found))
+        _rewrite(found, target)
         written = target
-    return Repair(
-        path, written, whole, tuple(found.losses), found.samples, samples_lost=_samples_lost(found)
-    )
-
-
-def _samples_lost(found: Survey) -> int | None:
-    if not found.losses:
-        return 0
-    stated = None if found.outcome is None else found.outcome.samples
-    return None if stated is None else max(0, stated - found.samples)
-
-
-def is_indexed(found: Survey) -> bool:
-    """Whether message indexes, summary and all else that follows from a sound content fit it.
-
-    Args:
-        found: of a file whose content has no fault.
-    """
-    with opened(found.path) as stream, opened(found.path) as other:
-        same = True
-
-        def compare(data: bytes) -> None:
-            nonlocal same
-            same = same and other.read(len(data)) == data
-
-        copy_of(found, stream, compare)
-        return same and not other.read(1)
-
-
-def copy_of(
-    found: Survey, stream: BinaryIO, write: Write, *, outcome: Mapping[str, str] | None = None
-) -> None:
-    """Write what stands of an archive as a new one.
-
-    Args:
-        found: what stands of it.
-        stream: the archive.
-        write: takes the bytes of the new one.
-        outcome: entries of its outcome that are to be others than before.
-    """
-    writer, parser = McapWriter(write), ChunkParser()
-    described = _description(found)
-    writer.start(schema.PROFILE, schema.LIBRARY)
-    writer.add_metadata(header.METADATA, header.sealed(described))
-    recovered = found.definitions
-    for piece in found.pieces:
-        record = container.record_at(stream, piece.offset, piece.size)
-        if piece.opcode != container.CHUNK:
-            writer.copy(record)
-            continue
-        for definition in recovered:
-            parser.known.take(definition)
-            writer.copy(definition)
-        recovered = []
-        chunk, entries = _chunk(record, parser)
-        for known in parser.known.definitions:
-            writer.note(known)
-        writer.add_chunk(chunk, entries)
-    stated = {**_outcome(found, writer.checksums), **(outcome or {})}
-    writer.add_metadata(header.OUTCOME, header.sealed(stated))
-    writer.finish()
-
-
-def _chunk(record: Record, parser: ChunkParser) -> tuple[Chunk, Entries]:
-    """A chunk as it stands, with the times of its messages, and their entries."""
-    head = container.chunk(record)
-    data = container.chunk_data(record, decompressor=zstandard.ZstdDecompressor(), head=head)
-    entries = entries_of(parser.messages(data, record.offset))
-    first, last = span(entries)
-    return replace(head, message_start_time=first, message_end_time=last), entries
-
-
-def _description(found: Survey) -> dict[str, str]:
-    """The ``hil`` record: as it was, without the attachments that are lost."""
-    assert found.metadata is not None and found.header is not None
-    names = [*found.header.attachments]
-    found_names = [name for name in names if name in found.attachments]
-    if found_names == names:
-        return found.metadata
-    return {**found.metadata, "attachments": json.dumps(found_names)}
-
-
-def _outcome(found: Survey, chunks: Sequence[int]) -> dict[str, str]:
-    """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
-    lists = {header.CHUNKS: header.chunk_list(chunks)}
-    if not found.losses and found.outcome is not None:
-        record = found.outcome.record  # other chunks than before if another program cut them
-        return {**record, **(lists if header.CHUNKS in record else {})}
-    unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
-    outcome = found.outcome or ArchiveOutcome.of(unknown)
-    before, lost = outcome.record, _samples_lost(found)
-    known = lost is not None and outcome.samples_lost is not None
-    return {
-        **before,
-        header.DESCRIPTION: header.checksum(_description(found)),
-        **lists,
-        "samples": str(found.samples),
-        "events": str(found.events),
-        **({"packets": str(found.counts.get(schema.PACKETS, 0))} if "packets" in before else {}),
-        "repaired": "yes",
-        "repaired.samples_lost": str((lost or 0) + (outcome.samples_lost or 0))
-        if known
-        else "unknown",
-        "repaired.losses": json.dumps([*outcome.losses, *found.losses]),
-    }
+    return Repair(path, written, whole, tuple(found.losses), found.samples, found.samples_lost)
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
@@ -274,10 +315,126 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
         ArchiveError: it is no whole archive.
         ArchiveWriteError: the disk refuses; the archive is as it was.
     """
-    path = Path(path)
     found = survey(path)
     if found.faults or found.metadata is None or found.outcome is None or not is_indexed(found):
-        raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
-    amended = {"outcome": outcome, "reason": reason}
+        raise ArchiveError(found.path, "is not whole", remedy="repair it with `hil archive repair`")
+    _rewrite(found, found.path, {"outcome": outcome, "reason": reason})
 
-    write_anew(path, path, partial(copy_of, found, outcome=amended))
+
+def is_indexed(found: Survey) -> bool:
+    """Whether message indexes, summary and all else that follows from a sound content fit it.
+
+    Args:
+        found: of a file whose content has no fault.
+    """
+    with opened(found.path) as stream, opened(found.path) as other:
+        same = True
+
+        def compare(data: bytes) -> None:
+            nonlocal same
+            same = same and other.read(len(data)) == data
+
+        _copy(found, stream, compare)
+        return same and not other.read(1)
+
+
+def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = None) -> None:
+    """Make an archive of what stands of another; `target` is at any moment what it was, or whole.
+
+    File and folder are on the disk when this returns, and the file has the mode of its source.
+
+    Args:
+        found: what stands of it.
+        target: the file to write or to replace, which may be the source.
+        outcome: entries of its outcome that are to be others than before.
+
+    Raises:
+        ArchiveWriteError: the disk refuses.
+        ArchiveError: what was written cannot be read back; it is thrown away.
+    """
+    try:
+        with found.path.open("rb") as stream, replacing(target) as temporary:
+            with temporary.open("xb") as output:
+                os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
+                _copy(found, stream, output.write, outcome)
+                output.flush()
+                os.fsync(output.fileno())
+            back = open_archive(temporary, fields=())
+            if not back.complete:
+                raise ArchiveError(
+                    found.path,
+                    f"cannot be written anew: {back.damage}",
+                    remedy="it is as it was, and what opens of it can be read: restore it from a "
+                    "copy, or record again",
+                )
+        sync_folder(target.parent)
+    except OSError as error:
+        raise ArchiveWriteError(
+            target,
+            f"cannot be written: {error.strerror}",
+            remedy="what was there is as it was: make room or make its folder writable, "
+            "and do it again",
+        ) from error
+
+
+def _copy(
+    found: Survey, stream: BinaryIO, write: Write, outcome: Mapping[str, str] | None = None
+) -> None:
+    """Write what stands of an archive as a new one."""
+    writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
+    described = _description(found)
+    writer.add_metadata(METADATA, header.sealed(described))
+    for opcode, *place in found.pieces:
+        record = container.record_at(stream, *place)
+        if opcode != container.CHUNK:
+            parser.known.take(record)
+            writer.put(record.data)
+            continue
+        head = container.chunk(record)
+        data = container.chunk_data(head, record.offset)
+        messages, definitions = numbered(parser, data, record.offset, found.definitions)
+        for definition in definitions:
+            writer.put(definition.data)
+        for known in parser.known.definitions:
+            writer.note(known)
+        entries = entries_of(messages)
+        first, last = span(entries)
+        head = replace(head, message_start_time=first, message_end_time=last)
+        writer.add_chunk(head, entries)
+    stated = _outcome(found, described, writer.checksums)
+    writer.add_metadata(OUTCOME, header.sealed({**stated, **(outcome or {})}))
+    writer.finish()
+
+
+def _description(found: Survey) -> dict[str, str]:
+    """The ``hil`` record: as it was, without the attachments that are lost."""
+    assert found.metadata is not None and found.header is not None
+    names = [name for name in found.header.attachments if name in found.attachments]
+    if len(names) == len(found.header.attachments):
+        return found.metadata
+    return {**found.metadata, "attachments": json.dumps(names)}
+
+
+def _outcome(found: Survey, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
+    """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
+    chunk_list = {header.CHUNKS: header.chunk_list(chunks)}
+    if not found.losses and found.outcome is not None:
+        record = found.outcome.record  # other chunks than before if another program cut them
+        return {**record, **(chunk_list if header.CHUNKS in record else {})}
+    unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
+    before = found.outcome or ArchiveOutcome.of(unknown)
+    lost, earlier = found.samples_lost, before.samples_lost
+    packets = str(found.counts.get(schema.PACKETS, 0))
+    return {
+        **before.record,
+        header.DESCRIPTION: header.checksum(described),
+        **chunk_list,
+        "samples": str(found.samples),
+        "events": str(found.counts.get(schema.EVENTS, 0)),
+        **({"packets": packets} if "packets" in before.record else {}),
+        "repaired": "yes",
+        "repaired.samples_lost": (
+            "unknown" if lost is None or earlier is None else str(lost + earlier)
+        ),
+        "repaired.losses": json.dumps([*before.losses, *found.losses]),
+    }

@@ -13,16 +13,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import BinaryIO, Self
+from dataclasses import dataclass
+from typing import BinaryIO
 
 import numpy as np
-import zstandard
 from mcap.records import Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
-from hil.archive.chunk import ChunkParser, Messages
+from hil.archive.chunk import ChunkParser, KnownChannels, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import (
     METADATA,
@@ -38,105 +37,57 @@ NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT
 """Channels that have one message of each sample."""
 
 _SEQUENCES = 1 << 32  # message numbers are counted modulo this
-_BUT_METADATA = frozenset(range(256)) - {container.METADATA}
+_BUT_METADATA = container.EVERY_OPCODE - {container.METADATA}
 
 
-@dataclass(eq=False)
-class Order:
-    """The chunks that a file must have, as its end says, and how far they have come.
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What a file must hold, as its end says.
 
     Attributes:
         chunks: their checksums in order, shape (k,); None where nothing says so.
         ends: stamps of the first and the last cycle [ns].
-        samples: how many were written, 0 where nothing says so.
-        strange: whether that end is of another recording than the beginning.
-        gapless: whether every chunk comes; otherwise some are left out.
+        mixed: whether that end is of another recording than the beginning.
         repaired: whether messages were lost before the file was written as it is.
     """
 
     chunks: NDArray[np.uint32] | None = None
     ends: tuple[int, int] | None = None
-    samples: int = 0
-    strange: bool = False
-    gapless: bool = True
+    mixed: bool = False
     repaired: bool = False
-    _at: int = field(default=0, init=False)
-    _newest: int = field(default=-1, init=False)
 
     @classmethod
-    def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Self:
+    def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Expected:
         """Find it, where the summary says or from head to head; the stream is left anywhere."""
         found = _records_of_ours(_indexed(stream, summary)) if summary else {}
         if found.keys() != {METADATA, OUTCOME}:
-            found = _records_of_ours(_walked(stream, size))
-        if found.keys() != {METADATA, OUTCOME}:
-            return cls()
+            stream.seek(0)
+            walk = container.records(stream, size, skip=_BUT_METADATA, check_end=False)
+            found = _records_of_ours(walk)
         try:
             header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
-        except HeaderError:
+        except (HeaderError, KeyError):
             return cls()
         if not outcome.belongs_to(header):
-            return cls(strange=True)
-        chunks = None
+            return cls(mixed=True)
         # Another program that copies a file may cut its chunks anew, and then names itself.
-        if outcome.chunks is not None and _is_ours(stream, size):
-            chunks = np.array(outcome.chunks, np.uint32)
-        return cls(chunks, _ends(header, outcome), outcome.samples or 0, repaired=outcome.repaired)
-
-    def check_chunk(self, crc: int, offset: int) -> None:
-        """Check that the chunk with this checksum, its own, is the next.
-
-        Raises:
-            Damage: it is not.
-        """
-        if self.strange:
-            reason = "(chunk) may be of either of two: the outcome is that of another recording"
-            raise Damage(offset, reason)
-        chunks = self.chunks
-        if chunks is None:
-            return
-        if self._at < len(chunks) and chunks[self._at] == crc:
-            self._at += 1
-            return
-        places = np.flatnonzero(chunks == crc)
-        if not len(places) or places[-1] < self._at:
-            why = "stands behind one that followed it" if len(places) else "is of another recording"
-            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
-        if self.gapless:
-            raise Damage(offset, "(chunk) does not continue the one before")
-        self._at = int(places[-1]) + 1
-
-    def check_cycles(self, stamps: NDArray[np.int64], offset: int, *, begins: bool) -> None:
-        """Check that cycles follow those before, and that they are of this recording.
-
-        Args:
-            stamps: theirs, shape (k,) [ns], k > 0.
-            offset: where their chunk stands.
-            begins: whether they are the first that were written.
-
-        Raises:
-            Damage: they are not.
-        """
-        if (np.diff(stamps) <= 0).any():
-            raise Damage(offset, "(chunk) has cycles that do not grow")
-        first, last = self.ends or (int(stamps[0]), int(stamps[-1]))
-        if stamps[0] < first or stamps[-1] > last or (begins and stamps[0] != first):
-            reason = "(chunk) has cycles of another recording: the outcome names others"
-            raise Damage(offset, reason)
-        if stamps[0] <= self._newest:
-            raise Damage(offset, "(chunk) has cycles that do not follow those before")
-
-    def take(self, newest: int) -> None:
-        """Note that cycles up to the stamp `newest` [ns] were taken."""
-        self._newest = newest
+        listed = outcome.chunks is not None and _is_ours(stream, size)
+        chunks = np.array(outcome.chunks, np.uint32) if listed else None
+        first, last, ends = outcome.first_cycle, outcome.last_cycle, None
+        # What was repaired may lack either end; earlier versions took two sessions.
+        known = header.period is not None and first is not None and last is not None
+        if known and first <= last and not outcome.repaired:
+            ends = round(first * (header.period * 1e9)), round(last * (header.period * 1e9))
+        return cls(chunks, ends, repaired=outcome.repaired)
 
 
 class Scan(ABC):
     """What has been verified of an archive so far.
 
     Args:
-        order: the chunks that must come.
-        topics: channels whose messages are verified, None for all.
+        expected: what must come.
+        gapless: whether every chunk comes; otherwise some are left out.
+        batch: bytes of chunks that are decoded at once; 0 to decode each by itself.
 
     Attributes:
         metadata: entries of the ``hil`` record, None before it came.
@@ -146,9 +97,11 @@ class Scan(ABC):
         attachments: content by file name.
         parser: of the chunks.
         counts: messages by topic.
+        chunks: how many chunks were taken.
     """
 
-    def __init__(self, order: Order, topics: Collection[str] | None = None) -> None:
+    def __init__(self, expected: Expected, *, gapless: bool, batch: int = 0) -> None:
+        self.expected = expected
         self.metadata: dict[str, str] | None = None
         self.header: ArchiveHeader | None = None
         self.unusable: HeaderError | None = None
@@ -156,11 +109,27 @@ class Scan(ABC):
         self.attachments: dict[str, bytes] = {}
         self.parser = ChunkParser()
         self.counts: dict[str, int] = {}
-        self._order = order
-        self._topics = topics
+        self.chunks = 0
+        self._gapless = gapless
+        self._batch = batch
+        self._waiting: list[tuple[int, bytes]] = []  # offset and content of chunks
+        self._listed = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
         self._numbers: frozenset[str] = frozenset()
-        self._decompressor = zstandard.ZstdDecompressor()
+        self._newest = -1  # stamp of a cycle [ns]
+
+    @property
+    def topics(self) -> Collection[str] | None:
+        """Channels whose messages are verified, None for all."""
+        return None
+
+    @abstractmethod
+    def visit(self, found: Mapping[str, Messages], offset: int) -> None:
+        """Use verified messages by topic, of the chunk at `offset` and maybe of some behind it.
+
+        Raises:
+            Damage: they cannot be used; then nothing of them counts.
+        """
 
     def take(self, record: Record) -> None:
         """Verify the next record, and take what it holds.
@@ -170,25 +139,80 @@ class Scan(ABC):
         """
         if record.opcode == container.CHUNK:
             if self.metadata is not None:  # else some other MCAP file
-                self.take_chunk(record)
+                head = container.chunk(record)
+                data = container.chunk_data(head, record.offset)
+                self._check_listed(head.uncompressed_crc, record.offset)
+                self._waiting.append((record.offset, data))
+                if sum(len(data) for _, data in self._waiting) >= self._batch:
+                    self.flush()
         elif record.opcode == container.ATTACHMENT:
-            self.take_attachment(record)
+            attachment = container.attachment(record)
+            name = attachment.name
+            if name in self.attachments:
+                raise Damage(record.offset, f"(attachment {name!r}) is there a second time")
+            self.attachments[name] = attachment.data
         elif record.opcode == container.METADATA:
-            self.take_metadata(record, *container.metadata(record))
-        elif record.opcode in (container.SCHEMA, container.CHANNEL):
+            self._take_metadata(record)
+        else:
             self.parser.known.take(record)
 
-    @abstractmethod
-    def take_chunk(self, record: Record) -> None:
-        """Take a chunk."""
+    def flush(self) -> None:
+        """Decode the chunks that wait: all at once, or one by one where that fails.
 
-    def take_attachment(self, record: Record) -> None:
-        """Take an attachment."""
-        attachment = container.attachment(record)
-        self.attachments[attachment.name] = attachment.data
+        Raises:
+            Damage: one of them does not follow those before.
+        """
+        waiting, self._waiting = self._waiting, []
+        if len(waiting) > 1:
+            try:
+                self._decode(b"".join(data for _, data in waiting), waiting[0][0])
+                self.chunks += len(waiting)
+                return
+            except Damage:
+                pass  # in one of them
+        for offset, data in waiting:
+            self._decode(data, offset)
+            self.chunks += 1
 
-    def take_metadata(self, record: Record, name: str, entries: dict[str, str]) -> None:
+    def shortfalls(self) -> Iterator[tuple[str, str]]:
+        """What the file says that it holds and does not: aspect of the profile, and sentence."""
+        for name in self.header.attachments if self.header else ():
+            if name not in self.attachments:
+                yield "attachments", f"attachment {name!r} is missing"
+        outcome = self.outcome
+        if outcome is None:
+            yield "outcome", "the outcome is missing"
+            return
+        counts = {"samples": NUMBERS, "events": (schema.EVENTS,)}
+        if "packets" in outcome.record:
+            counts["packets"] = (schema.PACKETS,)
+        for key, topics in counts.items():
+            if self.topics is None or not set(topics).isdisjoint(self.topics):
+                stated = getattr(outcome, key)
+                count = max(self.counts.get(topic, 0) for topic in topics)
+                if stated != count:
+                    yield "outcome", f"{stated} {key} were written, {count} are there"
+        listed = self.expected.chunks
+        if listed is not None and len(listed) != self.chunks:
+            yield "outcome", f"{len(listed)} chunks were written, {self.chunks} are there"
+
+    def missing(self, gaps: Mapping[str, int], offset: int) -> None:  # noqa: ARG002
+        """So many messages are missing before those of the chunk at `offset`, by topic.
+
+        Raises:
+            Damage: that is the end.
+        """
+        if self._gapless and not self.expected.repaired:
+            reason = "(chunk) does not continue the one before it: a chunk is missing"
+            raise Damage(offset, reason)
+
+    def numbered(self, data: bytes, offset: int) -> dict[int, Messages]:
+        """The messages of a chunk by channel; a scan may know more channels than those so far."""
+        return self.parser.messages(data, offset)
+
+    def _take_metadata(self, record: Record) -> None:
         """Take header or outcome; another record's name is passed over."""
+        name, entries = container.metadata(record)
         if name not in (METADATA, OUTCOME):
             return
         if entries.pop("checksum", None) != checksum(entries):
@@ -204,92 +228,98 @@ class Scan(ABC):
         except HeaderError as error:
             self.unusable = error
 
-    def opened(self, record: Record) -> bytes:
-        """The records of a chunk that is one of those written, and whose turn it is.
+    def _check_listed(self, crc: int, offset: int) -> None:
+        """Check that the chunk with this checksum is the next of those that were written."""
+        if self.expected.mixed and self._gapless:
+            reason = "(chunk) may be of either of two: the outcome is that of another recording"
+            raise Damage(offset, reason)
+        chunks = self.expected.chunks
+        if chunks is None:
+            return
+        places = np.flatnonzero(chunks[self._listed :] == crc) + self._listed
+        if not len(places):
+            before = crc in chunks
+            why = "stands behind one that followed it" if before else "is of another recording"
+            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
+        if self._listed in places:
+            self._listed += 1
+        elif self._gapless:
+            raise Damage(offset, "(chunk) does not continue the one before")
+        else:
+            self._listed = int(places[-1]) + 1
 
-        Raises:
-            Damage: it is none of them, or damaged.
-        """
-        head = container.chunk(record)
-        data = container.chunk_data(record, decompressor=self._decompressor, head=head)
-        self._order.check_chunk(head.uncompressed_crc, record.offset)
-        return data
-
-    def continued(self, found: Mapping[str, Messages], offset: int) -> None:
-        """Take messages by topic, which must be the next of their channels.
-
-        Raises:
-            Damage: they are not; then nothing of them is taken.
-        """
-        verified = {
-            topic: messages
-            for topic, messages in found.items()
-            if self._topics is None or topic in self._topics
-        }
-        numbers = frozenset(topic for topic in found if topic in NUMBERS)
-        if numbers and self._numbers not in (frozenset(), numbers):
-            raise Damage(offset, "(chunk) has samples in other channels than those before")
-        ends, gaps = {}, {}
+    def _decode(self, data: bytes, offset: int) -> None:
+        """Take messages that must be the next of their channels; else nothing of them counts."""
+        known = KnownChannels(self.parser.known)
+        try:
+            found = self.parser.by_topic(self.numbered(data, offset), offset)
+            verified = {
+                topic: messages
+                for topic, messages in found.items()
+                if self.topics is None or topic in self.topics
+            }
+            numbers = frozenset(topic for topic in found if topic in NUMBERS)
+            if numbers and self._numbers not in (frozenset(), numbers):
+                reason = "(chunk) has samples in other channels than those before"
+                raise Damage(offset, reason)
+            gaps = self._check_sequences(verified, offset)
+            newest = self._check_times(verified, offset)
+            if any(gaps.values()):
+                self.missing(gaps, offset)
+            self.visit(found, offset)
+        except Damage:
+            self.parser.known = known  # what it says goes with it
+            raise
+        self._newest = self._newest if newest is None else newest
+        self._numbers = self._numbers or numbers
         for topic, messages in verified.items():
+            ahead = self._next.get(topic, 0) + gaps[topic] + len(messages)
+            self._next[topic] = ahead % _SEQUENCES
+            self.counts[topic] = self.counts.get(topic, 0) + len(messages)
+
+    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
+        """Check that messages continue those before; how many are missing between, by topic."""
+        gaps = {}
+        for topic, messages in found.items():
             sequence = messages.of_heads("sequence")
             if (np.diff(sequence) != 1).any():
                 raise Damage(offset, "(chunk) has messages out of order")
             gaps[topic] = (int(sequence[0]) - self._next.get(topic, 0)) % _SEQUENCES
             if gaps[topic] > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages that were before")
-            ends[topic] = (int(sequence[-1]) + 1) % _SEQUENCES
-        samples = [topic for topic in verified if topic in NUMBERS]
-        if len({(len(verified[topic]), gaps[topic]) for topic in samples}) > 1:
+        samples = {(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}
+        if len(samples) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
-        newest = self._check_times(verified, samples, offset)
-        if any(gaps.values()):
-            self.missing(gaps, offset)
-        if newest is not None:
-            self._order.take(newest)
-        self._numbers = self._numbers or numbers
-        self._next |= ends
-        for topic, messages in verified.items():
-            self.counts[topic] = self.counts.get(topic, 0) + len(messages)
+        return gaps
 
-    def missing(self, gaps: Mapping[str, int], offset: int) -> None:  # noqa: ARG002
-        """So many messages are missing before those of the chunk at `offset`, by topic.
+    def _check_times(self, found: Mapping[str, Messages], offset: int) -> int | None:
+        """Check that cycles follow those before and are of this recording.
 
-        Raises:
-            Damage: that is the end.
+        Where there are no cycles, all channels must have the same times. Returns the newest stamp
+        [ns], None without cycles.
         """
-        raise Damage(offset, "(chunk) does not continue the one before it: a chunk is missing")
-
-    def _check_times(
-        self, found: Mapping[str, Messages], samples: list[str], offset: int
-    ) -> int | None:
-        """Check that cycles follow those before; the newest stamp [ns], None without cycles.
-
-        Where there are no cycles, all channels must have the same times.
-        """
+        samples = [topic for topic in found if topic in NUMBERS]
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples
         if not timed:
             return None
         stamps = [found[topic].stamps for topic in timed]
         if not all(map(len, stamps)):
             raise Damage(offset, "(chunk) has messages without a stamp")
-        first = stamps[0]
-        if not all(np.array_equal(one, first) for one in stamps):
+        stamp = stamps[0]
+        if not all(np.array_equal(one, stamp) for one in stamps):
             raise Damage(offset, "(chunk) has channels of different times")
         if timed[0] not in schema.PER_CYCLE or schema.CYCLE not in self.parser.known.topics:
             return None
+        if (np.diff(stamp) <= 0).any():
+            raise Damage(offset, "(chunk) has cycles that do not grow")
+        first, last = self.expected.ends or (int(stamp[0]), int(stamp[-1]))
         begins = int(found[timed[0]].of_heads("sequence")[0]) == 0
-        self._order.check_cycles(first, offset, begins=begins)
-        return int(first[-1])
-
-
-def _ends(header: ArchiveHeader, outcome: ArchiveOutcome) -> tuple[int, int] | None:
-    """Stamps of the first and the last cycle; None of what was repaired or has no cycles."""
-    step, first, last = header.period, outcome.first_cycle, outcome.last_cycle
-    if step is None or outcome.repaired or first is None or last is None:
-        return None
-    if first > last:  # earlier versions took two sessions
-        return None
-    return round(first * (step * 1e9)), round(last * (step * 1e9))
+        if stamp[0] < first or stamp[-1] > last or (begins and stamp[0] != first):
+            reason = "(chunk) has cycles of another recording: the outcome names others"
+            raise Damage(offset, reason)
+        if stamp[0] <= self._newest:
+            raise Damage(offset, "(chunk) has cycles that do not follow those before")
+        return int(stamp[-1])
 
 
 def _is_ours(stream: BinaryIO, size: int) -> bool:
@@ -297,9 +327,8 @@ def _is_ours(stream: BinaryIO, size: int) -> bool:
     stream.seek(0)
     try:
         header = next(container.records(stream, size, check_end=False))
-        if header.opcode != container.HEADER:
-            return False
-        return container.parsed(Header, header.body, 0).library == schema.LIBRARY
+        is_header = header.opcode == container.HEADER
+        return is_header and container.parsed(Header, header).library == schema.LIBRARY
     except Damage:
         return False
 
@@ -324,9 +353,3 @@ def _indexed(stream: BinaryIO, summary: Summary) -> Iterator[Record]:
         record = container.record_at(stream, *place)
         if record.opcode == container.METADATA:
             yield record
-
-
-def _walked(stream: BinaryIO, size: int) -> Iterator[Record]:
-    """Metadata records, found from head to head."""
-    stream.seek(0)
-    yield from container.records(stream, size, skip=_BUT_METADATA, check_end=False)

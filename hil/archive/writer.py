@@ -46,6 +46,7 @@ from hil.archive.schema import (
     description_messages,
 )
 from hil.errors import ArchiveWriteError
+from hil.files import sync_folder
 
 _MOST_NUMBERS = 1 << 32  # message numbers are counted modulo this
 _MEDIA_TYPES = {
@@ -97,12 +98,11 @@ class ArchiveFile:
         self._durable = durable
         self._descriptor = _create(path)
         self._parts: list[bytes] = []  # to be written at once
-        self._writer = McapWriter(self._parts.append)
+        self._writer = McapWriter(self._parts.append, PROFILE, LIBRARY)
         names = json.dumps(sorted(attachments))
         described = {**metadata, "format_version": str(FORMAT_VERSION), "attachments": names}
         self._description = checksum(described)
         with self._guarded():
-            self._writer.start(PROFILE, LIBRARY)
             self._writer.add_metadata(METADATA, sealed(described))
             for name, data in sorted(attachments.items()):
                 media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
@@ -211,15 +211,6 @@ def _create(path: Path) -> int:
             remedy="see that its folder is there and writable and its disk has room, "
             "and record again",
         ) from error
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the name of a new file survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 Array = NDArray[np.float64]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-import zstandard
 from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
 from mcap.records import Channel, Schema
 
@@ -19,7 +18,7 @@ from hil.reading import opened
 
 LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usual are one to sixteen million."""
-_BUT_CHUNKS: Final = frozenset(range(256)) - {container.CHUNK}
+_BUT_CHUNKS: Final = container.EVERY_OPCODE - {container.CHUNK}
 
 
 def check_sizes(stream: BinaryIO) -> None:
@@ -32,10 +31,10 @@ def check_sizes(stream: BinaryIO) -> None:
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
-    begun, decompressor = set(), zstandard.ZstdDecompressor()
+    begun = set()
     for record in container.records(stream, size, skip=_BUT_CHUNKS, check_end=False):
         head = container.chunk(record)
-        container.decompressed(head, record.offset, decompressor, largest=LARGEST_CHUNK)
+        container.decompressed(head, record.offset, largest=LARGEST_CHUNK)
         begun.add(record.offset)
     stream.seek(0)
     summary = make_reader(stream).get_summary()

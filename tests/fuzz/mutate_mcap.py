@@ -78,8 +78,8 @@ def _split(data: bytes) -> list[tuple[int, bytes]]:
 def _opened(opcode: int, body: bytes) -> Record:
     with contextlib.suppress(Damage):  # no chunk, or damaged beyond reading: as it is
         if opcode == container.CHUNK:
-            head = container.chunk(container.Record(0, opcode, body, len(body)))
-            plain = container.decompressed(head, 0, zstandard.ZstdDecompressor())
+            head = container.chunk(container.Record(0, opcode, body))
+            plain = container.decompressed(head, 0)
             inside = [Record(*piece) for piece in _split(plain)]
             times = head.message_start_time, head.message_end_time
             return Record(opcode, body, inside, head.compression, times)
@@ -100,7 +100,7 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
             continue
         if one.opcode == container.CHUNK:
             with contextlib.suppress(Damage):
-                head = container.chunk(container.Record(0, one.opcode, body, len(body)))
+                head = container.chunk(container.Record(0, one.opcode, body))
                 built.checksums.append(head.uncompressed_crc)
         file += record_of(one.opcode, body)
     if index:
@@ -143,7 +143,7 @@ def _body(record: Attachment | Chunk | Metadata) -> bytes:
 
 
 def _entries(one: Record) -> tuple[str, dict[str, str]]:
-    return container.metadata(container.Record(0, one.opcode, one.body, len(one.body)))
+    return container.metadata(container.Record(0, one.opcode, one.body))
 
 
 def _change(records: list[Record], rng: random.Random) -> None:
@@ -231,7 +231,7 @@ def _of_metadata(one: Record, rng: random.Random) -> None:
 
 def _of_an_attachment(one: Record, rng: random.Random) -> None:
     try:
-        found = container.parsed(Attachment, one.body, 0)
+        found = container.parsed(Attachment, container.Record(0, one.opcode, one.body))
     except Damage:
         return
     if rng.random() < 0.1:

@@ -80,8 +80,9 @@ class Indexed:
     """A file that grows record by record, and gets an index that fits."""
 
     def __init__(self) -> None:
-        self.data, self._parser = bytearray(container.MAGIC), ChunkParser()
-        self._writer = McapWriter(self.data.extend)
+        self.data = bytearray()
+        self._writer = McapWriter(self.data.extend, "", "")
+        self.data[:] = container.MAGIC  # the header is among the records
         self._writer.position = len(self.data)
 
     @property
@@ -91,26 +92,15 @@ class Indexed:
 
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
-        opcode, length = container.RECORD.unpack_from(data)
-        item = Record(len(self.data), opcode, data[container.RECORD.size :], length)
-        if opcode in (
-            container.METADATA,
-            container.ATTACHMENT,
-            container.SCHEMA,
-            container.CHANNEL,
-        ):
-            self._writer.copy(item)
-        elif opcode == container.CHUNK:
-            head = container.chunk(item)
-            content = container.chunk_data(item, decompressor=zstandard.ZstdDecompressor())
-            parser = ChunkParser()
-            found = parser.messages(content, item.offset)
-            for definition in parser.known.definitions:
-                self._writer.note(definition)
-            self._writer.add_chunk(head, entries_of(found))
-        else:
-            self.data += data
-            self._writer.position = len(self.data)
+        item = Record(len(self.data), data[0], data[container.RECORD.size :])
+        if item.opcode != container.CHUNK:
+            self._writer.put(data)
+            return
+        head, parser = container.chunk(item), ChunkParser()
+        found = parser.messages(container.chunk_data(head, item.offset), item.offset)
+        for definition in parser.known.definitions:
+            self._writer.note(definition)
+        self._writer.add_chunk(head, entries_of(found))
 
     def ended(self) -> bytes:
         """The file, whole."""

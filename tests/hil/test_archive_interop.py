@@ -349,8 +349,7 @@ def rows_of(batch: Batch) -> tuple[np.ndarray, ...]:
 
 def by_us(steps: list[Any], attachment: bytes) -> bytes:
     file = io.BytesIO()
-    writer = McapWriter(file.write)
-    writer.start("ros2", "test")
+    writer = McapWriter(file.write, "ros2", "test")
     writer.add_attachment("a.txt", "text/plain", attachment)
     channels = [writer.register(f"/{i}", "cdr", f"s/{i}", "ros2msg", b"int8 x") for i in range(3)]
     written = 0

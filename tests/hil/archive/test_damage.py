@@ -214,7 +214,7 @@ def earlier(data: bytes, path: Path) -> bytes:
     at = data.index(b"\x0b\x00\x00\x00hil.outcome") - container.RECORD.size
     opcode, length = container.RECORD.unpack_from(data, at)
     body = data[at + container.RECORD.size : at + container.RECORD.size + length]
-    name, entries = container.metadata(container.Record(at, opcode, body, length))
+    name, entries = container.metadata(container.Record(at, opcode, body))
     for key in (header.CHUNKS, header.DESCRIPTION, "checksum"):
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)

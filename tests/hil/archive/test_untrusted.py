@@ -68,8 +68,8 @@ class Stranger(mcap_bytes.Indexed):
         self.put(mcap_bytes.metadata(name, {**entries, "checksum": header.checksum(entries)}))
 
     def chunk(self, record: Record, change: Callable[[bytes], bytes]) -> None:
-        plain = change(container.chunk_data(record, decompressor=zstandard.ZstdDecompressor()))
         head = container.chunk(record)
+        plain = change(container.chunk_data(head, record.offset))
         self.put(mcap_bytes.chunk(plain, (head.message_start_time, head.message_end_time)))
 
     def attachment(self, record: Record, given: Mapping[str, bytes]) -> None:
