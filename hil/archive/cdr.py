@@ -120,8 +120,8 @@ class LayoutBuilder:
         if len(set(names)) != len(names):
             raise LayoutError("two of its fields have one name")
         size = len(self._template)
-        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
-        return MessageLayout(dtype, bytes(self._template), tuple(self._constant))
+        fields: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
+        return MessageLayout(np.dtype(fields), bytes(self._template), tuple(self._constant))
 
     def _extend(self, alignment: int, size: int) -> int:
         place = self.next_place(alignment)
@@ -221,7 +221,7 @@ def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayou
             place_field(field, path + field.name, depth)
 
     def place_field(field: _Field, path: str, depth: int) -> None:
-        count = field.count
+        count = field.length
         if count == _SEQUENCE:
             if message is None:
                 raise LayoutError("a sequence is not of constant size")
@@ -247,11 +247,11 @@ def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayou
 
 
 class _Field(NamedTuple):
-    """One line of a definition: `count` is None of a single value."""
+    """One line of a definition: `length` is None of a single value."""
 
     kind: str
     name: str
-    count: int | None
+    length: int | None
 
 
 def _short(kind: str) -> str:

@@ -75,9 +75,9 @@ class Expected:
         chunks = np.array(outcome.chunks, np.uint32) if listed else None
         first, last, ends = outcome.first_cycle, outcome.last_cycle, None
         # What was repaired may lack either end; earlier versions took two sessions.
-        known = header.period is not None and first is not None and last is not None
-        if known and first <= last and not outcome.repaired:
-            ends = round(first * (header.period * 1e9)), round(last * (header.period * 1e9))
+        step = (header.period or 0.0) * 1e9
+        if step and first is not None and last is not None and not outcome.repaired:
+            ends = (round(first * step), round(last * step)) if first <= last else None
         return cls(chunks, ends, repaired=outcome.repaired)
 
 
@@ -113,6 +113,7 @@ class Scan(ABC):
         self._gapless = gapless
         self._batch = batch
         self._waiting: list[tuple[int, bytes]] = []  # offset and content of chunks
+        self._size = 0  # of their content [bytes]
         self._listed = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
         self._numbers: frozenset[str] = frozenset()
@@ -143,7 +144,8 @@ class Scan(ABC):
                 data = container.chunk_data(head, record.offset)
                 self._check_listed(head.uncompressed_crc, record.offset)
                 self._waiting.append((record.offset, data))
-                if sum(len(data) for _, data in self._waiting) >= self._batch:
+                self._size += len(data)
+                if self._size >= self._batch:
                     self.flush()
         elif record.opcode == container.ATTACHMENT:
             attachment = container.attachment(record)
@@ -162,7 +164,7 @@ class Scan(ABC):
         Raises:
             Damage: one of them does not follow those before.
         """
-        waiting, self._waiting = self._waiting, []
+        waiting, self._waiting, self._size = self._waiting, [], 0
         if len(waiting) > 1:
             try:
                 self._decode(b"".join(data for _, data in waiting), waiting[0][0])
@@ -236,17 +238,16 @@ class Scan(ABC):
         chunks = self.expected.chunks
         if chunks is None:
             return
-        places = np.flatnonzero(chunks[self._listed :] == crc) + self._listed
-        if not len(places):
-            before = crc in chunks
-            why = "stands behind one that followed it" if before else "is of another recording"
-            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
-        if self._listed in places:
+        if self._listed < len(chunks) and chunks[self._listed] == crc:
             self._listed += 1
-        elif self._gapless:
+            return
+        places = np.flatnonzero(chunks == crc)
+        if not len(places) or places[-1] < self._listed:
+            why = "stands behind one that followed it" if len(places) else "is of another recording"
+            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
+        if self._gapless:
             raise Damage(offset, "(chunk) does not continue the one before")
-        else:
-            self._listed = int(places[-1]) + 1
+        self._listed = int(places[-1]) + 1
 
     def _decode(self, data: bytes, offset: int) -> None:
         """Take messages that must be the next of their channels; else nothing of them counts."""
