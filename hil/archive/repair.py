@@ -133,7 +133,7 @@ class Survey(Scan):
         except Damage as damage:
             self._lost_since = True  # and what is lost, counts and outcome will tell
             self._fault("container", damage, loss=False)
-        for place in self._listed_places():
+        for place in self._index_places():
             if place[0] not in seen:  # the walk did not get there
                 seen.add(place[0])
                 try:
@@ -150,7 +150,7 @@ class Survey(Scan):
             for aspect, text in self.shortfalls():
                 self._fault(aspect, text, loss=True)
 
-    def _listed_places(self) -> list[tuple[int, int]]:
+    def _index_places(self) -> list[tuple[int, int]]:
         try:
             return self._summary.places if self._summary else []
         except Damage:

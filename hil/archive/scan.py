@@ -71,8 +71,8 @@ class Expected:
         if not outcome.belongs_to(header):
             return cls(mixed=True)
         # Another program that copies a file may cut its chunks anew, and then names itself.
-        listed = outcome.chunks is not None and _is_ours(stream, size)
-        chunks = np.array(outcome.chunks, np.uint32) if listed else None
+        has_list = outcome.chunks is not None and _is_ours(stream, size)
+        chunks = np.array(outcome.chunks, np.uint32) if has_list else None
         first, last, ends = outcome.first_cycle, outcome.last_cycle, None
         # What was repaired may lack either end; earlier versions took two sessions.
         step = (header.period or 0.0) * 1e9
@@ -114,7 +114,7 @@ class Scan(ABC):
         self._batch = batch
         self._waiting: list[tuple[int, bytes]] = []  # offset and content of chunks
         self._size = 0  # of their content [bytes]
-        self._listed = 0  # place in the list of the chunk that comes next
+        self._place = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
         self._numbers: frozenset[str] = frozenset()
         self._newest = -1  # stamp of a cycle [ns]
@@ -142,7 +142,7 @@ class Scan(ABC):
             if self.metadata is not None:  # else some other MCAP file
                 head = container.chunk(record)
                 data = container.chunk_data(head, record.offset)
-                self._check_listed(head.uncompressed_crc, record.offset)
+                self._check_order(head.uncompressed_crc, record.offset)
                 self._waiting.append((record.offset, data))
                 self._size += len(data)
                 if self._size >= self._batch:
@@ -194,9 +194,9 @@ class Scan(ABC):
                 count = max(self.counts.get(topic, 0) for topic in topics)
                 if stated != count:
                     yield "outcome", f"{stated} {key} were written, {count} are there"
-        listed = self.expected.chunks
-        if listed is not None and len(listed) != self.chunks:
-            yield "outcome", f"{len(listed)} chunks were written, {self.chunks} are there"
+        chunks = self.expected.chunks
+        if chunks is not None and len(chunks) != self.chunks:
+            yield "outcome", f"{len(chunks)} chunks were written, {self.chunks} are there"
 
     def missing(self, gaps: Mapping[str, int], offset: int) -> None:  # noqa: ARG002
         """So many messages are missing before those of the chunk at `offset`, by topic.
@@ -230,7 +230,7 @@ class Scan(ABC):
         except HeaderError as error:
             self.unusable = error
 
-    def _check_listed(self, crc: int, offset: int) -> None:
+    def _check_order(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum is the next of those that were written."""
         if self.expected.mixed and self._gapless:
             reason = "(chunk) may be of either of two: the outcome is that of another recording"
@@ -238,16 +238,16 @@ class Scan(ABC):
         chunks = self.expected.chunks
         if chunks is None:
             return
-        if self._listed < len(chunks) and chunks[self._listed] == crc:
-            self._listed += 1
+        if self._place < len(chunks) and chunks[self._place] == crc:
+            self._place += 1
             return
         places = np.flatnonzero(chunks == crc)
-        if not len(places) or places[-1] < self._listed:
+        if not len(places) or places[-1] < self._place:
             why = "stands behind one that followed it" if len(places) else "is of another recording"
             raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
         if self._gapless:
             raise Damage(offset, "(chunk) does not continue the one before")
-        self._listed = int(places[-1]) + 1
+        self._place = int(places[-1]) + 1
 
     def _decode(self, data: bytes, offset: int) -> None:
         """Take messages that must be the next of their channels; else nothing of them counts."""
