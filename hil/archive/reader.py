@@ -424,7 +424,7 @@ def open_archive(
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
     columns = content.columns()
     stamp = columns["stamp"]
-    counted = fields is None or bool(fields)
+    with_columns = fields is None or bool(fields)
     lost = (
         None
         if damage is None
@@ -432,8 +432,8 @@ def open_archive(
             offset=damage.offset,
             reason=damage.reason,
             bytes_dropped=size - damage.offset,
-            samples=len(stamp) if counted else None,
-            duration=1e-9 * float(stamp[-1] - stamp[0]) if counted and len(stamp) else 0.0,
+            samples=len(stamp) if with_columns else None,
+            duration=1e-9 * float(stamp[-1] - stamp[0]) if with_columns and len(stamp) else 0.0,
             outcome_missing=content.outcome is None,
         )
     )
