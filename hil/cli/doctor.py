@@ -11,7 +11,7 @@ from rich.console import Console
 from hil.cli.arguments import JsonOption, print_json
 from hil.cli.verdict import NOT_GOOD
 from hil.doctor.diagnosis import as_json, examine, show
-from hil.doctor.link import controller_in, link_of
+from hil.doctor.link import controller_in
 from hil.progress import reporter
 
 QUICK_SECONDS = 5.0
@@ -43,7 +43,7 @@ def doctor(
     """
     controller = None if cell is None else controller_in(cell)
     diagnosis = examine(
-        link=None if controller is None else link_of(controller),
+        controller,
         cycle_ms=1 if controller is None else controller.cycle_ms,
         seconds=QUICK_SECONDS if quick else duration,
         place=output,

@@ -1,13 +1,26 @@
-"""Everything looked at and measured, in order; as a page for a person, and a table for a script."""
+"""Everything looked at and measured, in order; as a page for a person, and a table for a script.
+
+What is measured is measured by `probe`, in processes of their own; one that hangs is ended, never
+waited for.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Sequence
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -17,12 +30,72 @@ from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 from hil.terminal_text import printable
 
-from . import link as links
 from . import machine
-from .check import Check, Status, System
-from .link import CanLink, Link, UdpLink, address_of, can_check, network_checks
-from .machine import disk_checks
-from .measure import RESERVE, TURNAROUND_PERIOD, Latency, disk_trial, measure, obtained
+from .check import Check, Status, System, bad
+from .link import link_checks
+from .machine import DiskTrial, disk_checks
+
+if TYPE_CHECKING:
+    from hil.cell.schema import ControllerTable
+
+RESERVE: Final = 100e-6
+"""s of a cycle reserved for what a bare measurement leaves out: session and guard (20 µs, at most
+40),
+the packet on the wire both ways (25 µs each at 100 Mbit/s), the card's interrupt."""
+EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]) * 1e-6
+"""s, bounds of the histogram's bars."""
+
+
+@dataclass(frozen=True, eq=False)
+class Latency:
+    """Latencies of one kind.
+
+    Attributes:
+        name: "wake-up" or "turnaround".
+        samples: (m,) s, finite and not negative, m >= 1.
+        seconds: how long was measured.
+    """
+
+    name: str
+    samples: NDArray[np.float64]
+    seconds: float
+
+    def __post_init__(self) -> None:
+        if self.samples.ndim != 1 or not len(self.samples) or not self.seconds > 0:
+            raise ValueError(f"{self.name}: no samples")
+        if not (np.isfinite(self.samples).all() and (self.samples >= 0).all()):
+            raise ValueError(f"{self.name}: samples must be finite and not negative")
+
+    def percentile(self, percent: float) -> float:
+        """The smallest sample that `percent` of all do not exceed, s."""
+        return float(np.percentile(self.samples, percent, method="inverted_cdf"))
+
+    def late_cycles(self, period: float) -> int:
+        """Cycles of `period` s that would have ended before their answer.
+
+        A latency of several cycles costs each of them: a stall counts by its length.
+        """
+        return int(np.floor((self.samples + RESERVE) / period).sum())
+
+    def histogram(self) -> list[tuple[str, int]]:
+        """Bars: bounds in µs, and how many samples lie in them (lower bound included)."""
+        counts, _ = np.histogram(self.samples, EDGES)
+        finite = (1e6 * EDGES[:-1]).tolist()
+        bounds = [f"{low:.0f}-{high:.0f}" for low, high in pairwise(finite)]
+        return list(zip([*bounds, f"over {finite[-1]:.0f}"], counts.tolist(), strict=True))
+
+    def summary(self) -> dict[str, float | int]:
+        """Figures for scripts, µs."""
+        figures: dict[str, float | int] = {
+            f"p{str(p).replace('.', '')}_us": round(1e6 * self.percentile(p), 1)
+            for p in (50, 99, 99.9)
+        }
+        figures["max_us"] = round(1e6 * float(self.samples.max()), 1)
+        figures["samples"] = len(self.samples)
+        for cycle_ms in (1, 2):
+            figures[f"late_cycles_{cycle_ms}ms"] = self.late_cycles(cycle_ms / 1000)
+        return figures
+
 
 CRITERIA: Final = (
     f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs "
@@ -82,15 +155,88 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     return Fitness(cycle_ms, not late and used <= 0.5, late, bound, used, reason)
 
 
-def in_words(one: Fitness, two: Fitness) -> str:
-    """The verdict on both cycles in one sentence."""
-    if one.fit and two.fit:
-        return "1 ms is fit, and so is 2 ms."
-    if two.fit:
-        return "2 ms is fit; 1 ms is not."
-    if one.fit:
-        return "1 ms is fit."
-    return "Neither 1 ms nor 2 ms is fit."
+TURNAROUND_PERIOD = 1e-3
+"""s between two questions."""
+_GRACE = 15.0
+"""s that a probe may take beyond its measurement (start-up on a slow disk)."""
+
+
+def obtained() -> RealTimeReport | None:
+    """What a real-time process is given here; None if the probe failed."""
+    answer = run_probe(["permissions"], 0.0)
+    return None if answer is None else RealTimeReport(**answer)
+
+
+def disk_trial(place: Path) -> DiskTrial | None:
+    """Room and write times at `place`; None if the disk did not answer."""
+    answer = run_probe(["disk", str(place)], 0.0)
+    return None if answer is None else DiskTrial(**answer)
+
+
+def measure(
+    name: str, kind: str, period: float, seconds: float, reporter: Reporter
+) -> Latency | None:
+    """Run a latency probe (`wake-ups` or `turnaround`) under a progress bar; None if it failed."""
+    with tempfile.TemporaryDirectory() as folder, reporter.task(name, seconds) as task:
+        file = Path(folder) / "latency.npy"
+        words = [kind, repr(period), repr(seconds), str(file)]
+        if run_probe(words, seconds, task.advance) is None:
+            return None
+        try:
+            return Latency(name, np.load(file).astype(np.float64), seconds)
+        except (OSError, ValueError):
+            return None
+
+
+def run_probe(
+    words: Sequence[str], seconds: float, advance: Callable[[float], None] | None = None
+) -> dict[str, Any] | None:
+    """The JSON answer of `hil.doctor.probe`; None if it failed or took `_GRACE` s too long."""
+    command = [sys.executable, "-m", "hil.doctor.probe", *words]
+    probe = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        output = _wait(probe, seconds, advance)
+    finally:
+        _end(probe)
+    try:
+        answer = json.loads(output.splitlines()[-1]) if output and not probe.returncode else None
+    except ValueError:
+        return None
+    return answer if isinstance(answer, dict) else None
+
+
+def _wait(
+    probe: subprocess.Popen[str], seconds: float, advance: Callable[[float], None] | None
+) -> str | None:
+    """What the probe printed; advances the bar by the time that passed, up to `seconds`."""
+    began, shown = time.monotonic(), 0.0
+    while (passed := time.monotonic() - began) < seconds + _GRACE:
+        try:
+            output = probe.communicate(timeout=0.2)[0]
+            if advance is not None and seconds > shown:
+                advance(seconds - shown)
+            return output
+        except subprocess.TimeoutExpired:
+            step = min(passed, seconds) - shown
+            if advance is not None and step > 0:
+                advance(step)
+                shown += step
+    return None
+
+
+def _end(probe: subprocess.Popen[str]) -> None:
+    """Kill what still runs; one caught in a dead disk is not waited for."""
+    probe.kill()
+    with suppress(subprocess.TimeoutExpired):
+        probe.wait(timeout=1.0)
+    if probe.stdout is not None:
+        probe.stdout.close()
 
 
 CYCLES_MS = (1, 2)
@@ -133,13 +279,18 @@ class Diagnosis:
 
     @property
     def line(self) -> str:
-        """The verdict in one or two plain sentences."""
-        words = in_words(self.one, self.two)
-        bad = [check.name for check in self.checks if check.status is Status.BAD]
+        """The verdict in one or two sentences."""
+        words = {
+            (True, True): "1 ms is fit, and so is 2 ms.",
+            (True, False): "1 ms is fit.",
+            (False, True): "2 ms is fit; 1 ms is not.",
+            (False, False): "Neither 1 ms nor 2 ms is fit.",
+        }[self.one.fit, self.two.fit]
+        unfit = [check.name for check in self.checks if check.status is Status.BAD]
         if self.fit:
             words += f" This PC can answer a controller at {self.cycle_ms} ms."
         elif self.wanted.fit:
-            words += f" But the link will not work as it is: {', '.join(bad)}."
+            words += f" But the link will not work as it is: {', '.join(unfit)}."
         else:
             words += f" Do not connect an arm at {self.cycle_ms} ms."
         if self.provisional:
@@ -148,7 +299,7 @@ class Diagnosis:
 
 
 def examine(
-    link: Link | None,
+    controller: ControllerTable | None,
     cycle_ms: int,
     seconds: float,
     place: Path,
@@ -158,7 +309,7 @@ def examine(
     """Look at this PC and measure it for twice `seconds`.
 
     Args:
-        link: the cell's link, None for a simulated controller.
+        controller: of the cell; None without one.
         cycle_ms: the cycle that has to be fit; the wake-up timer runs at it.
         seconds: length of each measurement.
         place: where archives will be written.
@@ -168,66 +319,28 @@ def examine(
     system = system or System()
     reporter.say("looking at this PC; no packet is sent to the controller")
     given = obtained()
-    checks = [*permission_checks(given, system), *machine_checks(given, system)]
-    checks += link_checks(link, system)
-    checks += disk_checks(place, disk_trial(place))
-    checks.append(machine.load(system))
-    period, before = cycle_ms / 1000, system.text("/proc/stat") or ""
-    wake_up = measure("wake-up", "wake-ups", period, seconds, reporter)
-    turnaround = measure("turnaround", "turnaround", TURNAROUND_PERIOD, seconds, reporter)
+    checks = [
+        *machine.permissions(given, system),
+        *machine.computer(system, no_sleep=given is not None and given.cpu_awake),
+        *link_checks(controller, system),
+        *disk_checks(place, disk_trial(place)),
+        machine.load(system),
+    ]
+    before = system.text("/proc/stat") or ""
+    measured = {
+        "wake-up": measure("wake-up", "wake-ups", cycle_ms / 1000, seconds, reporter),
+        "turnaround": measure("turnaround", "turnaround", TURNAROUND_PERIOD, seconds, reporter),
+    }
     checks.append(machine.stolen(before, system.text("/proc/stat") or ""))
-    for name, latency in (("wake-up", wake_up), ("turnaround", turnaround)):
-        if latency is None:
-            checks.append(failed(name))
-    latencies = tuple(latency for latency in (wake_up, turnaround) if latency is not None)
+    look = "python -m hil.doctor.probe permissions   # says why"
+    checks += [
+        bad(f"{name} latency", "the probe gave no figures", look)
+        for name, latency in measured.items()
+        if latency is None
+    ]
+    latencies = tuple(latency for latency in measured.values() if latency is not None)
     one, two = (judge(latencies, cycle) for cycle in CYCLES_MS)
     return Diagnosis(tuple(checks), latencies, one, two, cycle_ms, seconds)
-
-
-def failed(name: str) -> Check:
-    """A measurement that could not be made."""
-    found = "the probe gave no figures"
-    remedy = "python -m hil.doctor.probe permissions   # says why"
-    return Check(f"{name} latency", Status.BAD, found, "without it nothing is known", (remedy,))
-
-
-def permission_checks(given: RealTimeReport | None, system: System) -> list[Check]:
-    """What the operating system allows."""
-    return [
-        machine.user(),
-        machine.scheduling(given),
-        machine.memory_lock(given),
-        machine.processor_awake(given, system),
-    ]
-
-
-def machine_checks(given: RealTimeReport | None, system: System) -> list[Check]:
-    """The computer itself."""
-    return [
-        machine.timer_resolution(),
-        machine.clock_source(system),
-        machine.governor(system),
-        machine.idle_states(system, no_sleep=given is not None and given.cpu_awake),
-        machine.isolation(system),
-        machine.preemption(system),
-        machine.virtualisation(system),
-        machine.python(),
-    ]
-
-
-def link_checks(link: Link | None, system: System) -> list[Check]:
-    """What lies between this PC and the controller."""
-    if isinstance(link, CanLink):
-        return [can_check(link, system)]
-    if isinstance(link, UdpLink):
-        trial = links.try_port(link.bind, link.port)
-        return [
-            *network_checks(link.host, link.port, address_of(link.host, system), system),
-            links.port_check(link.bind, link.port, trial, system),
-            links.options_check(trial),
-        ]
-    why = "routes, ports and buses are looked at when a cell with a real link is given"
-    return [Check("controller link", Status.OK, "none: no cell, or a simulated one", why)]
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
@@ -240,33 +353,30 @@ _OTHERWISE = (
 
 def show(diagnosis: Diagnosis, console: Console) -> None:
     """Print checks, histograms, verdict and remedies."""
-    console.print(_table(diagnosis.checks))
+    table = Table(box=None, pad_edge=False)
+    for title in ("check", "", "found"):
+        table.add_column(title, overflow="fold")
+    for check in diagnosis.checks:
+        status = f"[{_COLOUR[check.status]}]{check.status}[/]"
+        table.add_row(escape(check.name), status, escape(printable(check.found)))
+    console.print(table)
     for latency in diagnosis.latencies:
         console.print("\n".join(histogram(latency)), markup=False, highlight=False)
         console.print()
-    for verdict in (diagnosis.one, diagnosis.two):
-        console.print(verdict_line(verdict), markup=False, highlight=False, soft_wrap=True)
-    console.print(f"({CRITERIA})", markup=False, highlight=False, soft_wrap=True)
-    for line in remedies(diagnosis.checks):
-        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
+    lines = [
+        f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
+        for verdict in (diagnosis.one, diagnosis.two)
+    ]
+    lines += [f"({CRITERIA})", *remedies(diagnosis.checks)]
     if not diagnosis.wanted.fit:
-        otherwise = _OTHERWISE.format("use 2 ms; " if diagnosis.two.fit else "")
-        console.print(f"\n{otherwise}", markup=False, highlight=False, soft_wrap=True)
+        lines.append("\n" + _OTHERWISE.format("use 2 ms; " if diagnosis.two.fit else ""))
+    for line in lines:
+        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     console.print()
     colour = "green" if diagnosis.fit else "red"
     console.print(
         f"[bold {colour}]{escape(printable(diagnosis.line))}[/]", highlight=False, soft_wrap=True
     )
-
-
-def _table(checks: tuple[Check, ...]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for title in ("check", "", "found"):
-        table.add_column(title, overflow="fold")
-    for check in checks:
-        status = f"[{_COLOUR[check.status]}]{check.status}[/]"
-        table.add_row(escape(check.name), status, escape(printable(check.found)))
-    return table
 
 
 def histogram(latency: Latency) -> Iterator[str]:
@@ -281,11 +391,6 @@ def histogram(latency: Latency) -> Iterator[str]:
     for bounds, count in latency.histogram():
         bar = "█" * math.ceil(_BAR * math.log1p(count) / most) if count else ""
         yield f"  {bounds:>10} µs {count:>8} {bar}"
-
-
-def verdict_line(verdict: Fitness) -> str:
-    """One cycle's verdict and its reason."""
-    return f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
 
 
 def remedies(checks: tuple[Check, ...]) -> Iterator[str]:
@@ -310,7 +415,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, object]:
         "seconds": diagnosis.seconds,
         "cycles": [_verdict(verdict) for verdict in (diagnosis.one, diagnosis.two)],
         "latency": {each.name: each.summary() for each in diagnosis.latencies},
-        "checks": [asdict(check) for check in diagnosis.checks],
+        "checks": [asdict(check) | {"why": check.why} for check in diagnosis.checks],
     }
 
 

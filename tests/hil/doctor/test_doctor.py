@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,39 +25,28 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from drivers.exchange.realtime import RealTimeReport
-from hil.cell import Cell
 from hil.cell.errors import UnknownFieldsError
-from hil.cell.schema import ControllerTable
+from hil.cell.schema import CanTable, ControllerTable
 from hil.cli.doctor import doctor
-from hil.doctor import link as port
-from hil.doctor import link as route
-from hil.doctor import machine, probe
-from hil.doctor import machine as permissions
-from hil.doctor.check import Answer, Check, Status, run_command
+from hil.doctor import link, machine, probe
+from hil.doctor.check import Answer, Check, Status, System, bad, ok, run_command, unknown, warn
 from hil.doctor.diagnosis import (
+    RESERVE,
     Diagnosis,
     Fitness,
+    Latency,
     as_json,
+    disk_trial,
     examine,
     histogram,
-    in_words,
     judge,
+    measure,
+    obtained,
     remedies,
+    run_probe,
     show,
 )
-from hil.doctor.link import (
-    CanLink,
-    UdpLink,
-    can_check,
-    coalescing,
-    controller_in,
-    device_check,
-    firewall,
-    link_of,
-    network_checks,
-)
 from hil.doctor.machine import DiskTrial, disk_checks
-from hil.doctor.measure import RESERVE, Latency, disk_trial, measure, obtained, run_probe
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.doctor.conftest import Tree
@@ -150,8 +140,8 @@ def test_nothing_measured_is_not_fit() -> None:
         (False, False, "Neither 1 ms nor 2 ms is fit."),
     ],
 )
-def test_the_verdict_is_a_plain_sentence(one: bool, two: bool, words: str) -> None:
-    assert in_words(verdict(1, one), verdict(2, two)) == words
+def test_the_verdict_is_a_sentence(one: bool, two: bool, words: str) -> None:
+    assert Diagnosis((), (), verdict(1, one), verdict(2, two), 1, 60.0).line.startswith(words)
 
 
 def verdict(cycle_ms: int, fit: bool) -> Fitness:
@@ -159,7 +149,7 @@ def verdict(cycle_ms: int, fit: bool) -> Fitness:
 
 
 # --- diagnosis and report --------------------------------------------------------------------
-PORT = Check("UDP port 1000", Status.BAD, "in use [by] a", "the [only] port", ("sudo ss -lunp",))
+PORT = bad("UDP port 1000", "in use [by] a", "sudo ss -lunp")
 
 
 def diagnosis(*checks: Check, fit: bool = True, seconds: float = 60.0) -> Diagnosis:
@@ -175,8 +165,7 @@ def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
 
 
 def test_an_unknown_or_warning_does_not() -> None:
-    warn = Check("a", Status.WARN, "x", "y")
-    assert diagnosis(warn, Check("b", Status.UNKNOWN, "x", "y")).fit
+    assert diagnosis(warn("a", "x"), unknown("b", "x")).fit
 
 
 def test_a_short_measurement_calls_itself_provisional() -> None:
@@ -190,7 +179,7 @@ def test_a_short_measurement_calls_itself_provisional() -> None:
 def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
     fit: bool, seconds: float, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def made_up(**_: object) -> Diagnosis:
+    def made_up(*_: object, **__: object) -> Diagnosis:
         return diagnosis(fit=fit, seconds=seconds)
 
     monkeypatch.setattr("hil.cli.doctor.examine", made_up)
@@ -199,18 +188,15 @@ def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
     assert json.loads(ran.stdout)["provisional"] is (seconds < 60)
 
 
-def test_remedies_come_worst_first_and_a_good_check_has_none() -> None:
-    warn = Check("w", Status.WARN, "", "slow", ("make it fast",))
-    fine = Check("g", Status.OK, "", "good", ("never shown",))
-    lines = "\n".join(remedies((warn, fine, PORT)))
-    assert lines.index("sudo ss") < lines.index("make it fast")
-    assert "never shown" not in lines
-
-
-def test_a_command_that_helps_twice_is_typed_once() -> None:
-    again = Check("other", Status.BAD, "", "", ("sudo ss -lunp", "more"))
-    lines = list(remedies((PORT, again)))
-    assert [line.strip() for line in lines if line.startswith("    ")] == ["sudo ss -lunp", "more"]
+def test_remedies_come_worst_first_and_each_command_once() -> None:
+    checks = (
+        warn("w", "slow", "make it fast"),
+        ok("g", "good"),
+        PORT,
+        bad("o", "", "sudo ss -lunp"),
+    )
+    commands = [line.strip() for line in remedies(checks) if line.startswith("    ")]
+    assert commands == ["sudo ss -lunp", "make it fast"]
 
 
 def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
@@ -218,7 +204,7 @@ def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
     show(diagnosis(PORT), console)
     text = console.export_text()
     assert "in use [by] a" in text
-    assert "the [only] port" in text
+    assert "the controller sends to this port" in text
     assert "2000-5000 µs        1 █" in text
 
 
@@ -252,23 +238,23 @@ def test_the_json_says_what_the_page_says() -> None:
 def far_end() -> Iterator[Callable[[int | None], int]]:
     """Starts an echo that keeps one question to itself; gives its port."""
     threads = []
-    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    link.bind(("127.0.0.1", 0))
+    far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    far.bind(("127.0.0.1", 0))
 
     def start(unanswered: int | None) -> int:
         def run() -> None:
-            while (received := link.recvfrom(1500))[0] != b"end":
+            while (received := far.recvfrom(1500))[0] != b"end":
                 if int.from_bytes(received[0][:4], "little") != unanswered:
-                    link.sendto(received[0], received[1])
+                    far.sendto(received[0], received[1])
 
         threads.append(threading.Thread(target=run))
         threads[-1].start()
-        return int(link.getsockname()[1])
+        return int(far.getsockname()[1])
 
     yield start
     for thread in threads:
         thread.join(timeout=5.0)
-    link.close()
+    far.close()
 
 
 def test_a_question_never_answered_counts_its_whole_wait_and_the_next_is_asked(
@@ -308,7 +294,7 @@ def test_a_process_that_slept_through_deadlines_shows_it_as_one_long_latency(
 
 def test_a_probe_that_fails_or_hangs_gives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run_probe(["no such probe"], 0.0) is None
-    monkeypatch.setattr("hil.doctor.measure._GRACE", 0.3)
+    monkeypatch.setattr("hil.doctor.diagnosis._GRACE", 0.3)
     began = time.monotonic()
     assert run_probe(["echo"], 0.0) is None  # waits 5 s for packets
     assert time.monotonic() - began < 4.0
@@ -342,23 +328,13 @@ def cell_text(**controller: object) -> str:
     return text.replace('"ns16.urdf"', json.dumps(str(urdf)))
 
 
-def test_the_link_is_the_cells() -> None:
-    def cell(text: str) -> ControllerTable:
-        return Cell.from_texts(text, Cell.load(CELL_PATH).urdf, CELL_PATH).controller
-
-    assert link_of(cell(cell_text())) is None
-    assert link_of(cell(cell_text(transport="udp"))) == UdpLink("10.2.12.150", 1000, "0.0.0.0")
-    bus = '\n[controller.can]\ninterface = "socketcan"\nchannel = "can0"\n'
-    assert link_of(cell(cell_text(transport="can") + bus)) == CanLink("socketcan", "can0", True)
-
-
 def test_of_a_cell_that_is_being_filled_in_the_controller_is_enough(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(re.sub(r"(?m)^torque_constant = .*$", 'torque_constant = "?"', cell_text()))
-    assert link_of(controller_in(path)) is None
+    assert link.controller_in(path).transport == "simulated"
     path.write_text(re.sub(r"(?m)^cycle_ms = .*$", 'cycle_ms = "?"', cell_text()))
     with pytest.raises(UnknownFieldsError, match=r"controller\.cycle_ms"):
-        controller_in(path)
+        link.controller_in(path)
 
 
 def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: Path) -> None:
@@ -390,7 +366,8 @@ def test_a_cell_that_cannot_be_read_is_bad_input(tmp_path: Path) -> None:
 
 
 def test_every_remedy_can_be_typed_as_it_stands(tmp_path: Path) -> None:
-    found = examine(UdpLink("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
+    far = ControllerTable(transport="udp", cycle_ms=1, host="10.99.99.99", port=999)
+    found = examine(far, 1, 0.1, tmp_path, Silent())
     for check in found.checks:
         for command in check.remedy:
             checked = subprocess.run(["bash", "-n", "-c", command], capture_output=True, text=True)
@@ -403,95 +380,248 @@ def test_what_was_really_given_is_reported() -> None:
     assert given.scheduling
 
 
-# --- Judgements of a computer, its permissions and its disk: files instead of /proc and /sys
-
+# --- judgements: files in place of /proc and /sys, canned answers of commands -----------------
 ALL = RealTimeReport("SCHED_FIFO 50", True, True)
+PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now is locked (…)",))
 NOTHING = RealTimeReport("ordinary", False, False)
+AWAKE = {"/dev/cpu_dma_latency": ""}
+CLOCK = "/sys/devices/system/clocksource/clocksource0"
+CPU = "/sys/devices/system/cpu"
+C4G = "10.2.12.150"
+FD = CanTable(interface="socketcan", channel="can0", bitrate=1_000_000, data_bitrate=5_000_000)
+BUS = {"/sys/class/net/can0/type": "280", "/sys/class/net/can0/operstate": "up"}
+ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
+eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0
+eth1\t000C020A\t00000000\t0001\t0\t0\t100\t00FFFFFF\t0\t0\t0
+eth2\t000C020A\t00000000\t0001\t0\t0\t200\t00FFFFFF\t0\t0\t0
+"""
+GATEWAY = {"/proc/net/route": ROUTES.replace("eth1", "eth9").replace("000C020A", "00636363")}
+SHARED = {"/proc/net/route": ROUTES.replace("eth0", "eth1")}
+UDP_USERS = "header\n 12: 00000000:03E8 00000000:0000 07 0:0 0:0 0 1000 0 4711 2 0 0\ngarbage\n"
+CHAIN = "table inet filter { chain input { type filter hook input priority 0; policy %s; %s} }"
+UFW = "-P INPUT ACCEPT\n-A INPUT -j ufw-input\n-A ufw-input -p udp -j DROP\n"
 
 
-def processors(count: int, files: dict[str, str]) -> dict[str, str]:
-    base = "/sys/devices/system/cpu"
-    return {f"{base}/cpu{i}/{name}": text for i in range(count) for name, text in files.items()}
-
-
-# --- machine ---------------------------------------------------------------------------------
-def test_a_coarse_timer_is_bad() -> None:
-    assert machine.timer_resolution(1e-9).status is Status.OK
-    coarse = machine.timer_resolution(4e-3)
-    assert coarse.status is Status.BAD
-    assert "4 ms" in coarse.found
-
-
-def test_a_slow_clock_gets_the_command_that_selects_the_fast_one_only_if_it_is_offered(
-    tree: Tree,
-) -> None:
-    folder = "/sys/devices/system/clocksource/clocksource0"
-    tree.write({f"{folder}/current_clocksource": "hpet\n"})
-    assert machine.clock_source(tree.system()).remedy == ()
-    tree.write({f"{folder}/available_clocksource": "tsc hpet acpi_pm\n"})
-    check = machine.clock_source(tree.system())
-    assert check.status is Status.WARN
-    assert "echo tsc" in check.remedy[0]
-
-
-def test_one_processor_that_saves_power_is_enough_for_a_warning(tree: Tree) -> None:
-    tree.write(processors(4, {"cpufreq/scaling_governor": "performance\n"}))
-    assert machine.governor(tree.system()).status is Status.OK
-    tree.write(processors(1, {"cpufreq/scaling_governor": "powersave\n"}))
-    check = machine.governor(tree.system())
-    assert check.status is Status.WARN
-    assert "powersave" in check.found
-
-
-@pytest.mark.parametrize(
-    ("no_sleep", "disabled", "status"),
-    [(False, "0", Status.WARN), (True, "0", Status.OK), (False, "1", Status.OK)],
-)
-def test_a_deep_idle_state_matters_unless_disabled_or_kept_out(
-    tree: Tree, no_sleep: bool, disabled: str, status: Status
-) -> None:
-    state = {"cpuidle/state1/name": "C1", "cpuidle/state1/latency": "2"}
-    deep = {
-        "cpuidle/state3/name": "C6",
-        "cpuidle/state3/latency": "133",
-        "cpuidle/state3/disable": disabled,
+def processors(count: int, **files: str) -> dict[str, str]:
+    """Files of so many processors; __ in a name stands for a folder."""
+    return {
+        f"{CPU}/cpu{i}/{name.replace('__', '/')}": text
+        for i in range(count)
+        for name, text in files.items()
     }
-    tree.write(processors(2, state | deep))
-    check = machine.idle_states(tree.system(), no_sleep=no_sleep)
-    assert check.status is status
-    assert ("C6" in check.found) == (disabled == "0")
 
 
-def test_isolation_is_advised_only_where_there_are_processors_to_spare(tree: Tree) -> None:
-    tree.write(processors(2, {"uevent": ""}))
-    assert machine.isolation(tree.system()).status is Status.OK
-    tree.write(processors(8, {"uevent": ""}))
-    check = machine.isolation(tree.system())
-    assert check.status is Status.WARN
-    assert "isolcpus=managed_irq,domain,7" in check.remedy[0]
-    tree.write({"/sys/devices/system/cpu/isolated": "7\n"})
-    assert machine.isolation(tree.system()).status is Status.OK
+def deep(disable: str) -> dict[str, str]:
+    state = {"cpuidle__state1__name": "C1", "cpuidle__state1__latency": "2"}
+    state |= {"cpuidle__state3__name": "C6", "cpuidle__state3__latency": "133"}
+    return processors(2, **state, cpuidle__state3__disable=disable)
 
 
-@pytest.mark.parametrize(
-    ("files", "found", "status"),
-    [
-        ({"/proc/version": "Linux 6.1 #1 SMP PREEMPT_RT Debian"}, "PREEMPT_RT", Status.OK),
-        ({"/sys/kernel/debug/sched/preempt": "none voluntary (full) "}, "full", Status.OK),
-        ({"/proc/cmdline": "quiet preempt=voluntary"}, "voluntary", Status.WARN),
-        (
-            {"/proc/sys/kernel/osrelease": "6.1", "/boot/config-6.1": "CONFIG_PREEMPT_NONE=y"},
-            "none",
-            Status.WARN,
-        ),
-        ({"/proc/version": "Linux"}, "not stated by the kernel", Status.UNKNOWN),
-    ],
-)
-def test_the_preemption_model_is_found_wherever_it_is_stated(
-    tree: Tree, files: dict[str, str], found: str, status: Status
+def card(**files: str) -> dict[str, str]:
+    given = {"operstate": "up", "carrier": "1", "speed": "1000", "duplex": "full"} | files
+    return {f"/sys/class/net/eth1/{name.replace('__', '/')}": given[name] for name in given}
+
+
+def arp(entry: str) -> dict[str, str]:
+    head = "IP address       HW type     Flags       HW address            Mask     Device\n"
+    return {"/proc/net/arp": f"{head}{entry}\n"}
+
+
+def rates(nominal: int, data: int | None) -> Answer:
+    fast = {"data_bittiming": {"bitrate": data}} if data else {}
+    info = {"bittiming": {"bitrate": nominal}, **fast}
+    return Answer(0, json.dumps([{"linkinfo": {"info_kind": "can", "info_data": info}}]))
+
+
+Judge = Callable[[System], Check]
+Commands = dict[str, Answer]
+Case = tuple[Judge, dict[str, str], Commands, Status, str]
+OK, WARN, BAD, UNKNOWN = Status
+
+
+def of(judge: Judge, *cases: tuple[Any, ...]) -> list[Case]:
+    """Cases of one judgement: files, outcome, a word of it or of its remedy, and commands."""
+    return [(judge, one[0], one[3] if len(one) > 3 else {}, one[1], one[2]) for one in cases]
+
+
+def says(
+    code: int, output: str = "", errors: str = "", command: str = "ethtool"
+) -> dict[str, Answer]:
+    return {command: Answer(code, output, errors)}
+
+
+JUDGED = [
+    *of(
+        machine.clock_source,
+        ({f"{CLOCK}/current_clocksource": "hpet\n"}, WARN, "hpet"),
+        ({f"{CLOCK}/current_clocksource": "hpet",
+          f"{CLOCK}/available_clocksource": "tsc hpet"}, WARN, "echo tsc"),
+        ({f"{CLOCK}/current_clocksource": "tsc"}, OK, "tsc"),
+        ({}, UNKNOWN, "not stated"),
+    ),
+    *of(
+        machine.governor,
+        (processors(4, cpufreq__scaling_governor="performance"), OK, "performance"),
+        (processors(4, cpufreq__scaling_governor="performance")
+         | processors(1, cpufreq__scaling_governor="powersave"), WARN, "powersave"),
+        ({}, OK, "no frequency scaling"),
+    ),
+    *of(lambda s: machine.idle_states(s, no_sleep=False),
+        (deep("0"), WARN, "C6, 133 µs"), (deep("1"), OK, "C1"), ({}, OK, "none listed")),
+    *of(lambda s: machine.idle_states(s, no_sleep=True), (deep("0"), OK, "C6")),
+    *of(
+        machine.isolation,
+        (processors(2, uevent=""), OK, "none to spare"),
+        (processors(8, uevent=""), WARN, "isolcpus=managed_irq,domain,7"),
+        (processors(8, uevent="") | {f"{CPU}/isolated": "7"}, OK, "7"),
+    ),
+    *of(
+        machine.preemption,
+        ({"/proc/version": "Linux 6.1 #1 SMP PREEMPT_RT Debian"}, OK, "PREEMPT_RT"),
+        ({"/sys/kernel/debug/sched/preempt": "none voluntary (full) "}, OK, "full"),
+        ({"/proc/cmdline": "quiet preempt=voluntary"}, WARN, "voluntary"),
+        ({"/proc/sys/kernel/osrelease": "6.1", "/boot/config-6.1": "CONFIG_PREEMPT_NONE=y"},
+         WARN, "none"),
+        ({"/proc/version": "PREEMPT_DYNAMIC", "/proc/cmdline": "preempt=none"},
+         WARN, "preempt=full"),
+        ({"/proc/version": "Linux"}, UNKNOWN, "not stated by the kernel"),
+    ),
+    *of(
+        machine.virtualisation,
+        ({"/proc/cpuinfo": "flags\t\t: fpu vme\n"}, OK, "no sign"),
+        ({"/proc/cpuinfo": "flags\t\t: fpu hypervisor vme\n",
+          "/proc/stat": "cpu  50 0 0 40 0 0 0 10 0 0\ncpu0 1 2 3\n"}, WARN, "10.00 %"),
+    ),
+    *of(machine.load, ({"/proc/loadavg": "0.1 0 0"}, OK, "0.1"),
+        ({"/proc/loadavg": "9 0 0"}, WARN, "top"), ({}, UNKNOWN, "uptime")),
+    *of(lambda s: machine.user(0), ({}, WARN, "as the user")),
+    *of(lambda s: machine.user(1000), ({}, OK, "not root")),
+    # What was given counts, whatever the limit says.
+    *of(lambda s: machine.scheduling(ALL, 0), ({}, OK, "SCHED_FIFO 50")),
+    *of(lambda s: machine.scheduling(None, 0), ({}, UNKNOWN, "rtprio limit 0")),
+    *of(lambda s: machine.scheduling(NOTHING, 0),
+        ({}, BAD, "'@realtime - rtprio 98' | sudo tee -a /etc/security/limits.d/90-hil.conf"),
+        ({}, BAD, "sudo groupadd -f realtime && sudo usermod -aG realtime ")),
+    *of(lambda s: machine.scheduling(NOTHING, 80), ({}, BAD, "sched_rt_runtime_us")),
+    *of(lambda s: machine.memory_lock(ALL, 65536), ({}, OK, "64 KiB")),
+    *of(lambda s: machine.memory_lock(None, 0), ({}, UNKNOWN, "no answer")),
+    *of(lambda s: machine.memory_lock(NOTHING, 8 << 20),
+        ({}, BAD, "8192 KiB"), ({}, BAD, "memlock unlimited")),
+    *of(lambda s: machine.memory_lock(PARTLY, 8 << 20), ({}, WARN, "memlock unlimited")),
+    *of(lambda s: machine.processor_awake(ALL, s), (AWAKE, OK, "held at 0")),
+    *of(lambda s: machine.processor_awake(None, s), (AWAKE, UNKNOWN, "no answer")),
+    *of(lambda s: machine.processor_awake(NOTHING, s),
+        ({}, UNKNOWN, "has no"), (AWAKE, WARN, "/etc/udev/rules.d/90-hil.rules")),
+    *of(
+        lambda s: link.device_check("eth1", s),
+        ({}, BAD, "does not exist"),
+        (card(), OK, "1000 Mbit/s"),
+        (card(operstate="down", carrier="0"), BAD, "no carrier"),
+        (card(duplex="half"), BAD, "half"),
+        (card(speed="10"), BAD, "10 Mbit/s"),
+        (card(speed="-1", duplex="unknown"), OK, "speed not stated"),
+        (card(speed="gibberish"), OK, "speed not stated"),
+        (card(wireless__x=""), BAD, "wireless"),
+        (card() | SHARED, WARN, "shared with other traffic"),
+    ),
+    *of(
+        lambda s: link.coalescing("eth1", s),
+        ({}, UNKNOWN, "ethtool -c eth1"),
+        ({}, OK, "rx-usecs 0", says(0, "Adaptive RX: off  TX: off\nrx-usecs: 0\n")),
+        ({}, WARN, "adaptive", says(0, "Adaptive RX: on  TX: on\nrx-usecs: 3\n")),
+        ({}, WARN, "200", says(0, "rx-usecs: 200\n")),
+        ({}, OK, "has none", says(1, "", "netlink error: Operation not supported")),
+        ({}, UNKNOWN, "not permitted", says(1, "", "netlink error: Operation not permitted")),
+        ({}, OK, "not stated", says(0, "\x00nonsense")),
+    ),
+    *of(
+        lambda s: link.neighbour_check(C4G, "eth1", link.neighbour(C4G, "eth1", s)),
+        (arp("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth1"), OK, "permanent"),
+        (arp("10.2.12.150 0x1 0x2 00:04:50:00:00:01 * eth1"), WARN, "will expire"),
+        (arp("10.2.12.150 0x1 0x0 00:00:00:00:00:00 * eth1"), WARN, "none"),
+        (arp("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth2"), WARN, "none"),
+        (arp("10.2.12.150 0x1 what? 00:04:50:00:00:01 * eth1"), WARN, "none"),
+        (arp(""), WARN, "sudo ip neigh replace 10.2.12.150 lladdr "),
+    ),
+    *of(
+        lambda s: link.firewall(C4G, 1000, s),
+        ({}, OK, "no packet filter"),
+        ({"/proc/net/netfilter/nf_log": ""}, UNKNOWN, "neither nft nor iptables"),
+        ({}, OK, "no rule", says(0, "", command="nft")),
+        ({}, OK, "no rule", says(0, CHAIN % ("accept", ""), command="nft")),
+        ({}, WARN, "drop", says(0, CHAIN % ("drop", ""), command="nft")),
+        ({}, WARN, "drop", says(0, CHAIN % ("accept", "udp dport 1000 drop "), command="nft")),
+        ({}, OK, "no rule", says(0, "-P INPUT ACCEPT\n", command="iptables")),
+        ({}, WARN, "drop", says(0, "-P INPUT DROP\n", command="iptables")),
+        ({}, WARN, "drop", says(0, UFW, command="iptables")),
+        ({}, OK, "no rule", says(0, UFW.replace("DROP", "ACCEPT"), command="iptables")),
+        ({}, UNKNOWN, "root", says(1, "", "not permitted (you must be root)", command="nft")),
+        ({}, UNKNOWN, "root", says(0, "", command="nft")
+         | says(4, "", "Permission denied", command="iptables")),
+    ),
+    *of(
+        lambda s: link.can_check(FD, s),
+        ({}, BAD, "does not exist"),
+        (BUS | {"/sys/class/net/can0/type": "1"}, BAD, "is no CAN interface"),
+        (BUS | {"/sys/class/net/can0/operstate": "down"}, BAD,
+         "bitrate 1000000 dbitrate 5000000 fd on"),
+        (BUS, OK, "5000000", {"ip": rates(1_000_000, 5_000_000)}),
+        (BUS, BAD, "500000", {"ip": rates(500_000, 5_000_000)}),
+        (BUS, BAD, "2000000", {"ip": rates(1_000_000, 2_000_000)}),
+        (BUS, BAD, "1000000", {"ip": rates(1_000_000, None)}),
+        (BUS, UNKNOWN, "not stated", {"ip": Answer(0, "[]")}),
+        (BUS, UNKNOWN, "not stated", {"ip": Answer(0, "not json")}),
+        (BUS, OK, "virtual bus", {"ip": Answer(0, '[{"linkinfo": {"info_kind": "vcan"}}]')}),
+    ),
+    *of(lambda s: link.can_check(CanTable(interface="slcan", channel="/dev/ttyACM0"), s),
+        ({}, UNKNOWN, "not a kernel device")),
+    *of(lambda s: link.port_check("0.0.0.0", 1000, errno.EACCES, s),
+        ({"/proc/sys/net/ipv4/ip_unprivileged_port_start": "1024\n"}, BAD, "1024"),
+        ({}, BAD, "net.ipv4.ip_unprivileged_port_start=1000")),
+    *of(lambda s: link.port_check("0.0.0.0", 1000, errno.EADDRINUSE, s), ({}, BAD, "another user")),
+    *of(lambda s: link.port_check("10.1.1.1", 1000, errno.EADDRNOTAVAIL, s),
+        ({}, BAD, "10.1.1.1 is no address")),
+    *of(lambda s: link.port_check("0.0.0.0", 1000, -1, s), ({}, BAD, "error -1")),
+    *of(lambda s: link.port_check("0.0.0.0", 1000, errno.ENOBUFS, s), ({}, BAD, "ENOBUFS")),
+    *of(lambda s: link.port_check("0.0.0.0", 1000, 0, s), ({}, OK, "0.0.0.0")),
+    *of(lambda s: machine.stolen("cpu  100 0 0 100 0 0 0 500 0 0\n",
+                                 "cpu  200 0 0 200 0 0 0 500 0 0\n"), ({}, OK, "0.00 %")),
+    *of(lambda s: machine.stolen("cpu  100 0 0 100 0 0 0 500 0 0\n",
+                                 "cpu  145 0 0 145 0 0 0 510 0 0\n"), ({}, WARN, "10.00 %")),
+    *of(lambda s: machine.stolen("nonsense", ""), ({}, UNKNOWN, "not stated")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("judge", "files", "commands", "status", "word"), JUDGED)
+def test_what_is_found_is_judged(
+    tree: Tree,
+    judge: Judge,
+    files: dict[str, str],
+    commands: dict[str, Answer],
+    status: Status,
+    word: str,
 ) -> None:
-    check = machine.preemption(tree.write(files).system())
-    assert (check.found, check.status) == (found, status)
+    found = judge(tree.write(files).system(**commands))
+    assert found.status is status
+    assert word in "\n".join([found.found, *found.remedy])
+    assert found.why
+
+
+@given(text=st.text())
+def test_nonsense_of_the_kernel_never_stops_the_examination(
+    tmp_path_factory: pytest.TempPathFactory, text: str
+) -> None:
+    tree = Tree(tmp_path_factory.mktemp("nonsense"))
+    idle = {"cpuidle__state0__latency": text, "cpuidle__state0__disable": text}
+    tree.write(processors(2, cpufreq__scaling_governor=text, **idle))
+    tree.write(card(speed=text, duplex=text))
+    tree.write(dict.fromkeys(("/proc/net/route", "/proc/net/arp"), f"header\n{text}"))
+    names = ("loadavg", "stat", "cpuinfo", "cmdline", "version")
+    system = tree.write({f"/proc/{name}": text for name in names}).system()
+    checks = [*machine.computer(system, no_sleep=False), machine.load(system)]
+    assert all(check.found for check in [*checks, link.device_check("eth1", system)])
+    assert link.route_to(C4G, system) is None
+    assert link.neighbour(C4G, "eth1", system) is None
 
 
 def test_the_preemption_model_is_read_from_the_packed_kernel_configuration(tree: Tree) -> None:
@@ -500,111 +630,17 @@ def test_the_preemption_model_is_read_from_the_packed_kernel_configuration(tree:
     (tree.root / "proc/config.gz").write_bytes(packed)
     assert machine.preemption(tree.system()).found == "none"
     (tree.root / "proc/config.gz").write_bytes(packed[:20])
-    assert machine.preemption(tree.system()).status is Status.UNKNOWN
+    assert machine.preemption(tree.system()).status is UNKNOWN
 
 
-def test_a_virtual_machine_is_told_and_its_stolen_time(tree: Tree) -> None:
-    tree.write({"/proc/cpuinfo": "flags\t\t: fpu vme\n"})
-    assert machine.virtualisation(tree.system()).status is Status.OK
-    tree.write(
-        {
-            "/proc/cpuinfo": "flags\t\t: fpu hypervisor vme\n",
-            "/proc/stat": "cpu  50 0 0 40 0 0 0 10 0 0\ncpu0 1 2 3\n",
-        }
-    )
-    check = machine.virtualisation(tree.system())
-    assert check.status is Status.WARN
-    assert "10.00 %" in check.found
-
-
-def test_only_time_stolen_during_the_measurement_counts() -> None:
-    before = "cpu  100 0 0 100 0 0 0 500 0 0\n"
-    assert machine.stolen(before, "cpu  200 0 0 200 0 0 0 500 0 0\n").status is Status.OK
-    check = machine.stolen(before, "cpu  145 0 0 145 0 0 0 510 0 0\n")
-    assert check.status is Status.WARN
-    assert check.found == "10.00 %"
-    assert machine.stolen("nonsense", "").status is Status.UNKNOWN
-
-
-@given(text=st.text())
-def test_nonsense_in_sysfs_never_stops_the_examination(
-    tmp_path_factory: pytest.TempPathFactory, text: str
-) -> None:
-    names = ["cpufreq/scaling_governor", "cpuidle/state0/latency", "cpuidle/state0/disable"]
-    tree = Tree(tmp_path_factory.mktemp("nonsense"))
-    tree.write(processors(2, dict.fromkeys(names, text)))
-    files = ["/proc/loadavg", "/proc/stat", "/proc/cpuinfo", "/proc/cmdline", "/proc/version"]
-    tree.write(dict.fromkeys(files, text))
-    system = tree.system()
-    checks = [
-        machine.governor(system),
-        machine.idle_states(system, no_sleep=False),
-        machine.preemption(system),
-        machine.virtualisation(system),
-        machine.load(system),
-    ]
-    assert all(check.found for check in checks)
-
-
-# --- permissions -----------------------------------------------------------------------------
-def test_what_was_given_counts_whatever_the_limit_says() -> None:
-    assert permissions.scheduling(ALL, 0).status is Status.OK
-    assert permissions.memory_lock(ALL, 65536).status is Status.OK
-
-
-def test_a_refused_right_gets_the_line_that_grants_it() -> None:
-    check = permissions.scheduling(NOTHING, 0)
-    assert check.status is Status.BAD
-    granting = "echo '@realtime - rtprio 98' | sudo tee -a /etc/security/limits.d/90-hil.conf"
-    assert check.remedy[1] == granting
-    assert check.remedy[0].startswith("sudo groupadd -f realtime && sudo usermod -aG realtime ")
-    check = permissions.memory_lock(NOTHING, 8 << 20)
-    assert check.status is Status.BAD
-    assert "8192 KiB" in check.found
-    assert "memlock unlimited" in check.remedy[1]
-
-
-def test_memory_locked_as_far_as_a_limit_goes_is_a_warning() -> None:
-    partly = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now is locked (…)",))
-    check = permissions.memory_lock(partly, 8 << 20)
-    assert check.status is Status.WARN
-    assert "memlock unlimited" in check.remedy[1]
-
-
-def test_real_time_refused_within_the_limit_points_at_the_kernel_too() -> None:
-    assert "sched_rt_runtime_us" in permissions.scheduling(NOTHING, 80).remedy[-1]
-
-
-def test_a_silent_probe_leaves_permissions_unknown(tree: Tree) -> None:
-    assert permissions.scheduling(None, 0).status is Status.UNKNOWN
-    assert permissions.memory_lock(None, 0).status is Status.UNKNOWN
-    tree.write({"/dev/cpu_dma_latency": ""})
-    assert permissions.processor_awake(None, tree.system()).status is Status.UNKNOWN
-
-
-def test_the_sleep_setting_gets_a_udev_rule_only_where_the_file_exists(tree: Tree) -> None:
-    assert permissions.processor_awake(NOTHING, tree.system()).status is Status.UNKNOWN
-    tree.write({"/dev/cpu_dma_latency": ""})
-    check = permissions.processor_awake(NOTHING, tree.system())
-    assert check.status is Status.WARN
-    assert any("/etc/udev/rules.d/90-hil.rules" in line for line in check.remedy)
-    assert permissions.processor_awake(ALL, tree.system()).status is Status.OK
-
-
-def test_root_is_told_that_what_root_may_do_says_little() -> None:
-    assert permissions.user(0).status is Status.WARN
-    assert permissions.user(1000).status is Status.OK
-
-
-# --- disk ------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("trial", "statuses"),
     [
-        (DiskTrial("/d", 10**12, (0.001, 0.2)), [Status.OK, Status.OK]),
-        (DiskTrial("/d", 10**9, (0.001, 0.8)), [Status.WARN, Status.WARN]),
-        (DiskTrial("/d", 10**6, (0.001, 2.6)), [Status.BAD, Status.BAD]),
-        (DiskTrial("/d", 10**12, (), "Read-only file system"), [Status.OK, Status.BAD]),
-        (None, [Status.BAD]),
+        (DiskTrial("/d", 10**12, (0.001, 0.2)), [OK, OK]),
+        (DiskTrial("/d", 10**9, (0.001, 0.8)), [WARN, WARN]),
+        (DiskTrial("/d", 10**6, (0.001, 2.6)), [BAD, BAD]),
+        (DiskTrial("/d", 10**12, (), "Read-only file system"), [OK, BAD]),
+        (None, [BAD]),
     ],
 )
 def test_room_and_write_time_are_judged_apart(
@@ -624,268 +660,45 @@ def test_a_command_that_is_not_there_or_hangs_gives_no_answer(
     assert answer.status == 0
 
 
-# --- Judgements of routes, cards, ports and buses: files instead of /proc and /sys
+class TestRoute:
+    def first(self, tree: Tree, files: dict[str, str], address: str | None = C4G) -> Check:
+        return link.network_checks("c4g", 1000, address, tree.write(files).system())[0]
 
-ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
-eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0
-eth1\t000C020A\t00000000\t0001\t0\t0\t100\t00FFFFFF\t0\t0\t0
-eth2\t000C020A\t00000000\t0001\t0\t0\t200\t00FFFFFF\t0\t0\t0
-"""
-ARP = "IP address       HW type     Flags       HW address            Mask     Device\n"
-C4G = "10.2.12.150"
+    def test_the_longest_prefix_then_the_lowest_metric(self, tree: Tree) -> None:
+        system = tree.write({"/proc/net/route": ROUTES}).system()
+        assert link.route_to(C4G, system) == link.Route("eth1", None)
+        assert link.route_to("10.2.13.1", system) == link.Route("eth0", "192.0.2.1", True)
+        assert link.route_to("127.0.0.1", system) == link.Route("lo", None)
 
+    def test_a_gateway_or_none_at_all_is_bad(self, tree: Tree) -> None:
+        check = self.first(tree, GATEWAY)
+        assert check.status is BAD
+        assert "192.0.2.1" in check.found and "10.2.12.149/24" in check.remedy[0]
+        assert self.first(tree, {"/proc/net/route": ""}).found == f"none to {C4G}"
+        assert self.first(tree, {}, None).status is BAD
 
-def card(**files: str) -> dict[str, str]:
-    given = {"operstate": "up", "carrier": "1", "speed": "1000", "duplex": "full"} | files
-    return {f"/sys/class/net/eth1/{name}": text for name, text in given.items()}
+    def test_an_own_address_is_loopback_and_needs_no_card(self, tree: Tree) -> None:
+        trie = "Local:\n  +-- 10.2.12.0/24\n     |-- 10.2.12.150\n        /32 host LOCAL\n"
+        tree.write({"/proc/net/fib_trie": trie, "/proc/net/route": ROUTES})
+        checks = link.network_checks(C4G, 1000, C4G, tree.system())
+        assert {check.status for check in checks} == {OK}
 
-
-def by_name(checks: list[Check]) -> dict[str, Check]:
-    return {check.name: check for check in checks}
-
-
-def test_the_longest_prefix_and_then_the_lowest_metric_carries_the_route(tree: Tree) -> None:
-    system = tree.write({"/proc/net/route": ROUTES}).system()
-    assert route.route_to(C4G, system) == route.Route("eth1", None)
-    assert route.route_to("10.2.13.1", system) == route.Route("eth0", "192.0.2.1", True)
-    assert route.route_to("127.0.0.1", system) == route.Route("lo", None)
-
-
-def test_a_controller_behind_a_gateway_is_bad_and_none_at_all_too(tree: Tree) -> None:
-    tree.write({"/proc/net/route": ROUTES.replace("eth1", "eth9").replace("000C020A", "00636363")})
-    checks = by_name(network_checks(C4G, 1000, C4G, tree.system()))
-    assert checks["route to the controller"].status is Status.BAD
-    assert "192.0.2.1" in checks["route to the controller"].found
-    assert "10.2.12.149/24" in checks["route to the controller"].remedy[0]
-    tree.write({"/proc/net/route": ""})
-    checks = by_name(network_checks(C4G, 1000, C4G, tree.system()))
-    assert checks["route to the controller"].found == f"none to {C4G}"
+    def test_a_name_is_looked_up_in_the_hosts_file_and_nowhere_else(self, tree: Tree) -> None:
+        tree.write({"/etc/hosts": "127.0.0.1 localhost\n10.2.12.150 c4g robot # ours\n"})
+        assert link.address_of("robot", tree.system()) == C4G
+        assert link.address_of("ours", tree.system()) is None
 
 
-def test_an_own_address_is_loopback_and_needs_no_card(tree: Tree) -> None:
-    trie = "Local:\n  +-- 10.2.12.0/24\n     |-- 10.2.12.150\n        /32 host LOCAL\n"
-    tree.write({"/proc/net/fib_trie": trie, "/proc/net/route": ROUTES})
-    checks = network_checks(C4G, 1000, C4G, tree.system())
-    assert {check.status for check in checks} == {Status.OK}
+class TestPort:
+    def test_its_owner_is_named(self, tree: Tree) -> None:
+        tree.write({"/proc/net/udp": UDP_USERS, "/proc/42/comm": "orchestra\n"})
+        folder = tree.root / "proc/42/fd"
+        folder.mkdir()
+        (folder / "3").symlink_to("/dev/null")
+        (folder / "4").symlink_to("socket:[4711]")
+        found = link.port_check("", 1000, errno.EADDRINUSE, tree.system()).found
+        assert "orchestra (process 42)" in found
 
-
-def test_a_name_is_looked_up_in_the_hosts_file_and_nowhere_else(tree: Tree) -> None:
-    tree.write({"/etc/hosts": "127.0.0.1 localhost\n10.2.12.150 c4g robot # ours\n"})
-    assert route.address_of("robot", tree.system()) == C4G
-    assert route.address_of("ours", tree.system()) is None
-    check = network_checks("elsewhere.invalid", 1000, None, tree.system())[0]
-    assert check.status is Status.BAD
-
-
-@pytest.mark.parametrize(
-    ("files", "status", "word"),
-    [
-        ({}, Status.OK, "1000 Mbit/s"),
-        ({"operstate": "down", "carrier": "0"}, Status.BAD, "no carrier"),
-        ({"duplex": "half"}, Status.BAD, "half"),
-        ({"speed": "10"}, Status.BAD, "10 Mbit/s"),
-        ({"speed": "-1", "duplex": "unknown"}, Status.OK, "speed not stated"),
-        ({"speed": "gibberish"}, Status.OK, "speed not stated"),
-        ({"wireless/x": ""}, Status.BAD, "wireless"),
-    ],
-)
-def test_the_card_has_to_be_up_wired_and_fast(
-    tree: Tree, files: dict[str, str], status: Status, word: str
-) -> None:
-    check = device_check("eth1", tree.write(card(**files)).system())
-    assert check.status is status
-    assert word in check.found
-
-
-def test_a_card_shared_with_the_default_route_is_warned_of(tree: Tree) -> None:
-    tree.write(card() | {"/proc/net/route": ROUTES.replace("eth0", "eth1")})
-    assert device_check("eth1", tree.system()).status is Status.WARN
-
-
-def test_a_card_that_is_not_there_is_bad(tree: Tree) -> None:
-    assert device_check("eth7", tree.system()).status is Status.BAD
-
-
-@pytest.mark.parametrize(
-    ("line", "status", "word"),
-    [
-        ("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth1", Status.OK, "permanent"),
-        ("10.2.12.150 0x1 0x2 00:04:50:00:00:01 * eth1", Status.WARN, "will expire"),
-        ("10.2.12.150 0x1 0x0 00:00:00:00:00:00 * eth1", Status.WARN, "none"),
-        ("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth2", Status.WARN, "none"),
-        ("10.2.12.150 0x1 what? 00:04:50:00:00:01 * eth1", Status.WARN, "none"),
-        ("", Status.WARN, "none"),
-    ],
-)
-def test_a_permanent_arp_entry_is_wanted(tree: Tree, line: str, status: Status, word: str) -> None:
-    tree.write(card() | {"/proc/net/route": ROUTES, "/proc/net/arp": ARP + line + "\n"})
-    check = by_name(network_checks(C4G, 1000, C4G, tree.system()))["ARP entry of the controller"]
-    assert check.status is status
-    assert word in check.found
-    if status is Status.WARN:
-        assert check.remedy[0].startswith("sudo ip neigh replace 10.2.12.150 lladdr ")
-
-
-@pytest.mark.parametrize(
-    ("answer", "status"),
-    [
-        (Answer(0, "Adaptive RX: off  TX: off\nrx-usecs: 0\n"), Status.OK),
-        (Answer(0, "Adaptive RX: on  TX: on\nrx-usecs: 3\n"), Status.WARN),
-        (Answer(0, "rx-usecs: 200\n"), Status.WARN),
-        (Answer(1, "", "netlink error: Operation not supported"), Status.OK),
-        (Answer(1, "", "netlink error: Operation not permitted"), Status.UNKNOWN),
-        (Answer(0, "\x00nonsense"), Status.OK),
-    ],
-)
-def test_a_card_that_gathers_packets_is_warned_of(
-    tree: Tree, answer: Answer, status: Status
-) -> None:
-    check = coalescing("eth1", tree.system(ethtool=answer))
-    assert check is not None
-    assert check.status is status
-
-
-def test_without_ethtool_coalescing_is_unknown_and_the_command_is_given(tree: Tree) -> None:
-    check = coalescing("eth1", tree.system())
-    assert check is not None
-    assert check.status is Status.UNKNOWN
-    assert "ethtool -c eth1" in check.remedy
-
-
-NFT_DROP = "table inet filter { chain input { type filter hook input priority 0; policy drop; } }"
-NFT_OPEN = "table inet filter { chain input { type filter hook input priority 0; policy accept; } }"
-UFW = "-P INPUT ACCEPT\n-A INPUT -j ufw-input\n-A ufw-input -p udp -j DROP\n"
-NFT_NESTED = """table inet filter { chain input { type filter hook input priority 0; policy accept;
-    ct state vmap { established : accept }
-    udp dport 1000 drop } }"""
-
-
-@pytest.mark.parametrize(
-    ("commands", "status"),
-    [
-        ({"nft": Answer(0, "")}, Status.OK),
-        ({"nft": Answer(0, NFT_OPEN)}, Status.OK),
-        ({"nft": Answer(0, NFT_DROP)}, Status.WARN),
-        ({"iptables": Answer(0, "-P INPUT ACCEPT\n")}, Status.OK),
-        ({"iptables": Answer(0, "-P INPUT DROP\n")}, Status.WARN),
-        ({"iptables": Answer(0, UFW)}, Status.WARN),
-        ({"iptables": Answer(0, UFW.replace("DROP", "ACCEPT"))}, Status.OK),
-        ({"nft": Answer(0, NFT_NESTED)}, Status.WARN),
-        ({"nft": Answer(1, "", "Operation not permitted (you must be root)")}, Status.UNKNOWN),
-        ({"nft": Answer(0, ""), "iptables": Answer(4, "", "Permission denied")}, Status.UNKNOWN),
-    ],
-)
-def test_a_firewall_is_judged_only_as_far_as_it_can_be_read(
-    tree: Tree, commands: dict[str, Answer], status: Status
-) -> None:
-    assert firewall(C4G, 1000, tree.system(**commands)).status is status
-
-
-def test_without_tools_a_loaded_filter_is_unknown_and_none_is_fine(tree: Tree) -> None:
-    assert firewall(C4G, 1000, tree.system()).status is Status.OK
-    tree.write({"/proc/net/netfilter/nf_log": ""})
-    assert firewall(C4G, 1000, tree.system()).status is Status.UNKNOWN
-
-
-@given(text=st.text())
-def test_nonsense_in_the_kernels_tables_is_no_route_and_no_neighbour(
-    tmp_path_factory: pytest.TempPathFactory, text: str
-) -> None:
-    tree = Tree(tmp_path_factory.mktemp("nonsense"))
-    head = "header\n"
-    tree.write({"/proc/net/route": head + text, "/proc/net/arp": head + text})
-    assert route.route_to(C4G, tree.system()) is None
-    assert route.neighbour(C4G, "eth1", tree.system()) is None
-
-
-@given(text=st.text())
-def test_nonsense_about_a_card_is_still_a_verdict(
-    tmp_path_factory: pytest.TempPathFactory, text: str
-) -> None:
-    tree = Tree(tmp_path_factory.mktemp("nonsense"))
-    tree.write(card(speed=text, duplex=text, operstate="up"))
-    assert device_check("eth1", tree.system()).found
-
-
-# --- port ------------------------------------------------------------------------------------
-def test_a_privileged_port_gets_the_setting_that_frees_it_for_good(tree: Tree) -> None:
-    tree.write({"/proc/sys/net/ipv4/ip_unprivileged_port_start": "1024\n"})
-    trial = port.SocketTrial(errno.EACCES)
-    check = port.port_check("0.0.0.0", 1000, trial, tree.system())
-    assert check.status is Status.BAD
-    assert "1024" in check.found
-    assert "net.ipv4.ip_unprivileged_port_start=1000" in check.remedy[0]
-
-
-def test_the_owner_of_a_port_is_named(tree: Tree) -> None:
-    line = " 12: 00000000:03E8 00000000:0000 07 00000000:00000000 00:00000000 0 1000 0 4711 2 0 0\n"
-    tree.write({"/proc/net/udp": "header\n" + line + "garbage\n", "/proc/42/comm": "orchestra\n"})
-    folder = tree.root / "proc/42/fd"
-    folder.mkdir()
-    (folder / "3").symlink_to("/dev/null")
-    (folder / "4").symlink_to("socket:[4711]")
-    trial = port.SocketTrial(errno.EADDRINUSE)
-    assert "orchestra (process 42)" in port.port_check("", 1000, trial, tree.system()).found
-    assert "another user" in port.port_check("", 1001, trial, tree.system()).found
-
-
-def test_a_port_in_use_here_is_found_in_use() -> None:
-    assert port.try_port("127.0.0.1", 0).error == 0
-    assert port.try_port("192.0.2.77", 0).error == errno.EADDRNOTAVAIL
-
-
-def test_every_way_a_bind_can_fail_is_bad(tree: Tree) -> None:
-    for number in (errno.EADDRNOTAVAIL, errno.EACCES, errno.EADDRINUSE, errno.ENOBUFS, -1):
-        check = port.port_check("10.2.12.149", 1000, port.SocketTrial(number), tree.system())
-        assert check.status is Status.BAD
-
-
-def test_only_busy_polling_may_be_refused_without_a_warning() -> None:
-    assert port.options_check(port.SocketTrial(0, ("SO_BUSY_POLL",), 212992)).status is Status.OK
-    assert port.options_check(port.SocketTrial(0, ("SO_PRIORITY",), 1)).status is Status.WARN
-
-
-# --- CAN -------------------------------------------------------------------------------------
-FD = CanLink("socketcan", "can0", True, 1_000_000, 5_000_000)
-BUS = {"/sys/class/net/can0/type": "280", "/sys/class/net/can0/operstate": "up"}
-
-
-def ip_says(text: str) -> Answer:
-    return Answer(0, text)
-
-
-def rates(nominal: int, data: int | None) -> Answer:
-    fast = f', "data_bittiming": {{"bitrate": {data}}}' if data else ""
-    info = f'{{"bittiming": {{"bitrate": {nominal}}}{fast}}}'
-    return ip_says(f'[{{"linkinfo": {{"info_kind": "can", "info_data": {info}}}}}]')
-
-
-@pytest.mark.parametrize(
-    ("answer", "status"),
-    [
-        (rates(1_000_000, 5_000_000), Status.OK),
-        (rates(500_000, 5_000_000), Status.BAD),
-        (rates(1_000_000, 2_000_000), Status.BAD),
-        (rates(1_000_000, None), Status.BAD),
-        (ip_says("[]"), Status.UNKNOWN),
-        (ip_says("not json"), Status.UNKNOWN),
-        (ip_says('[{"linkinfo": {"info_kind": "vcan"}}]'), Status.OK),
-    ],
-)
-def test_the_bit_rates_have_to_be_the_cells(tree: Tree, answer: Answer, status: Status) -> None:
-    assert can_check(FD, tree.write(BUS).system(ip=answer)).status is status
-
-
-def test_a_bus_that_is_down_gets_the_command_that_brings_it_up(tree: Tree) -> None:
-    tree.write(BUS | {"/sys/class/net/can0/operstate": "down"})
-    check = can_check(FD, tree.system())
-    assert check.status is Status.BAD
-    assert "bitrate 1000000 dbitrate 5000000 fd on" in check.remedy[0]
-
-
-def test_a_missing_or_foreign_interface_is_bad_and_an_adapter_is_not_touched(tree: Tree) -> None:
-    assert can_check(FD, tree.system()).status is Status.BAD
-    tree.write(BUS | {"/sys/class/net/can0/type": "1"})
-    assert can_check(FD, tree.system()).status is Status.BAD
-    serial = CanLink("slcan", "/dev/ttyACM0", False)
-    assert can_check(serial, tree.system()).status is Status.UNKNOWN
+    def test_it_is_tried(self) -> None:
+        assert link.try_port("127.0.0.1", 0) == 0
+        assert link.try_port("192.0.2.77", 0) == errno.EADDRNOTAVAIL
