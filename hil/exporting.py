@@ -94,25 +94,37 @@ class Exported:
 
     def to_dict(self) -> dict[str, object]:
         """The same for JSON."""
-        compared, spread = self.comparison, self.spread
+        why = self.comparison if isinstance(self.comparison, str) else None
+        compared = None if isinstance(self.comparison, str) else self.comparison
         return {
             "path": str(self.path),
             "joints": [*self.joint_names],
-            "read_back": None if isinstance(compared, str) else compared.difference,
-            "not_read_back": compared if isinstance(compared, str) else None,
-            "left_out": {}
-            if isinstance(compared, str)
-            else {words: torque.tolist() for words, torque in compared.left_out.items()},
-            "torque": None if isinstance(compared, str) else compared.torque.tolist(),
-            "spread": None
-            if spread is None
-            else {name: one.tolist() for name, one in spread._asdict().items()},
+            "read_back": compared and compared.difference,
+            "not_read_back": why,
+            "left_out": {k: v.tolist() for k, v in compared.left_out.items()} if compared else {},
+            "torque": compared and compared.torque.tolist(),
+            "spread": self.spread and {k: v.tolist() for k, v in self.spread._asdict().items()},
             "verdict": self.verdict,
         }
 
     def _row(self, torque: Array) -> str:
         figures = ", ".join(f"{one:.3g}" for one in torque)
         return f"{figures} {' or '.join(sorted(set(self.units)))}"
+
+
+def consistent_of(found: Identification) -> ConsistentEstimate:
+    """The physically consistent parameters of an identification.
+
+    Raises:
+        InputError: there are none.
+    """
+    if isinstance(found.consistency, str):
+        raise InputError(
+            found.paths[0],
+            f"there are no physically consistent parameters: {found.consistency}",
+            remedy="see the verdict of `hil identify`",
+        )
+    return found.consistency.consistent
 
 
 def arm_of(cell: Cell, consistent: ConsistentEstimate) -> Arm:
@@ -151,15 +163,7 @@ def export_model(
         InputError: there are no physically consistent parameters to write.
         IdentificationError: the arm cannot be written, or reads back as another.
     """
-    consistency = found.consistency
-    if isinstance(consistency, str):
-        raise InputError(
-            found.paths[0],
-            f"there are no physically consistent parameters: {consistency}",
-            remedy="see the verdict of `hil identify`",
-        )
-    consistent, form = consistency.consistent, FORMATS[to]
-    arm, motion = arm_of(found.cell, consistent), _motion(found)
+    form, arm, motion = FORMATS[to], arm_of(found.cell, consistent_of(found)), _motion(found)
     remarks = _remarks(found)
     make_folder(output.parent)
     text = form.write(arm, found.cell.name, remarks)
@@ -224,16 +228,10 @@ def _motion(found: Identification) -> Motion:
     parts = [samples.motion for samples in found.unseen]
     share = _MOST_ROWS // len(parts)
     some = [motion.rows(_some(motion.n_samples, share)) for motion in parts]
-    direction = None
-    if all(one.direction is not None for one in some):
-        direction = np.concatenate([one.direction for one in some if one.direction is not None])
-    return Motion(
-        np.concatenate([one.time for one in some]),
-        np.concatenate([one.position for one in some]),
-        np.concatenate([one.velocity for one in some]),
-        np.concatenate([one.acceleration for one in some]),
-        direction,
-    )
+    columns = [np.concatenate(column) for column in zip(*(one[:4] for one in some), strict=True)]
+    directions = [one.direction for one in some if one.direction is not None]
+    direction = np.concatenate(directions) if len(directions) == len(some) else None
+    return Motion(*columns)._replace(direction=direction)
 
 
 def _some(count: int, most: int) -> NDArray[np.intp]:
@@ -243,9 +241,10 @@ def _some(count: int, most: int) -> NDArray[np.intp]:
 def _remarks(found: Identification) -> tuple[str, ...]:
     """Where the model comes from, a line each."""
     origin = provenance_of(found.results, found.paths)
-    lines = ["Identified by hil; bodies are physically consistent parameters."]
-    if found.estimate.pooled.undetermined:
-        unknown = ", ".join(found.estimate.pooled.undetermined)
-        lines.append(f"Not determined by the data: {unknown}.")
-    lines += [f"{key}: {value}" for key, value in origin.items()]
+    unknown = ", ".join(found.estimate.pooled.undetermined)
+    lines = [
+        "Identified by hil; bodies are physically consistent parameters.",
+        *([f"Not determined by the data: {unknown}."] if unknown else []),
+        *(f"{key}: {value}" for key, value in origin.items()),
+    ]
     return tuple(" ".join(line.split()) for line in lines)

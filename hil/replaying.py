@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.errors import InputError
+from hil.exporting import consistent_of
 from hil.identify import Identification
 from hil.identify.run import FIGURE_SAMPLES
 from hil.identify.surroundings import nominal_of
@@ -53,23 +53,25 @@ class Replayed:
     tested_on: str
     verdict: str
 
+    @property
+    def figures(self) -> dict[str, tuple[Array, Array]]:
+        """Root mean square and largest error (n,) by model, and of the ensemble's spread."""
+        rows = dict(self.errors)
+        if self.spread is not None:
+            rows["spread of the ensemble"] = self.spread
+        return {name: _figures(error) for name, error in rows.items()}
+
     def lines(self) -> list[str]:
         """Root mean square and largest error of each joint, model by model."""
         lines = [f"simulated on {self.tested_on}, with a feedback of {FEEDBACK:g} Hz:"]
-        for name, error in self._rows:
-            figures = (
+        for name, figures in self.figures.items():
+            joints = zip(self.joint_names, *figures, self.units, strict=True)
+            words = (
                 f"{joint} {rms:.2g} (at most {most:.2g}) {unit}"
-                for joint, rms, most, unit in zip(
-                    self.joint_names, *_figures(error), self.units, strict=True
-                )
+                for joint, rms, most, unit in joints
             )
-            lines.append(f"{name}: {', '.join(figures)}")
+            lines.append(f"{name}: {', '.join(words)}")
         return [*lines, *self.reasons, self.verdict]
-
-    @property
-    def _rows(self) -> list[tuple[str, Array]]:
-        rows = [*self.errors.items()]
-        return rows if self.spread is None else [*rows, ("spread of the ensemble", self.spread)]
 
     def to_dict(self) -> dict[str, object]:
         """The same for JSON."""
@@ -77,8 +79,8 @@ class Replayed:
             "joints": [*self.joint_names],
             "units": [*self.units],
             "models": {
-                name: dict(zip(("rms", "most"), (x.tolist() for x in _figures(e)), strict=True))
-                for name, e in self._rows
+                name: {"rms": rms.tolist(), "most": most.tolist()}
+                for name, (rms, most) in self.figures.items()
             },
             "reasons": [*self.reasons],
             "verdict": self.verdict,
@@ -101,21 +103,22 @@ class Replayed:
                     axes.plot(self.time, error[:, joint], label=name, linewidth=0.8)
                 axes.set_ylabel(f"{self.joint_names[joint]} [{self.units[joint]}]")
                 bare(axes)
-            rows[0].legend(loc="upper right", ncols=len(self._rows))
+            rows[0].legend(loc="upper right", ncols=3)
             rows[0].set_title("Position error under the recorded torques")
             rows[-1].set_xlabel("time [s]")
         return figure
 
     def beside(self, series: ReportSeries) -> ReportSeries:
         """The series of a report with those of the replay."""
-        some = slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES))
-        nothing = np.empty((0, 0))
-        nominal = self.errors.get("nominal")
+        some, nothing = (
+            slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES)),
+            np.empty((0, 0)),
+        )
         return replace(
             series,
             replay_time=self.time[some],
             replay_error=self.errors["identified"][some],
-            replay_nominal=nothing if nominal is None else nominal[some],
+            replay_nominal=self.errors.get("nominal", nothing)[some],
             replay_spread=nothing if self.spread is None else self.spread[some],
             replay_words="\n".join(self.reasons),
         )
@@ -137,89 +140,72 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
     Raises:
         InputError: there are no physically consistent parameters to simulate.
     """
-    consistency, model = found.consistency, found.cell.model
-    if isinstance(consistency, str):
-        raise InputError(
-            found.paths[0],
-            f"there are no physically consistent parameters: {consistency}",
-            remedy="see the verdict of `hil identify`",
-        )
-    consistent = consistency.consistent
-    identified = Simulated(model, consistent.standard, consistent.estimate.values)
-    arms = {"identified": identified}
-    if (nominal := _nominal(found)) is not None:
-        arms["nominal"] = nominal
-    variants: list[Simulated] = []
+    consistent, model = consistent_of(found), found.cell.model
+    names = ["identified"]
+    standard, values = [consistent.standard], [consistent.estimate.values]
+    if (nominal := nominal_of(found.cell)) is not None:  # None where no link has a stated mass
+        names.append("nominal")
+        standard.append(_nominal_bodies(found))
+        values.append(nominal.values)
     if ensemble > 1:
-        sampled = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
-        pairs = zip(sampled.standard, sampled.values, strict=True)
-        variants = [Simulated(model, standard, values) for standard, values in pairs]
-    errors: dict[str, list[Array]] = {name: [] for name in arms}
-    spread: list[Array] = []
+        variants = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
+        standard.extend(variants.standard)
+        values.extend(variants.values)
+    arms = Simulated(model, np.array(standard), np.array(values))
+    parts: list[Array] = []
     time: list[Array] = []
-    rounds = len(arms) + bool(variants)
-    with reporter.task("simulating", rounds * len(found.unseen)) as task:
+    with reporter.task("simulating (motions)", len(found.unseen)) as task:
         for samples in found.unseen:
             last = float(time[-1][-1]) if time else 0.0
             time.append(last + samples.motion.time - samples.motion.time[0])
-            for name, arm in arms.items():
-                errors[name].append(replay(arm, samples, identified))
-                task.advance(1, name)
-            if variants:
-                every = [replay(variant, samples, identified) for variant in variants]
-                spread.append(np.std(every, axis=0, ddof=1))
-                task.advance(1, "ensemble")
+            parts.append(replay(arms, samples))
+            task.advance(1)
     scale = np.where(model.chain.revolute, 180.0 / np.pi, 1e3)
-    strays = {name: scale * np.concatenate(every) for name, every in errors.items()}
-    width = scale * np.concatenate(spread) if spread else None
+    errors = scale * np.concatenate(parts, axis=1)
+    spread = np.std(errors[len(names) :], axis=0, ddof=1) if ensemble > 1 else None
     return Replayed(
         joint_names=model.joint_names,
         units=tuple("°" if turns else "mm" for turns in model.chain.revolute),
         time=np.concatenate(time),
-        errors=strays,
-        spread=width,
-        reasons=_reasons(found, identified, strays["identified"], width),
+        errors=dict(zip(names, errors, strict=False)),
+        spread=spread,
+        reasons=() if spread is None else _reasons(found, arms, errors[0], spread),
         tested_on=found.tested_on,
         verdict=found.verdict.line,
     )
 
 
 def _reasons(
-    found: Identification, arm: Simulated, error: Array, spread: Array | None
+    found: Identification, arms: Simulated, error: Array, spread: Array
 ) -> tuple[str, ...]:
     """Why joints drift by more than the parameters are uncertain."""
-    if spread is None:
-        return ()
     strays, uncertain = _figures(error)[0], _figures(spread)[0]
-    left = slow_residual(arm, found.unseen)
+    left = slow_residual(arms, found.unseen)
     sentences = []
     for joint in np.flatnonzero(strays > DRIFT * uncertain):
-        unit = "N·m" if arm.model.chain.revolute[joint] else "N"
         constant, friction = left.constant[joint], left.friction[joint]
-        rest = 1.0 - constant - friction
         share, cause = max(
             (constant, "constant: an offset of the torque, a payload, or gravity"),
             (friction, "in the direction of motion: friction that differs from the fitted one"),
             (
-                rest,
+                1.0 - constant - friction,
                 "neither constant nor in the direction of motion: it depends on posture or time",
             ),
         )
         times = strays[joint] / uncertain[joint]
         sentences.append(
-            f"{found.cell.joint_names[joint]} drifts {times:.1f} times as far as its parameters are"
-            f" uncertain: averaged over {1.0 / FEEDBACK:g} s the model leaves out"
-            f" {left.rms[joint]:.2g} {unit}, {share:.0%} of its square {cause}"
+            f"{found.cell.joint_names[joint]} drifts {times:.1f} times as far as its"
+            f" parameters are uncertain: averaged over {1.0 / FEEDBACK:g} s the model leaves out"
+            f" {left.rms[joint]:.2g} {'N·m' if arms.model.chain.revolute[joint] else 'N'},"
+            f" {share:.0%} of its square {cause}"
         )
     return tuple(sentences)
 
 
-def _nominal(found: Identification) -> Simulated | None:
-    """The arm as its papers have it; None where they do not say what it weighs."""
-    cell, nominal = found.cell, nominal_of(found.cell)
-    if nominal is None:
-        return None
-    standard, table = cell.model.nominal, cell.file.nominal
-    if table is not None and cell.model.rotor_inertia:
-        standard[cell.model.layout.rotors] = table.rotor_inertia
-    return Simulated(cell.model, standard, nominal.values)
+def _nominal_bodies(found: Identification) -> Array:
+    """Standard parameters (s,) that URDF and cell file state."""
+    model, table = found.cell.model, found.cell.file.nominal
+    standard = model.nominal
+    if table is not None and model.rotor_inertia:
+        standard[model.layout.rotors] = table.rotor_inertia
+    return standard

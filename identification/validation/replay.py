@@ -5,6 +5,7 @@ r"""Recorded torques through a model forwards in time: how far the arm would hav
 with the rotors' inertia R and a feedback :math:`\tau_f` on the recorded motion, a spring and damper
 of `FEEDBACK` on each joint: without one any two models part, the farther the longer the motion. In
 steps of at most `STEP`. Dry friction is an impulse that at most stops its joint, and so can hold.
+All arms are simulated at once: to pinocchio they are branches of one robot.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from identification.model.friction import FrictionTerm
 from identification.model.pseudo_inertia import body
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -33,12 +35,12 @@ _FOUND: Final = 1e-9
 
 
 class Simulated(NamedTuple):
-    """A model with its parameters.
+    """A model with parameters of V arms.
 
     Attributes:
         model: the robot.
-        standard: standard parameters (s,); every link with a mass, or held by rotors.
-        values: parameters (p,), of which friction, springs and balancers are read.
+        standard: standard parameters (V, s); every link with a mass, or held by rotors.
+        values: parameters (V, p), of which friction, springs and balancers are read.
     """
 
     model: RobotModel
@@ -46,44 +48,44 @@ class Simulated(NamedTuple):
     values: Array
 
 
-def replay(arm: Simulated, samples: Samples, gains_of: Simulated | None = None) -> Array:
-    """Return simulated less recorded positions (m, n) [rad or m]; NaN between stretches.
+def replay(arms: Simulated, samples: Samples) -> Array:
+    """Return simulated less recorded positions (V, m, n) [rad or m]; NaN between stretches.
 
     Args:
-        arm: what is simulated, from the first recorded state of each stretch on.
+        arms: what is simulated, from the first recorded state of each stretch on. The feedback is
+            that of the first one's inertia for all.
         samples: recorded motion and torque, without that of a payload and known elements.
-        gains_of: the arm whose inertia the feedback belongs to; by default the same.
 
     Raises:
         numpy.linalg.LinAlgError: a joint moves nothing that has inertia.
     """
-    dynamics = _Dynamics(arm)
-    ruler = dynamics if gains_of is None else _Dynamics(gains_of)
-    error = np.full(samples.motion.position.shape, np.nan)
+    dynamics = _Dynamics(arms)
+    found = np.full((len(arms.standard), *samples.motion.position.shape), np.nan)
     rate = 2.0 * math.pi * FEEDBACK
     for stretch in samples.segments:
         motion, torque = samples.motion.rows(stretch), samples.torque[stretch]
         if not motion.n_samples:
             continue
-        inertia = np.diag(ruler.inertia(motion.position[0]))
-        q, v = motion.position[0].copy(), motion.velocity[0].copy()
-        found = error[stretch]
-        for k in range(motion.n_samples):
-            found[k] = q - motion.position[k]
-            if k + 1 == motion.n_samples:
-                break
-            duration = float(motion.time[k + 1] - motion.time[k])
-            steps = max(1, math.ceil(duration / STEP - 1e-6))
-            for step in range(steps):
-                share = (step + 0.5) / steps
-                aim, speed, given = (
-                    (1.0 - share) * one[k] + share * one[k + 1]
-                    for one in (motion.position, motion.velocity, torque)
-                )
-                given = given + inertia * (rate**2 * (aim - q) + 2.0 * rate * (speed - v))
-                q, v = dynamics.advanced(q, v, given, duration / steps)
-        error[stretch] = found
-    return error
+        q, v = (np.tile(one[0], (len(found), 1)) for one in (motion.position, motion.velocity))
+        inertia = np.diag(dynamics.inertia(q)[0])
+        path = found[:, stretch]
+        path[:, 0] = q
+        duration = np.diff(motion.time)
+        steps = np.maximum(1, np.ceil(duration / STEP - 1e-6)).astype(np.intp)
+        sample = np.repeat(np.arange(len(steps)), steps)
+        step = np.arange(len(sample)) - (np.cumsum(steps) - steps)[sample]
+        share = ((step + 0.5) / steps[sample])[:, None]
+        between = (
+            (1.0 - share) * one[sample] + share * one[sample + 1]
+            for one in (motion.position, motion.velocity, torque)
+        )
+        for k, period, aim, speed, given in zip(
+            sample + 1, (duration / steps)[sample].tolist(), *between, strict=True
+        ):
+            pull = inertia * (rate**2 * (aim - q) + 2.0 * rate * (speed - v))
+            q, v = dynamics.advanced(q, v, given + pull, period)
+            path[:, k] = q
+    return found - samples.motion.position
 
 
 class SlowResidual(NamedTuple):
@@ -104,12 +106,12 @@ def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual
     """Return what makes a replay drift: faster residuals average out.
 
     Args:
-        arm: the model.
+        arm: the model; the first arm counts.
         recordings: motion and torque.
     """
     slow, turns = [], []
     for samples in recordings:
-        residual = samples.torque - samples.predicted_torque(arm.model, arm.values)
+        residual = samples.torque - samples.predicted_torque(arm.model, arm.values[0])
         turning = np.sign(samples.motion.velocity) * arm.model.moving(samples.motion.velocity)
         for stretch in samples.segments:
             period = (samples.motion.time[stretch] * FEEDBACK).astype(np.intp)
@@ -135,96 +137,123 @@ def _steps(period: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 class _Dynamics:
-    """Equations of motion of one arm."""
+    """Equations of motion of V arms of one model."""
 
-    def __init__(self, arm: Simulated) -> None:
-        chain, self._model = arm.model.chain, arm.model
-        self._arm = pin.Model()
-        self._arm.gravity.linear = arm.model.gravity
-        for joint, inertial in enumerate(arm.standard[arm.model.layout.links]):
-            kind = "Revolute" if chain.revolute[joint] else "Prismatic"
-            place = pin.SE3(chain.rotation[joint], chain.translation[joint])
-            own = self._arm.addJoint(
-                int(chain.parents[joint]) + 1,
-                getattr(pin, f"JointModel{kind}Unaligned")(chain.axis[joint]),
-                place,
-                chain.joint_names[joint],
-            )
-            if inertial[-1] > 0.0:
-                one = body(inertial)
-                mass = pin.Inertia(one.mass, one.centre, one.inertia)
-                self._arm.appendBodyToJoint(own, mass, pin.SE3.Identity())
-        self._data = self._arm.createData()
-        self._rotors = arm.model.layout.rotor_matrix(arm.standard)
-        friction, n = arm.model.friction, arm.model.n_joints
-        coefficients = friction.table(arm.values[arm.model.friction_part])
+    def __init__(self, arms: Simulated) -> None:
+        self._model, n = arms.model, arms.model.n_joints
+        self._arms = _branches(arms)
+        self._data = self._arms.createData()
+        self._rotors = np.array([arms.model.layout.rotor_matrix(one) for one in arms.standard])
+        friction = arms.model.friction
+        tables = [friction.table(one[arms.model.friction_part]) for one in arms.values]
         self._turns = np.vstack([np.eye(n), friction.motor_speeds()])  # of joints, then motors
+        owners: dict[FrictionTerm, list[int]] = {}
+        for owner, law in enumerate(friction.all_laws):
+            for term in law.terms:
+                owners.setdefault(term, []).append(owner)
         self._terms = [
-            (term, row.get(term.symbol, 0.0), owner)
-            for owner, (law, row) in enumerate(zip(friction.all_laws, coefficients, strict=True))
-            for term in law.terms
+            (term, own, np.array([[one[k].get(term.symbol, 0.0) for k in own] for one in tables]))
+            for term, own in owners.items()
         ]
-        self._elements = arm.values[arm.model.element_part]
+        self._elements = arms.values[:, arms.model.element_part]
 
     def inertia(self, q: Array) -> Array:
-        """Return the inertia matrix (n, n) at positions (n,)."""
-        upper = np.triu(pin.crba(self._arm, self._data, q))
-        return np.asarray(upper + np.triu(upper, 1).T + self._rotors)
+        """Return the inertia matrices (V, n, n) at positions (V, n)."""
+        shape = (*q.shape, *q.shape)
+        upper = np.triu(
+            np.einsum("anam->anm", pin.crba(self._arms, self._data, q.ravel()).reshape(shape))
+        )
+        return np.asarray(upper + np.triu(upper, 1).swapaxes(1, 2) + self._rotors)
 
     def advanced(self, q: Array, v: Array, torque: Array, duration: float) -> tuple[Array, Array]:
-        """Return position and velocity (n,) after a duration [s] under a torque (n,)."""
+        """Return position and velocity (V, n) after a duration [s] under torques (V, n)."""
         smooth, slope, dry = self._friction(v)
-        rest = torque - smooth - pin.nonLinearEffects(self._arm, self._data, q, v)
-        if self._elements.size:
-            rest = rest - self._model.elements.torque(self._elements, q[None])[0]
-        response = np.asarray(np.linalg.inv(self.inertia(q) + duration * slope), dtype=np.float64)
-        moved = self._slowed(v, v + duration * (response @ rest), response, duration * dry)
+        bias = pin.nonLinearEffects(self._arms, self._data, q.ravel(), v.ravel())
+        rest = torque - smooth - bias.reshape(q.shape)
+        for one in self._model.elements.identified:
+            columns = one.columns(q)
+            rest[:, one.joint] -= np.einsum("ac,ac->a", columns, self._elements[:, one.part])
+        held = self.inertia(q) + duration * slope
+        response = np.asarray(np.linalg.inv(held), dtype=np.float64)
+        free = v + duration * np.einsum("anm,am->an", response, rest)
+        moved = self._slowed(v, free, response, duration * dry)
         return q + duration * moved, moved
 
     def _slowed(self, before: Array, free: Array, response: Array, most: Array) -> Array:
-        """Return the speeds (n,) that dry friction leaves of those without it.
+        """Return the speeds (V, n) that dry friction leaves of those without it.
 
         Args:
-            before: speeds before the step (n,).
-            free: speeds after it without dry friction (n,).
-            response: speeds per impulse (n, n).
-            most: largest impulse of dry friction of each joint and coupled motor (n + k,).
+            before: speeds before the step (V, n).
+            free: speeds after it without dry friction (V, n).
+            response: speeds per impulse (V, n, n).
+            most: largest impulse of dry friction of each joint and coupled motor (V, n + k).
         """
         turns = self._turns
-        directions = np.sign(turns @ before)
+        directions = np.sign(before @ turns.T)
         columns = response @ turns.T
         impulse = -most * directions
-        moved = free + columns @ impulse
-        if np.array_equal(np.sign(turns @ moved), directions):
+        moved = free + np.einsum("ank,ak->an", columns, impulse)
+        turned = np.any(np.sign(moved @ turns.T) != directions, axis=1)
+        if not turned.any():
             return np.asarray(moved)
         # Some change direction or rest: each as much as stops it, at most what it has.
-        own = np.einsum("kn,nk->k", turns, columns)
+        columns, impulse, most, speeds = (
+            columns[turned],
+            impulse[turned],
+            most[turned],
+            moved[turned],
+        )
+        own = np.einsum("kn,ank->ak", turns, columns)
         for _ in range(_ROUNDS):
             changed = False
-            for k in np.flatnonzero(most):
-                wanted = impulse[k] - (turns[k] @ moved) / own[k]
-                change = min(max(wanted, -most[k]), most[k]) - impulse[k]
-                if abs(change) > _FOUND * most[k]:
-                    impulse[k] += change
-                    moved = moved + columns[:, k] * change
+            for k in np.flatnonzero(most.any(axis=0)):
+                wanted = impulse[:, k] - (speeds @ turns[k]) / own[:, k]
+                change = np.clip(wanted, -most[:, k], most[:, k]) - impulse[:, k]
+                change[np.abs(change) <= _FOUND * most[:, k]] = 0.0
+                if change.any():
+                    impulse[:, k] += change
+                    speeds += columns[:, :, k] * change[:, None]
                     changed = True
             if not changed:
                 break
+        moved[turned] = speeds
         return np.asarray(moved)
 
     def _friction(self, v: Array) -> tuple[Array, Array, Array]:
         """Return what friction depends on speed alone, its slope, and what depends on direction.
 
-        Of all joints (n,), with their speeds (n, n), and of joints and then motors (n + k,).
+        Of all joints (V, n), with their speeds (V, n, n), and of joints and then motors (V, n + k).
         """
         turns, zero = self._turns, np.zeros(())
-        speeds = turns @ v
-        smooth, slope, dry = np.zeros((3, len(speeds)))
-        for term, coefficient, owner in self._terms:
-            speed = speeds[owner]
-            still = float(term.column(speed, zero))
-            smooth[owner] += coefficient * still
-            dry[owner] += coefficient * (float(term.column(speed, zero + 1.0)) - still)
-            slope[owner] += coefficient * float(term.slope(speed, zero))
-        resisting = (turns.T * np.maximum(slope, 0.0)) @ turns
-        return turns.T @ smooth, resisting, np.maximum(dry, 0.0)
+        speeds = v @ turns.T
+        smooth, slope, dry = np.zeros((3, *speeds.shape))
+        for term, owners, coefficients in self._terms:
+            speed = speeds[:, owners]
+            still = term.column(speed, zero)
+            smooth[:, owners] += coefficients * still
+            dry[:, owners] += coefficients * (term.column(speed, zero + 1.0) - still)
+            slope[:, owners] += coefficients * term.slope(speed, zero)
+        resisting = (turns.T * np.maximum(slope, 0.0)[:, None]) @ turns
+        return smooth @ turns, resisting, np.maximum(dry, 0.0)
+
+
+def _branches(arms: Simulated) -> pin.Model:
+    """Return all arms side by side on one base."""
+    chain, found = arms.model.chain, pin.Model()
+    found.gravity.linear = arms.model.gravity
+    for arm, standard in enumerate(arms.standard):
+        base = found.njoints - 1
+        for joint, inertial in enumerate(standard[arms.model.layout.links]):
+            kind = "Revolute" if chain.revolute[joint] else "Prismatic"
+            parent = int(chain.parents[joint])
+            own = found.addJoint(
+                0 if parent < 0 else base + parent + 1,
+                getattr(pin, f"JointModel{kind}Unaligned")(chain.axis[joint]),
+                pin.SE3(chain.rotation[joint], chain.translation[joint]),
+                f"{arm}/{chain.joint_names[joint]}",
+            )
+            if inertial[-1] > 0.0:
+                one = body(inertial)
+                mass = pin.Inertia(one.mass, one.centre, one.inertia)
+                found.appendBodyToJoint(own, mass, pin.SE3.Identity())
+    return found

@@ -29,7 +29,8 @@ def an_arm(**options: object) -> Simulated:
     standard[:66] = some_bodies(6)
     standard[model.layout.rotors] += 1.0
     others = np.random.default_rng(1).uniform(1.0, 3.0, model.n_parameters - model.base.rank)
-    return Simulated(model, standard, np.concatenate([model.base.grouping @ standard, others]))
+    values = np.concatenate([model.base.grouping @ standard, others])
+    return Simulated(model, standard[None], values[None])
 
 
 def samples_of(arm: Simulated, step: float = 2e-3) -> Samples:
@@ -44,7 +45,7 @@ def samples_of(arm: Simulated, step: float = 2e-3) -> Samples:
         size * rate * np.cos(angle),
         -size * rate**2 * np.sin(angle),
     )
-    return samples(motion, arm.model.torque(arm.values, *motion[1:]))
+    return samples(motion, arm.model.torque(arm.values[0], *motion[1:]))
 
 
 def samples(motion: Motion, torque: Array) -> Samples:
@@ -75,18 +76,27 @@ class TestReplay:
         error = replay(arm, samples_of(arm))
         assert np.abs(error).max() < 2e-3  # rad, of a motion of about 0.7
 
+    @pytest.mark.parametrize("name", OPTIONS)
+    def test_arms_side_by_side_move_as_each_by_itself(self, name: str) -> None:
+        arm = an_arm(**OPTIONS[name])
+        given = samples_of(arm)
+        short = samples(given.motion.rows(slice(0, 300)), given.torque[:300])
+        both = together(arm, changed_weight(arm, 1.2))
+        back = together(changed_weight(arm, 1.2), arm)
+        found, alone, heavy = (replay(one, short) for one in (both, arm, back))
+        np.testing.assert_allclose(found[0], alone[0], atol=1e-12)
+        assert not np.allclose(found[1], heavy[0], atol=1e-6)  # another inertia's feedback
+
     def test_an_arm_of_another_weight_goes_astray(self) -> None:
         arm = an_arm()
-        given = samples_of(arm)
-        heavy = changed_weight(arm, 1.2)
-        good, bad = replay(arm, given), replay(heavy, given, arm)
+        good, bad = replay(together(arm, changed_weight(arm, 1.2)), samples_of(arm))
         assert np.all(np.sqrt(np.mean(bad**2, axis=0)) > 3.0 * np.sqrt(np.mean(good**2, axis=0)))
 
     def test_dry_friction_holds_an_arm_at_rest(self) -> None:
         """Gravity alone would let every joint fall."""
         arm = an_arm(friction=FrictionLaw(viscous=False, third=None))
         values = arm.values.copy()
-        values[arm.model.friction_part] = 1e4
+        values[:, arm.model.friction_part] = 1e4
         time, still = np.arange(0.0, 0.2, 2e-3), np.full((100, 6), 0.5)
         motion = Motion(time, still, 0.0 * still, 0.0 * still)
         error = replay(arm._replace(values=values), samples(motion, 0.0 * still))
@@ -97,29 +107,34 @@ class TestReplay:
         given = samples_of(arm)
         parts = changed(given, segments=(slice(0, 600), slice(800, 1500)))
         error = replay(arm, parts)
-        assert np.isnan(error[600:800]).all()
-        assert not error[[0, 800]].any()
+        assert np.isnan(error[:, 600:800]).all()
+        assert not error[:, [0, 800]].any()
 
     def test_mujoco_makes_the_same_motion(self) -> None:
         """From the same description, with the same feedback, half as heavy as the truth."""
         pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
         truth = an_arm(coupling=Coupling(WRIST))
         given, arm = samples_of(truth, 1e-3), changed_weight(truth, 0.5)
-        found = given.motion.position + replay(arm, given)
+        found = given.motion.position + replay(arm, given)[0]
         np.testing.assert_allclose(found, by_mujoco(arm, given), atol=5e-3)
 
 
 def changed_weight(arm: Simulated, factor: float) -> Simulated:
     values = arm.values.copy()
-    values[: arm.model.base.rank] *= factor
+    values[:, : arm.model.base.rank] *= factor
     return arm._replace(standard=factor * arm.standard, values=values)
+
+
+def together(*arms: Simulated) -> Simulated:
+    standard, values = (np.concatenate([one[k] for one in arms]) for k in (1, 2))
+    return Simulated(arms[0].model, standard, values)
 
 
 def by_mujoco(arm: Simulated, given: Samples) -> Array:
     mujoco = load_mujoco()
     infinite = np.full(6, np.inf)
     ranges = Ranges(-infinite, infinite, infinite, infinite)
-    text = mjcf(Arm(urdf_text(), arm.model, arm.standard, arm.values, ranges), "arm")
+    text = mjcf(Arm(urdf_text(), arm.model, arm.standard[0], arm.values[0], ranges), "arm")
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.timestep = 1e-3
     data = mujoco.MjData(model)
