@@ -1,8 +1,7 @@
 """The paper's study: methods A and B designed, executed, identified and compared."""
 
-from .recorded import study_campaigns
 from .results import StudyResults
-from .run import run_study
+from .run import run_study, study_campaigns
 from .settings import FULL, QUICK, StudySettings, study_settings
 
 __all__ = [

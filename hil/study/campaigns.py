@@ -1,50 +1,182 @@
-"""The campaigns of a study: planned, and run in child processes against the simulated cell."""
+"""The searches of a study, and its campaigns, run in child processes on the simulated cell."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
+from hil.batch.types import Broken
+from hil.batch.workers import ArchiveTask, LocalWorkers, Part
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.quick_design import plan_around
 from hil.cell import Cell
-from hil.design import DesignSettings, problem_of
+from hil.design import DesignResult, DesignSettings, preset, problem_of
 from hil.design.advice import NoExcitationError
+from hil.design.folder import DesignFolder
+from hil.design.run import run_design
 from hil.errors import ControllerFault, HilError
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from hil.simulation import simulated_link, simulated_provenance
-from identification import IdentificationError
-from identification.excitation import (
-    Excitation,
-    sampled,
-)
-from planner import FourierSeries, PlanFile, PlannerError
-from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.worker import WorkerProcess, map_in_children
+from identification.excitation import RESCORE_PERIOD, Excitation, Objective, sampled
+from planner import FourierSeries, PlanFile, PlannerError, plan_in_child
 
-from .searches import (
-    AP,
-    B0,
-    SINES,
-    A,
-    B,
-    Found,
-    best_sines,
-    fly_key,
-    printed_sines,
-    via_key,
-    weight_key,
-    with_fly,
-)
-from .settings import StudyFolder, StudySettings
+from .settings import Effort, StudyFolder, StudySettings
+
+A, B, B0, AP = "a", "b", "b0", "a-printed"
+LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
+SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
+    "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
+    "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
+    "a-middle-fast": (
+        "about the middle of the ranges, frequencies up to the appendix's bound",
+        {"fastest": "from limits"},
+    ),
+    "a-home-fast": (
+        "about the home posture, frequencies up to the appendix's bound",
+        {"offset": "home", "fastest": "from limits"},
+    ),
+}
+"""Method A has a search for each choice that the paper leaves open, and uses the best."""
+PRINTED_SINES: Final = ("a-middle", "a-home")
+"""Those with the frequencies of the paper's Table 1, which are for six joints."""
+_PRINTED_JOINTS: Final = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """One search: the key names its folder, `words` say what is searched.
+
+    `excitation` is None before the search, and where no motion satisfied the constraints.
+    """
+
+    key: str
+    words: str
+    settings: DesignSettings
+    excitation: Excitation | None = None
+
+    @property
+    def found(self) -> Excitation:
+        """The motion.
+
+        Raises:
+            NoExcitationError: there is none.
+        """
+        if self.excitation is None:
+            raise NoExcitationError(
+                f"{self.words} found no motion that satisfies all constraints of the cell;"
+                " search longer (without --quick), or with another --seed"
+            )
+        return self.excitation
+
+    @property
+    def notes(self) -> str:
+        """What is searched and how long, as the notes of the paper's Table 1."""
+        search, via, sines = self.settings.search, self.settings.via_points, self.settings.sines
+        effort = f"{search.population} individuals, {search.generations} generations"
+        if via is not None:
+            one, two = search.weights
+            fly = f"{100.0 * via.fly:.0f} %"
+            return f"K = {via.n_via}, fly {fly}, λ1 = {one:g}, λ2 = {two:g}; {effort}"
+        harmonics = "" if sines is None else f"W = {sines.harmonics}, "
+        return f"{harmonics}{self.words.removeprefix('method A, ')}; {effort}"
+
+
+def searches(settings: StudySettings, n_joints: int) -> list[Search]:
+    """All searches of a study, those that everything rests on first."""
+
+    def asked(method: Literal["a", "b"], effort: Effort) -> DesignSettings:
+        sizes = {"population": effort.population, "generations": effort.generations, "polish": 0}
+        return preset(method).replaced(seed=settings.seed, search=sizes)
+
+    a, b = asked("a", settings.effort_a), asked("b", settings.effort_b)
+    found = [
+        Search(key, f"method A, sines {words}", a.replaced(sines=sines))
+        for key, (words, sines) in SINES.items()
+        if n_joints == _PRINTED_JOINTS or key not in PRINTED_SINES
+    ]
+    found.append(Search(B, "method B", b))
+    found.append(Search(B0, "method B with fly 0", b.replaced(via_points={"fly": 0.0})))
+    for n in settings.n_via:
+        points = b.replaced(via_points={"n_via": n})
+        found.append(Search(variant_key("via", n), f"B with K = {n}", points))
+    for own in settings.coupling_weight:
+        weighted = b.replaced(search={"weights": [1.0 - own, own]})
+        words = f"B with a weight of {own:g} on the coupling index"
+        found.append(Search(variant_key("weight", own), words, weighted))
+    return [one for k, one in enumerate(found) if one.key not in {o.key for o in found[:k]}]
+
+
+def variant_key(name: Literal["via", "weight", "fly"], value: float) -> str:
+    """Key of B with one setting varied; that of B itself for its own value."""
+    settings = preset("b")
+    via = settings.via_points
+    assert via is not None  # method B has via points
+    own = {"via": via.n_via, "weight": settings.search.weights[1], "fly": via.fly}
+    return B if value == own[name] else f"b-{name}-{value:g}"
+
+
+def run_searches(
+    folder: StudyFolder, cell: Cell, wanted: Sequence[Search], reporter: Reporter, workers: int
+) -> dict[str, Search]:
+    """Search what was not found yet; an interrupted search resumes from its journal.
+
+    Raises:
+        HilError: see :func:`hil.design.run.run_design`; that a search finds nothing is no error.
+    """
+    found = {}
+    for number, one in enumerate(wanted, 1):
+        place = DesignFolder(folder.design(one.key))
+        result = DesignResult.load(place.result) if place.result.exists() else None
+        if result is None or not result.complete or result.settings != one.settings:
+            reporter.say(f"search {number} of {len(wanted)}: {one.words}")
+            resume = place.settings.exists()
+            try:
+                result = run_design(
+                    place, cell, one.settings, reporter, workers=workers, resume=resume
+                ).result
+            except NoExcitationError as error:
+                reporter.say(f"no motion was found: {error}")
+                result = None
+        found[one.key] = replace(one, excitation=None if result is None else result.excitation)
+    return found
+
+
+def best_sines(found: Mapping[str, Search], keys: Collection[str] = tuple(SINES)) -> str | None:
+    """Key of the sines of largest determinant among some, which is what method A searches."""
+    known = {
+        key: one.excitation.criteria.log10_det
+        for key, one in found.items()
+        if key in keys and one.excitation is not None
+    }
+    return max(known, key=lambda key: known[key], default=None)
+
+
+def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionChecks) -> Excitation:
+    """The via points of an excitation run with another fly-by share.
+
+    Raises:
+        NoExcitationError: the motion must not be sent, or cannot be planned.
+    """
+    assert excitation.via_points is not None and excitation.speed is not None
+    try:
+        trajectory = plan_in_child(
+            excitation.via_points, cell.joint_limits, speed=excitation.speed, fly=fly
+        )
+    except PlannerError as error:
+        raise NoExcitationError(f"fly {fly:g}: {error}") from error
+    refusal = checks.refusal(trajectory)
+    if refusal is not None:
+        raise NoExcitationError(f"fly {fly:g}: {refusal}")
+    criteria = Objective(cell.model).criteria(trajectory, RESCORE_PERIOD)
+    return replace(excitation, trajectory=trajectory, criteria=criteria, fly=fly)
+
 
 T = TypeVar("T")
 
@@ -91,17 +223,13 @@ class Plans:
     """All campaigns of a study.
 
     Attributes:
-        sines: key of the search that method A is represented by.
-        printed: key of the search for the paper's own sines; None where these are `sines`, or
-            there are none.
-        excitations: A, B, B with fly 0, and the paper's own sines.
+        searched: key of the search that each method's excitation is of; `AP`, the paper's own
+            sines, is there only where these are not those of A.
         executions: by condition and key.
         missing: what cannot be run, in sentences.
     """
 
-    sines: str
-    printed: str | None
-    excitations: dict[str, Excitation]
+    searched: dict[str, str]
     executions: dict[str, dict[str, Execution]]
     missing: list[str]
 
@@ -118,19 +246,19 @@ class Plans:
             StudyError: A, B or B with fly 0 itself was ended.
         """
         missing = list(self.missing)
-        executions = {condition: dict(some) for condition, some in self.executions.items()}
+        executions: dict[str, dict[str, Execution]] = {name: {} for name in self.executions}
         for condition, some in self.executions.items():
             for key, one in some.items():
-                if one.root not in ended:
-                    continue
-                if (condition != ABLATION and key != AP) or key == B:
+                why = ended.get(one.root)
+                if why is None:
+                    executions[condition][key] = one
+                elif key == B or (condition != ABLATION and key != AP):
                     raise StudyError(
                         f"{one.root}: this arm cannot bear the excitation that was found for it:"
-                        f" {ended[one.root]}; another search (--seed, in another folder) finds"
-                        " another one"
+                        f" {why}; another search (--seed, in another folder) finds another one"
                     )
-                del executions[condition][key]
-                missing.append(f"{key} could not be run: {ended[one.root]}")
+                else:
+                    missing.append(f"{key} could not be run: {why}")
         return replace(self, executions=executions, missing=missing)
 
 
@@ -140,7 +268,7 @@ def noise_key(method: str, factor: float) -> str:
 
 
 def plan_study(
-    folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Found]
+    folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Search]
 ) -> Plans:
     """Plan all campaigns of a study.
 
@@ -150,16 +278,21 @@ def plan_study(
     Raises:
         NoExcitationError: a method has no motion, or no held-out motion satisfies the constraints.
     """
-    checks, sines, printed = MotionChecks.of(cell), best_sines(found), printed_sines(found)
-    excitations = {A: _of(found, sines), B: _of(found, B), B0: _of(found, B0)}
-    if printed is not None:
-        excitations[AP] = _of(found, printed)
+    checks, sines, printed = MotionChecks.of(cell), best_sines(found), None
+    if sines is None:
+        raise NoExcitationError(
+            "no sum of sines satisfies all constraints of the cell; search longer (without --quick)"
+        )
+    if sines not in PRINTED_SINES:
+        printed = best_sines(found, PRINTED_SINES)
+    searched = {A: sines, B: B, B0: B0} | ({} if printed is None else {AP: printed})
+    excitations = {key: found[name].found for key, name in searched.items()}
     count, seed, fly = settings.motions, settings.seed, excitations[B].fly
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
     held_out = {
-        A: sine_motions(cell, found[sines].search.settings, checks, count=count, seed=seed),
-        B: via_point_motions(cell, excitations[B], checks, fly=fly, count=count, seed=seed),
-        B0: via_point_motions(
+        A: _sine_motions(cell, found[sines].settings, checks, count=count, seed=seed),
+        B: _via_motions(cell, excitations[B], checks, fly=fly, count=count, seed=seed),
+        B0: _via_motions(
             cell, excitations[B0], checks, fly=0.0, count=count, seed=seed + _STOPS_SEED
         ),
     }
@@ -168,55 +301,55 @@ def plan_study(
     )
     few = cell.with_campaign(repetitions=settings.ablation_repetitions, simulation_seed=seed)
     executions: dict[str, dict[str, Execution]] = {}
-
-    def add(
-        condition: str, key: str, arm: Cell, excitation: Excitation,
-        motions: Sequence[PlannedMotion] = (), *, effects: bool = False,
-    ) -> None:  # fmt: skip
-        plan = _plan(arm, excitation, motions)
-        one = Execution(folder.campaign(condition, key), arm, plan, effects)
-        executions.setdefault(condition, {})[key] = one
-
     for condition in (NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,):
-        for key, one in excitations.items():
-            on = condition == EFFECTS
-            add(condition, key, main, one, held_out.get(key, ()), effects=on)
+        executions[condition] = {
+            key: Execution(
+                folder.campaign(condition, key),
+                main,
+                _plan(main, one, held_out.get(key, ())),
+                effects=condition == EFFECTS,
+            )
+            for key, one in excitations.items()
+        }
     varied, missing = _varied(cell, settings, found, checks)
-    for key, one in varied.items():
-        add(ABLATION, key, few, one)
+    arms = {key: (few, one) for key, one in varied.items()}
     for factor in settings.noise:
-        noisy = few.with_values(
-            {"simulation.current_noise": factor * cell.simulation.current_noise}
-        )
+        noise = {"simulation.current_noise": factor * cell.simulation.current_noise}
         for key in (A, B):
-            add(ABLATION, noise_key(key, factor), noisy, excitations[key])
-    return Plans(sines, printed, excitations, executions, missing)
+            arms[noise_key(key, factor)] = few.with_values(noise), excitations[key]
+    executions[ABLATION] = {
+        key: Execution(folder.campaign(ABLATION, key), arm, _plan(arm, one))
+        for key, (arm, one) in arms.items()
+    }
+    return Plans(searched, executions, missing)
 
 
 def _varied(
-    cell: Cell, settings: StudySettings, found: Mapping[str, Found], checks: MotionChecks
+    cell: Cell, settings: StudySettings, found: Mapping[str, Search], checks: MotionChecks
 ) -> tuple[dict[str, Excitation], list[str]]:
     """Excitations of the ablations by key, B itself among them; and what there is none of."""
-    varied = {B: _of(found, B)}
-    missing: list[str] = []
+    varied, missing = {B: found[B].found}, list[str]()
     for fly in settings.fly:
-        if fly_key(fly) not in varied:
+        key = variant_key("fly", fly)
+        if key not in varied:
             try:
-                varied[fly_key(fly)] = with_fly(cell, varied[B], fly, checks)
+                varied[key] = with_fly(cell, varied[B], fly, checks)
             except NoExcitationError as error:
                 missing.append(f"B's via points cannot be run so: {error}.")
-    wanted = [via_key(k) for k in settings.n_via]
-    wanted += [weight_key(w) for w in settings.coupling_weight]
+    wanted = [variant_key("via", n) for n in settings.n_via]
+    wanted += [variant_key("weight", weight) for weight in settings.coupling_weight]
     for key in wanted + [key for key in SINES if key in found]:
         one = found[key].excitation
         if one is None:
-            missing.append(f"The search of {found[key].search.words} found no motion.")
+            missing.append(f"The search of {found[key].words} found no motion.")
         else:
             varied[key] = one
     return varied, missing
 
 
-def _plan(cell: Cell, excitation: Excitation, held_out: Sequence[PlannedMotion]) -> CampaignPlan:
+def _plan(
+    cell: Cell, excitation: Excitation, held_out: Sequence[PlannedMotion] = ()
+) -> CampaignPlan:
     moves, points = excitation.moves, excitation.via_points
     file = None
     if moves is not None and points is not None:
@@ -224,38 +357,18 @@ def _plan(cell: Cell, excitation: Excitation, held_out: Sequence[PlannedMotion])
     return CampaignPlan(excitation, tuple(held_out), file)
 
 
-def _of(found: Mapping[str, Found], key: str) -> Excitation:
-    excitation = found[key].excitation
-    if excitation is None:
-        raise NoExcitationError(
-            f"{found[key].search.words} found no motion that satisfies all constraints of the"
-            " cell; search longer (without --quick), or with another --seed"
-        )
-    return excitation
-
-
-def via_point_motions(
+def _via_motions(
     cell: Cell, excitation: Excitation, checks: MotionChecks, *, fly: float, count: int, seed: int
 ) -> tuple[PlannedMotion, ...]:
-    """Wide random motions through as many via points as the cell's excitation has.
-
-    Raises:
-        NoExcitationError: none satisfies the constraints.
-    """
-    own = cell.with_values(
-        {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
-    )
-    return plan_around(own, excitation, checks).validation
+    """Wide random motions through as many via points as the cell's excitation has."""
+    own = {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
+    return plan_around(cell.with_values(own), excitation, checks).validation
 
 
-def sine_motions(
+def _sine_motions(
     cell: Cell, settings: DesignSettings, checks: MotionChecks, *, count: int, seed: int
 ) -> tuple[PlannedMotion, ...]:
-    """Random sums of sines of the family of a search; the first do not depend on the number.
-
-    Raises:
-        NoExcitationError: none satisfies the constraints.
-    """
+    """Random sums of sines of the family of a search; the first do not depend on the number."""
     problem = problem_of(cell, settings)
 
     def one_motion(k: int) -> PlannedMotion:
@@ -276,7 +389,7 @@ def sine_motions(
 
 
 def execute_all(
-    executions: Sequence[Execution], reporter: Reporter, workers: Workers
+    executions: Sequence[Execution], reporter: Reporter, workers: LocalWorkers
 ) -> dict[Path, str]:
     """Run what is missing of several campaigns, side by side.
 
@@ -287,11 +400,8 @@ def execute_all(
         StudyError: a campaign was refused, or its process ended before it.
     """
     missing = [one for one in executions if not one.complete]
-    with reporter.task("running campaigns", len(executions)) as task:
-        task.advance(len(executions) - len(missing))
-        ended = workers.map(
-            execute, [(one,) for one in missing], done=lambda count: task.advance(count)
-        )
+    calls = [(one.root, (one,)) for one in missing]
+    ended = in_children(execute, calls, "running campaigns", reporter, workers, of=len(executions))
     return {one.root: why for one, why in zip(missing, ended, strict=True) if why is not None}
 
 
@@ -322,60 +432,30 @@ def execute(execution: Execution) -> str | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class Workers:
-    """Child processes; without any, all is done in this process."""
+def in_children(
+    function: Callable[..., T],
+    calls: Sequence[tuple[Path, tuple[Any, ...]]],
+    title: str,
+    reporter: Reporter,
+    workers: LocalWorkers,
+    of: int,
+) -> list[T]:
+    """Call a function of a module with the arguments of each place; results in order.
 
-    children: tuple[WorkerProcess, ...]
+    `of` is the number of calls of the whole task, those included that are not needed any more.
 
-    def map(
-        self,
-        function: Callable[..., T],
-        arguments: Sequence[tuple[Any, ...]],
-        done: Callable[[int], None] = lambda _: None,
-    ) -> list[T]:
-        """Call a function of a module with each of the arguments; results in order.
-
-        The longest calls come first; `done` gets the number of calls that have ended.
-
-        Raises:
-            StudyError: a call was refused, ended its process, or lasted too long.
-        """
-        if not self.children:
-            found = []
-            for some in arguments:
-                found += _called(function, [some])
-                done(1)
-            return found
-        results = map_in_children(
-            self.children,
-            _called,
-            [[k] for k in range(len(arguments))],
-            lambda chunk: (function, [arguments[k] for k in chunk]),
-            done=done,
-        )
-        for result in results:
-            if isinstance(result, PlannerCrashed | PlanningTimedOut):
-                raise StudyError(f"a part of the study failed ({result}); start it again to resume")
-        return [one for one in results if not isinstance(one, PlannerCrashed | PlanningTimedOut)]
+    Raises:
+        StudyError: a call was refused, ended its process, or lasted too long.
+    """
+    tasks = [ArchiveTask(str(place), _called, (function, own)) for place, own in calls]
+    with reporter.task(title, of) as task:
+        task.advance(of - len(tasks))
+        found = list(workers.notes(tasks, done=lambda count: task.advance(count)))
+    for one in found:
+        if isinstance(one, Broken):
+            raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")
+    return [one for one in found if not isinstance(one, Broken)]
 
 
-@contextmanager
-def workers_of(count: int) -> Iterator[Workers]:
-    """So many processes, ended when this is left; one is this process itself."""
-    children = [WorkerProcess(timeout=LONGEST) for _ in range(count if count > 1 else 0)]
-    try:
-        yield Workers(tuple(children))
-    finally:
-        for child in children:
-            child.close()
-
-
-def _called(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
-    """Results of the calls; a refusal as an error that can be sent from process to process."""
-    try:
-        return [function(*some) for some in arguments]
-    except StudyError:
-        raise
-    except (HilError, IdentificationError, PlannerError) as error:
-        raise StudyError(str(error)) from error
+def _called(function: Callable[..., T], arguments: tuple[Any, ...]) -> Part[None, T]:
+    return Part(None, function(*arguments))

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
+from hil.batch.workers import LocalWorkers
 from hil.campaign import CampaignFolder
 from hil.campaign.plan import moves_from_dict
 from hil.errors import ArchiveError, InputError
@@ -28,7 +29,6 @@ from hil.io import json_digest
 from hil.progress import Reporter, Silent
 from hil.reading import text_of
 from hil.results import Frozen
-from hil.study.campaigns import Workers
 from identification import Factor, RobotModel
 from identification.estimators.least_squares import estimate_repetitions
 from identification.excitation import correlation, coupling_index, information, log10_det
@@ -36,7 +36,8 @@ from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
 from identification.validation.prediction import FIGURE_BANDWIDTH, for_figure
 from planner import FlyDistance, FlyPercent, InvalidPlanFile
-from planner.commands import Fly
+
+from .campaigns import in_children
 
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
@@ -46,6 +47,11 @@ VERSION: Final = 5
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
 CLASSES: Final[tuple[MotionClass, ...]] = ("fly-by", "stop-to-stop", "sinusoid")
+SHOWN: Final = 1200
+"""Rows of a series that a figure is drawn from, at most."""
+FIGURE_DIGITS: Final = 5
+_MOVES: Final = 1e-3
+"""rad/s or m/s: a joint that is faster moves."""
 
 
 class Record(Frozen):
@@ -151,45 +157,10 @@ def write_record(path: Path, record: Record) -> None:
     write_or_tell(path, record.model_dump_json() + "\n")
 
 
-def digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> str:
-    """Digest of archives (name, checksum) and of whatever else a record rests on."""
-    return json_digest([VERSION, list(archives), others])
+# What a motion says of any estimate
 
 
-def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
-    """Form of one motion; rows that are not usable count as zero, as in the errors."""
-    blocks, columns = run.regressor(model)
-    n = model.n_parameters
-    whole, slow = np.zeros((n, n)), []
-    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
-        usable = run.usable[:, j]
-        table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
-        whole[np.ix_(used, used)] += table[:, :-1].T @ table[:, :-1]
-        passed = low_passed(run, table)[usable]
-        slow.append((passed.T @ passed).tolist())
-    return MotionForm(
-        archive=archive,
-        torque_squared=(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0).tolist(),
-        columns=[[int(k) for k in used] for used in columns],
-        slow=slow,
-        whole=whole.tolist(),
-    )
-
-
-def low_passed(run: Samples, values: Array) -> Array:
-    """Values (m, c) low-passed as the paper's Fig. 4 is, each segment of a recording by itself.
-
-    A segment without a usable row stays zero.
-    """
-    slow = np.zeros_like(values)
-    for part in run.segments:
-        if run.usable[part].any():
-            slow[part] = low_pass(run.motion.time[part], values[part], FIGURE_BANDWIDTH)
-    return slow
-
-
-@dataclass(frozen=True, eq=False)
-class ClassForms:
+class ClassForms(NamedTuple):
     """The forms of all motions of one class; m motions, n joints, p parameters.
 
     Attributes:
@@ -229,56 +200,85 @@ class ClassForms:
         away = values - truth
         return np.asarray(away @ self.whole @ away.T)
 
+    def relative(self, kernels: Array, weights: Array) -> Array:
+        """Error over torque (m, s) of weighted means of estimates, weights (s, r), on each motion.
+
+        `kernels` (m, r, r) are of one of the two kinds above.
+        """
+        squared = np.maximum(((weights @ kernels) * weights).sum(axis=2), 0.0)
+        return np.asarray(np.sqrt(squared / self.torque_squared.sum(axis=1)[:, None]))
+
     def overall(self, estimate: Array) -> Array:
         """||e|| / ||tau|| of one estimate (p,) on each motion (m,), low-passed."""
-        return self._relative(self.torque_kernels(estimate[None]))
+        return self.relative(self.torque_kernels(estimate[None]), np.ones((1, 1)))[:, 0]
 
     def own(self, estimate: Array, truth: Array) -> Array:
         """||Phi (pi - truth)|| / ||tau|| of one estimate (p,) on each motion (m,)."""
-        return self._relative(self.own_kernels(estimate[None], truth))
-
-    def _relative(self, kernels: Array) -> Array:
-        squared = np.maximum(kernels[:, 0, 0], 0.0)
-        return np.asarray(np.sqrt(squared / self.torque_squared.sum(axis=1)))
+        return self.relative(self.own_kernels(estimate[None], truth), np.ones((1, 1)))[:, 0]
 
 
-SHOWN: Final = 1200
-"""Rows of a series that a figure is drawn from, at most."""
-FIGURE_DIGITS: Final = 5
-_MOVES: Final = 1e-3
-"""rad/s or m/s: a joint that is faster moves."""
+def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
+    """Form of one motion; rows that are not usable count as zero, as in the errors."""
+    blocks, columns = run.regressor(model)
+    n = model.n_parameters
+    whole, slow = np.zeros((n, n)), []
+    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+        usable = run.usable[:, j]
+        table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
+        whole[np.ix_(used, used)] += table[:, :-1].T @ table[:, :-1]
+        passed = low_passed(run, table)[usable]
+        slow.append((passed.T @ passed).tolist())
+    return MotionForm(
+        archive=archive,
+        torque_squared=(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0).tolist(),
+        columns=[[int(k) for k in used] for used in columns],
+        slow=slow,
+        whole=whole.tolist(),
+    )
+
+
+def low_passed(run: Samples, values: Array) -> Array:
+    """Values (m, c) low-passed as the paper's Fig. 4 is, each segment of a recording by itself.
+
+    A segment without a usable row stays zero.
+    """
+    slow = np.zeros_like(values)
+    for part in run.segments:
+        if run.usable[part].any():
+            slow[part] = low_pass(run.motion.time[part], values[part], FIGURE_BANDWIDTH)
+    return slow
+
+
+# Reading archives
 
 
 def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
     """Estimate from each repetition and from all (eq. 4)."""
     prepared = _prepared(archives)
-    model, recordings = prepared.sources.cell.model, prepared.fitted
-    found = estimate_repetitions(model, recordings)
-    first, source = recordings[0], prepared.sources.training[0]
-    rows = executed_rows(source, first)
+    model, sources = prepared.sources.cell.model, prepared.sources.training
+    found = estimate_repetitions(model, prepared.fitted)
     executed = Factor.zero(model)
-    for one, own in zip(recordings, prepared.sources.training, strict=True):
-        part = executed_rows(own, one)
-        motion = one.motion.rows(part)
-        executed = executed + Factor.from_samples(model, motion, one.torque[part])
-    gram, count = information(executed), rows.stop - rows.start
-    shown = _thinned(rows)
+    parts = [executed_rows(own, one) for own, one in zip(sources, prepared.fitted, strict=True)]
+    for one, part in zip(prepared.fitted, parts, strict=True):
+        executed = executed + Factor.from_samples(model, one.motion.rows(part), one.torque[part])
+    gram, motion, rows = information(executed), prepared.fitted[0].motion, parts[0]
+    shown, count = motion.rows(_thinned(rows)), rows.stop - rows.start
     return FitRecord(
         inputs=inputs,
-        repetitions=[one.name for one in prepared.sources.training],
+        repetitions=[one.name for one in sources],
         values=[one.values.tolist() for one in found.repetitions],
         pooled=found.pooled.values.tolist(),
         pooled_std=found.pooled.std.tolist(),
         undetermined=list(found.pooled.undetermined),
         noise_std=found.pooled.noise_std.tolist(),
-        log10_det=log10_det(gram, count * len(recordings)),
+        log10_det=log10_det(gram, count * len(sources)),
         coupling_index=coupling_index(gram),
         n_samples=count,
         correlation=correlation(gram).tolist(),
-        duration=float(first.motion.time[rows.stop - 1] - first.motion.time[rows.start]),
-        time=_rounded(first.motion.time[shown] - first.motion.time[rows.start]),
-        position=[_rounded(column) for column in first.motion.position[shown].T],
-        velocity=[_rounded(column) for column in first.motion.velocity[shown].T],
+        duration=float(motion.time[rows.stop - 1] - motion.time[rows.start]),
+        time=_rounded(shown.time - shown.time[0]),
+        position=[_rounded(column) for column in shown.position.T],
+        velocity=[_rounded(column) for column in shown.velocity.T],
     )
 
 
@@ -296,18 +296,16 @@ def score(
         estimates: parameters (p,) by name.
         shown: estimates of the example in time, drawn on the motion of median error.
     """
-    runs: list[Samples] = []
-    names: list[str] = []
+    runs: dict[str, Samples] = {}  # every campaign numbers its archives from 0
     for key, archives in groups:
         prepared = _prepared(archives)
-        runs += prepared.fitted
-        # Every campaign numbers its archives from 0.
-        names += [f"{key}/{source.name}" for source in prepared.sources.training]
+        names = [f"{key}/{source.name}" for source in prepared.sources.training]
+        runs |= zip(names, prepared.fitted, strict=True)
     model = prepared.sources.cell.model
     table = np.array(list(estimates.values()), dtype=np.float64)
     truth = list(estimates).index(PLANTED) if PLANTED in estimates else None
-    by_motion = [_errors(model, table, run, truth) for run in runs]
-    usable = [run.usable[_motion_rows(run)] for run in runs]
+    by_motion = [_errors(model, table, run, truth) for run in runs.values()]
+    usable = [run.usable[_motion_rows(run)] for run in runs.values()]
     errors: dict[str, dict[str, Any]] = {"own": {}} | {
         quantity: {
             name: [some[quantity][k].tolist() for some in by_motion]
@@ -319,15 +317,15 @@ def score(
     examples = []
     if shown:
         every = np.mean([errors["overall"][name] for name in shown], axis=0)
-        typical = int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])
+        typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
         series = {name: np.asarray(estimates[name]) for name in shown}
-        examples.append(_example(model, runs[typical], names[typical], series))
+        examples.append(_example(model, runs[typical], typical, series))
     return ScoreRecord(
         inputs=inputs,
-        durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs],
+        durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs.values()],
         samples=[len(rows) for rows in usable],
         left_out=[np.count_nonzero(~rows, axis=0).tolist() for rows in usable],
-        forms=[motion_form(model, name, run) for name, run in zip(names, runs, strict=True)],
+        forms=[motion_form(model, name, run) for name, run in runs.items()],
         examples=examples,
         **errors,
     )
@@ -347,24 +345,22 @@ def _errors(model: RobotModel, table: Array, run: Samples, truth: int | None) ->
     def filtered(error: Array) -> Array:
         return low_passed(run, error.reshape(len(error), -1)).reshape(error.shape)
 
+    def relative(error: Array, torque: Array) -> Array:
+        return np.asarray(np.sqrt((error**2).sum(axis=(0, 1)) / (torque**2).sum()))
+
     everywhere, whole = filtered(left), _motion_rows(run)
     left[~run.usable] = 0.0
     slow = np.where(run.usable[..., None], filtered(left), 0.0)
     torque = np.where(run.usable, run.torque, 0.0)
     rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
     found = {
-        "overall": _relative(slow, torque),
-        "all_rows": _relative(everywhere[whole], run.torque[whole]),
+        "overall": relative(slow, torque),
+        "all_rows": relative(everywhere[whole], run.torque[whole]),
         "mean_abs": (np.abs(slow).sum(axis=0) / rows[:, None]).T,
     }
     if truth is not None:
-        found["own"] = _relative(left - left[..., truth, None], torque)
+        found["own"] = relative(left - left[..., truth, None], torque)
     return found
-
-
-def _relative(error: Array, torque: Array) -> Array:
-    """||e|| / ||tau|| (k,) of errors (m, n, k) over all joints."""
-    return np.asarray(np.sqrt((error**2).sum(axis=(0, 1)) / (torque**2).sum()))
 
 
 def _motion_rows(run: Samples) -> slice:
@@ -403,19 +399,15 @@ def _thinned(rows: slice) -> slice:
 
 
 def _rounded(values: Array) -> list[float]:
-    """Numbers of a figure, to as many digits as an eye could want."""
     return [float(f"{value:.{FIGURE_DIGITS}g}") for value in values.tolist()]
+
+
+# Campaigns
 
 
 @dataclass(frozen=True)
 class Run:
-    """One excitation that was executed.
-
-    Attributes:
-        key: names it among the others.
-        label: for people.
-        root: its campaign folder.
-    """
+    """One excitation that was executed: its key among the others, label, and campaign folder."""
 
     key: str
     label: str
@@ -426,90 +418,80 @@ class Run:
         """The same, to be read."""
         return CampaignFolder(self.root)
 
-    def archives(self, kind: str) -> tuple[tuple[str, str], ...]:
-        """Names and checksums of its whole archives of one kind.
+    def archives(self, *kinds: str) -> dict[str, str]:
+        """Checksums of its whole archives of some kinds by name.
 
         Raises:
             CampaignFolderError: there is no manifest that can be read.
         """
-        names = [path.name for path in self.folder.completed(kind)]
+        names = [path.name for kind in kinds for path in self.folder.completed(kind)]
         sums = {entry.name: entry.sha256 for entry in self.folder.manifest()}
-        return tuple((name, sums[name]) for name in names)
+        return {name: sums[name] for name in names}
 
     def paths(self, names: Sequence[str]) -> list[Path]:
         """Its archives of these names, and those of the standstill, for the noise of positions."""
-        standstill = [name for name, _ in self.archives("standstill")]
-        return [self.folder.archives / name for name in (*names, *standstill)]
+        return [self.folder.archives / name for name in (*names, *self.archives("standstill"))]
 
 
-def fit_all(
-    runs: Sequence[Run], fits: Path, reporter: Reporter, workers: Workers
-) -> dict[str, FitRecord]:
-    """Estimate from the excitations of each run; what was read before is not read again.
+@dataclass(frozen=True, eq=False)
+class Reader:
+    """Reads archives in child processes, and keeps what it read as records in a folder."""
 
-    Raises:
-        InputError: a run has no whole excitation.
-    """
-    tasks = []
-    for run in runs:
-        archives = run.archives("excitation")
-        if not archives:
-            raise InputError(run.root, "holds no whole excitation", remedy="run the campaign first")
-        inputs = digest([*archives, *run.archives("standstill")], {})
-        place = fits / f"{run.key}.json"
-        tasks.append((place, inputs, fit, (run.paths([name for name, _ in archives]), inputs)))
-    found = _all(FitRecord, tasks, "estimating (excitations)", reporter, workers)
-    return {run.key: record for run, record in zip(runs, found, strict=True)}
+    fits: Path
+    reporter: Reporter
+    workers: LocalWorkers
 
+    def fit(self, runs: Sequence[Run]) -> dict[str, FitRecord]:
+        """Estimate from the excitations of each run, by key.
 
-def score_all(
-    runs: Sequence[Run],
-    fits: Path,
-    estimates: Mapping[str, Array],
-    shown: Sequence[str],
-    reporter: Reporter,
-    workers: Workers,
-) -> dict[str, ScoreRecord]:
-    """Predict the held-out motions of all runs, class by class; by class."""
-    values = {name: estimate.tolist() for name, estimate in estimates.items()}
-    names = {run.key: classes_of(run) for run in runs}
-    tasks, found = [], [one for one in CLASSES if any(one in own for own in names.values())]
-    for one in found:
-        members = [(run, names[run.key][one]) for run in runs if one in names[run.key]]
-        sums = [run.archives(kind) for run, _ in members for kind in ("validation", "standstill")]
-        inputs = digest(
-            [archive for some in sums for archive in some],
-            {"estimates": values, "shown": [*shown], "archives": [own for _, own in members]},
-        )
-        groups = [(run.key, run.paths(own)) for run, own in members]
-        place = fits / f"{'+'.join(key for key, _ in groups)}-{one}.json"
-        tasks.append((place, inputs, score, (groups, inputs, values, list(shown))))
-    title = "predicting (classes of motion)"
-    return dict(zip(found, _all(ScoreRecord, tasks, title, reporter, workers), strict=True))
+        Raises:
+            InputError: a run has no whole excitation.
+        """
+        tasks = []
+        for run in runs:
+            if not (archives := run.archives("excitation")):
+                problem, remedy = "holds no whole excitation", "run the campaign first (hil run)"
+                raise InputError(run.root, problem, remedy=remedy)
+            inputs = _digest([*run.archives("excitation", "standstill").items()], {})
+            tasks.append((run.key, inputs, (run.paths([*archives]), inputs)))
+        found = self._read(FitRecord, fit, tasks, "estimating (excitations)")
+        return {run.key: record for run, record in zip(runs, found, strict=True)}
 
+    def score(
+        self, runs: Sequence[Run], estimates: Mapping[str, Array], shown: Sequence[str]
+    ) -> dict[str, ScoreRecord]:
+        """Predict the held-out motions of all runs, class by class; by class."""
+        values = {name: estimate.tolist() for name, estimate in estimates.items()}
+        names = {run.key: classes_of(run) for run in runs}
+        tasks, found = [], [one for one in CLASSES if any(one in own for own in names.values())]
+        for one in found:
+            members = [(run, names[run.key][one]) for run in runs if one in names[run.key]]
+            sums = [
+                s for run, _ in members for s in run.archives("validation", "standstill").items()
+            ]
+            others = {"estimates": values, "shown": [*shown], "archives": [o for _, o in members]}
+            inputs = _digest(sums, others)
+            groups = [(run.key, run.paths(own)) for run, own in members]
+            place = f"{'+'.join(key for key, _ in groups)}-{one}"
+            tasks.append((place, inputs, (groups, inputs, values, [*shown])))
+        records = self._read(ScoreRecord, score, tasks, "predicting (classes of motion)")
+        return dict(zip(found, records, strict=True))
 
-def _all(
-    kind: type[R],
-    tasks: Sequence[tuple[Path, str, Callable[..., R], tuple[Any, ...]]],
-    title: str,
-    reporter: Reporter,
-    workers: Workers,
-) -> list[R]:
-    """Records by place and inputs; those missing, or of other archives, are made by the function.
-
-    The function is called with the given arguments.
-    """
-    found = {k: read_record(place, kind, inputs) for k, (place, inputs, *_) in enumerate(tasks)}
-    missing = [k for k, record in found.items() if record is None]
-    with reporter.task(title, len(tasks)) as task:
-        task.advance(len(tasks) - len(missing))
-        made = workers.map(
-            make_record,
-            [(place, function, *own) for place, _, function, own in (tasks[k] for k in missing)],
-            done=lambda count: task.advance(count),
-        )
-    found |= dict(zip(missing, made, strict=True))
-    return [record for record in found.values() if record is not None]
+    def _read(
+        self,
+        kind: type[R],
+        function: Callable[..., R],
+        tasks: Sequence[tuple[str, str, tuple[Any, ...]]],
+        title: str,
+    ) -> list[R]:
+        """Records by name and inputs; those missing, or of other inputs, the function makes."""
+        places = [self.fits / f"{name}.json" for name, _, _ in tasks]
+        found = [read_record(p, kind, own) for p, (_, own, _) in zip(places, tasks, strict=True)]
+        missing = [k for k, record in enumerate(found) if record is None]
+        calls = [(places[k], (places[k], function, *tasks[k][2])) for k in missing]
+        made = in_children(make_record, calls, title, self.reporter, self.workers, of=len(tasks))
+        fresh = iter(made)
+        return [next(fresh) if record is None else record for record in found]
 
 
 def make_record(place: Path, function: Callable[..., R], *arguments: Any) -> R:
@@ -519,10 +501,15 @@ def make_record(place: Path, function: Callable[..., R], *arguments: Any) -> R:
     return record
 
 
+def _digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> str:
+    """Digest of archives (name, checksum) and of whatever else a record rests on."""
+    return json_digest([VERSION, list(archives), others])
+
+
 def classes_of(run: Run) -> dict[MotionClass, list[str]]:
     """Names of the held-out archives of a run by the class of their planned motion."""
     found: dict[MotionClass, list[str]] = {}
-    for name, _ in run.archives("validation"):
+    for name in run.archives("validation"):
         motion_class = class_in(open_archive(run.folder.archives / name))
         found.setdefault(motion_class, []).append(name)
     return found
@@ -539,36 +526,21 @@ def plan_in(archive: Archive) -> dict[str, Any]:
 def class_in(archive: Archive) -> MotionClass:
     """Class of the planned motion in an archive.
 
-    Raises:
-        ArchiveError: its plan is not what it should be.
-    """
-    try:
-        return class_of(plan_in(archive))
-    except InvalidPlanFile as error:
-        raise ArchiveError(archive.path, f"its plan cannot be read: {error}") from error
-
-
-def class_of(plan: Mapping[str, Any]) -> MotionClass:
-    """Class of a planned motion: what an archive's `plan.json` says of it.
-
     A motion in pieces without its moves counts as fly-by, as the interpolator runs it.
 
     Raises:
-        InvalidPlanFile: the moves that it lists are none.
+        ArchiveError: its plan is not what it should be.
     """
+    plan = plan_in(archive)
     trajectory = plan.get("trajectory")
     if isinstance(trajectory, dict) and trajectory.get("type") == "fourier_series":
         return "sinusoid"
-    moves = moves_from_dict(plan)
-    if moves is None or any(_rounds(move.fly) for move in moves.moves):
-        return "fly-by"
-    return "stop-to-stop"
-
-
-def _rounds(fly: Fly) -> bool:
-    match fly:
-        case FlyPercent(percent):
-            return percent > 0.0
-        case FlyDistance(distance):
-            return distance > 0.0
-    return False
+    try:
+        moves = moves_from_dict(plan)
+    except InvalidPlanFile as error:
+        raise ArchiveError(archive.path, f"its plan cannot be read: {error}") from error
+    for move in () if moves is None else moves.moves:
+        match move.fly:
+            case FlyPercent(extent) | FlyDistance(extent) if extent > 0.0:
+                return "fly-by"
+    return "fly-by" if moves is None else "stop-to-stop"

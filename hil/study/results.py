@@ -1,4 +1,4 @@
-"""What a study leaves behind: `results.json`, and some twenty sentences made from its numbers.
+"""What a study leaves behind: `results.json`.
 
 SI units; lists per joint follow `joint_names`, lists per parameter `parameters`. Torque errors are
 low-passed at 30 Hz unless they say otherwise.
@@ -12,13 +12,12 @@ from typing import Any, Final, Literal, Self
 
 from pydantic import Field
 
-from hil.cell import Cell
 from hil.report.numbers import capitalised, fixed, significant
 from hil.results import Frozen
-from hil.study.records import ClassErrors, ExampleRecord, Fitted
-from hil.study.searches import AP, B0, A, B, Found
-from hil.study.settings import StudySettings, load_json
-from hil.version import software
+
+from .campaigns import AP, B0, A, B
+from .records import ClassErrors, ExampleRecord, Fitted
+from .settings import StudySettings, load_json
 
 SCHEMA_VERSION: Final = 1
 ALPHA: Final = 0.05
@@ -26,6 +25,7 @@ ALPHA: Final = 0.05
 SMALL: Final = 0.02
 """A difference of errors below this share exists and does not matter."""
 
+Quantity = Literal["error", "own", "parameter_error"]
 Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse", "too few"]
 
 
@@ -58,21 +58,6 @@ class SearchResult(Frozen):
     log10_det: float | None
     coupling_index: float | None
     duration: float | None
-
-    @classmethod
-    def of(cls, found: Found, *, chosen: bool) -> Self:
-        """What a search found."""
-        one = found.excitation
-        return cls(
-            key=found.search.key,
-            words=found.search.words,
-            chosen=chosen,
-            tried=0 if one is None else one.tried,
-            infeasible={} if one is None else {name: int(n) for name, n in one.rejected.items()},
-            log10_det=None if one is None else one.criteria.log10_det,
-            coupling_index=None if one is None else one.criteria.coupling_index,
-            duration=None if one is None else float(one.trajectory.duration),
-        )
 
 
 class MotionRow(Frozen):
@@ -260,7 +245,7 @@ class AblationBand(Frozen):
     method: str
     repetitions: int
     """In each subset."""
-    quantity: Literal["error", "own", "parameter_error"]
+    quantity: Quantity
     motion_class: str | None
     """Null for the parameters."""
     low: float
@@ -327,50 +312,31 @@ class StudyResults(Frozen):
         return load_json(cls, path, "is not the result of a study", "run the study again")
 
 
-_NONE: Final = "no significant difference"
-TOO_FEW: Final = "too few repetitions or motions for a conclusion"
 OWN_CLASS: Final = {A: "sinusoid", B: "fly-by", B0: "stop-to-stop"}
 """Class of motion by the method whose excitation is of it."""
-_WHERE: Final = {"plain": "without unmodelled effects", "effects": "with unmodelled effects"}
+_OUTCOMES: Final = {
+    "none": "No significant difference",
+    "too few": "Too few repetitions or motions for a conclusion",
+}
+_Pairs = Sequence[tuple[ConditionResult, ComparisonResult]]
 
 
-def reading_of(results: StudyResults) -> list[Paragraph]:
+def conclusions(results: StudyResults) -> list[Paragraph]:
     """All paragraphs, the paper's question first."""
-    paragraphs = [
-        _prediction(results),
-        _classes(results),
-        _effects(results),
-        *(_ablation(one) for one in results.ablations),
-    ]
-    return [one for one in paragraphs if one is not None]
-
-
-def study_results(
-    root: Path, cell: Cell, parameters: list[StudyParameter], **tables: Any
-) -> StudyResults:
-    """Results of a study with what its numbers say; `tables` are the other fields."""
-    results = StudyResults(
-        name=root.resolve().name,
-        cell=cell.name,
-        software=software(),
-        joint_names=list(cell.joint_names),
-        n_base=len(cell.model.base.names),
-        parameters=parameters,
-        reading=[],
-        **tables,
-    )
-    return results.model_copy(update={"reading": reading_of(results)})
+    found = [_prediction(results), _classes(results), _effects(results)]
+    found += [_ablation(one) for one in results.ablations]
+    return [one for one in found if one is not None]
 
 
 def summary_of(results: StudyResults) -> dict[str, Any]:
     """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
     fields = {"motion_class", "first", "second", "ratio", "level", "verdict", "p_corrected"}
-    conclusions = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]
+    lines = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]
     return {
         "name": results.name,
         "simulated": results.simulated,
         "quick": results.quick,
-        "line": " ".join(conclusions) or f"{results.name}: one excitation, nothing to compare.",
+        "line": " ".join(lines) or f"{results.name}: one excitation, nothing to compare.",
         "ratios": [
             {
                 "condition": condition.key,
@@ -388,23 +354,17 @@ def summary_of(results: StudyResults) -> dict[str, Any]:
 
 def _prediction(results: StudyResults) -> Paragraph | None:
     """The first two methods on the robot's own motions: the paper's Fig. 3."""
-    labels = list(results.conditions[0].labels.values())
-    if len(labels) < 2:
-        return None
-    pairs = [(one, row) for one in results.conditions if (row := _main(one)) is not None]
-    kind = pairs[0][1].motion_class if pairs else "held-out"
-    if not pairs:
-        verdict = "There is no held-out motion, so nothing can be predicted."
-        sentences = ["The tables and figures below are of the excitations and the parameters."]
-    else:
-        verdict = _each(pairs)
-        sentences = [f"{_where(one)}, {_ratio(row, one.labels)}." for one, row in pairs]
     conditions = results.conditions
+    first, second, *_ = [*conditions[0].labels.values(), None, None]
+    if second is None:
+        return None
+    pairs = [(one, row) for one in conditions if (row := _main(one)) is not None]
     printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
+    sentences = [f"{capitalised(one.words)}, {_ratio(row, one.labels)}." for one, row in pairs]
     if printed:
         sentences.append(
             "A is its best search here, beyond the frequencies that the paper prints. Compared"
-            f" with A as printed: {_lower(_each(printed))}"
+            f" with A as printed: {_each(printed)}"
         )
     directions = {row.ratio < 1.0 for _, row in pairs if row.differs}
     if len(directions) == 2 and all(one.key.startswith("recorded") for one, _ in pairs):
@@ -413,26 +373,31 @@ def _prediction(results: StudyResults) -> Paragraph | None:
             "The same motions, run in each campaign, lead to opposite conclusions: the state of"
             " the arm differs from one campaign to the other.",
         )
-    heading = f"Does {labels[1]} predict {kind} motions better than {labels[0]}?"
-    return Paragraph(key="prediction", heading=heading, verdict=verdict, sentences=sentences)
+    kind = pairs[0][1].motion_class if pairs else "held-out"
+    return Paragraph(
+        key="prediction",
+        heading=f"Does {second} predict {kind} motions better than {first}?",
+        verdict=_each(pairs) if pairs else "There is no held-out motion to predict.",
+        sentences=sentences or ["Tables and figures are of the excitations and the parameters."],
+    )
 
 
 def _classes(results: StudyResults) -> Paragraph | None:
     """Whether estimates predict their own class of motion best: the paper's main argument."""
-    counts, best, total = [], 0, 0
+    upheld: dict[str, list[bool]] = {}
     for condition in results.conditions:
         present = [one.motion_class for one in condition.classes]
         own = [k for k, name in OWN_CLASS.items() if k in condition.labels and name in present]
         if len(own) > 1:  # of one class there is nothing to compare it with
-            upheld = sum(_best(condition, key, OWN_CLASS[key]) for key in own)
-            best, total = best + upheld, total + len(own)
-            counts.append(f"{upheld} of {len(own)} {_lower(_where(condition))}")
-    if not counts:
+            upheld[condition.words] = [_best(condition, key, OWN_CLASS[key]) for key in own]
+    if not upheld:
         return None
+    every = [one for own in upheld.values() for one in own]
+    counts = ", ".join(f"{sum(own)} of {len(own)} {words}" for words, own in upheld.items())
     return Paragraph(
         key="classes",
         heading="Do estimates predict their own class of motion best?",
-        verdict=f"{'Yes' if best == total else 'In part' if best else 'No'}: {', '.join(counts)}.",
+        verdict=f"{'Yes' if all(every) else 'In part' if any(every) else 'No'}: {counts}.",
         sentences=["Best means significantly better than every other estimate."],
     )
 
@@ -452,7 +417,7 @@ def _effects(results: StudyResults) -> Paragraph | None:
     by_key = {one.key: one for one in results.conditions}
     if not {"plain", "effects"} <= by_key.keys():
         return None
-    before, after = _main(by_key["plain"]), _main(by_key["effects"])
+    before, after = (_main(by_key[key]) for key in ("plain", "effects"))
     if before is None or after is None:
         return None
     same = (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0)
@@ -499,19 +464,20 @@ def _main(condition: ConditionResult) -> ComparisonResult | None:
     return condition.compared("fly-by" if "fly-by" in names else names[0], first, second)
 
 
-def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
+def _each(pairs: _Pairs) -> str:
     """The conclusion under each condition; once where it is the same."""
     texts = [_outcome(condition, row) for condition, row in pairs]
-    if len(set(texts)) == 1:
-        return f"{capitalised(texts[0]) if texts[0] in (TOO_FEW, _NONE) else texts[0]}."
-    named = [f"{_lower(_where(one))} {text}" for (one, _), text in zip(pairs, texts, strict=True)]
-    return capitalised("; ".join(named) + ".")
+    if len(set(texts)) > 1:
+        texts = [
+            f"{capitalised(one.words)}: {text}" for (one, _), text in zip(pairs, texts, strict=True)
+        ]
+    return " ".join(f"{text}." for text in dict.fromkeys(texts))
 
 
 def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
     """Whose error is smaller, by how much, and whether more motion is all there is to it."""
     if not row.differs:
-        return TOO_FEW if row.verdict == "too few" else _NONE
+        return _OUTCOMES[row.verdict]
     better = condition.labels[row.second if row.ratio < 1.0 else row.first]
     saved = significant(100.0 * (1.0 - min(row.ratio, 1.0 / row.ratio)), 2)
     slightly = "slightly " if row.verdict.startswith("slightly") else ""
@@ -522,17 +488,8 @@ def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
 
 
 def _ratio(row: ComparisonResult, labels: dict[str, str]) -> str:
-    """The ratio of two errors, in words."""
     interval = "" if row.low is None else f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)})"
     return (
         f"the error with {labels[row.second]} is {fixed(row.ratio, 3)} times that with"
         f" {labels[row.first]}{interval}, smaller on {row.wins} of {row.motions} motions"
     )
-
-
-def _where(condition: ConditionResult) -> str:
-    return capitalised(_WHERE.get(condition.key, condition.words))
-
-
-def _lower(words: str) -> str:
-    return words[:1].lower() + words[1:] if words[1:2].islower() else words

@@ -7,10 +7,9 @@ estimates, which is the same on all of these motions: other repetitions would ha
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,8 @@ from scipy import stats
 
 from hil.compare.spread import holm
 
-from .records import ClassForms, FitRecord
-from .results import ALPHA, SMALL, AblationBand, ComparisonResult, EqualDataResult, Verdict
+from .records import ClassForms
+from .results import ALPHA, SMALL, AblationBand, ComparisonResult, Quantity, Verdict
 
 Array = NDArray[np.float64]
 
@@ -31,18 +30,6 @@ asked."""
 _CHUNK: Final = 500
 _SUBSETS: Final = 400
 _SEED, _BAND_SEED = 20140901, 20140902
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Standard error of a mean log ratio, and its degrees of freedom."""
-
-    error: float
-    freedom: float
-
-    def half_width(self, level: float) -> float:
-        """Of the interval at a level, by Student's t."""
-        return float(stats.t.ppf(0.5 + 0.5 * level, self.freedom)) * self.error
 
 
 def compare(first: Array, second: Array) -> tuple[float, int, float]:
@@ -86,52 +73,53 @@ def compared_on(
     # The sum of a mean's squared errors: weights 1 / r on either side.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
     ratio, wins, p_value = compare(before, after)
-    known = spread(*inner, drifts=drifts, seed=_SEED)
-    one = ComparisonResult(
-        motion_class=motion_class,
-        joint=joint,
-        first=keys[0],
-        second=keys[1],
-        motions=len(before),
-        repetitions=[one.shape[1] for one in inner],
-        ratio=ratio,
-        error=None if known is None else known.error,
-        freedom=None if known is None else known.freedom,
-        level=1.0 - ALPHA,
-        low=None,
-        high=None,
-        verdict="too few",
-        wins=wins,
-        p_value=p_value,
-        p_corrected=p_value,
+    error, freedom = spread(*inner, drifts=drifts, seed=_SEED) or (None, None)
+    (one,) = corrected(
+        [
+            ComparisonResult(
+                motion_class=motion_class,
+                joint=joint,
+                first=keys[0],
+                second=keys[1],
+                motions=len(before),
+                repetitions=[one.shape[1] for one in inner],
+                ratio=ratio,
+                error=error,
+                freedom=freedom,
+                level=1.0 - ALPHA,
+                low=None,
+                high=None,
+                verdict="too few",
+                wins=wins,
+                p_value=p_value,
+                p_corrected=p_value,
+            )
+        ]
     )
-    return _judged(one, 1)
+    return one
 
 
 def corrected(comparisons: Sequence[ComparisonResult]) -> list[ComparisonResult]:
-    """The comparisons of one table, corrected for their number.
+    """The comparisons of one table with interval and verdict, corrected for their number.
 
-    Intervals and verdicts after Bonferroni, so that all intervals of the table hold together and
-    a verdict is exactly that of its interval; signed ranks after Holm.
+    Intervals by Student's t and verdicts after Bonferroni, so that all intervals of the table hold
+    together and a verdict is exactly that of its interval; signed ranks after Holm.
     """
     after = holm(np.array([one.p_value for one in comparisons])).tolist()
-    return [
-        _judged(one, len(comparisons)).model_copy(update={"p_corrected": p})
-        for one, p in zip(comparisons, after, strict=True)
-    ]
+    level = 1.0 - ALPHA / max(1, len(comparisons))
+    found = []
+    for one, p_value in zip(comparisons, after, strict=True):
+        low, high = None, None
+        if one.error is not None and one.freedom is not None:
+            width = float(stats.t.ppf(0.5 + 0.5 * level, one.freedom)) * one.error
+            low, high = (float(bound) for bound in one.ratio * np.exp([-width, width]))
+        judged = {"level": level, "low": low, "high": high, "p_corrected": p_value}
+        judged["verdict"] = verdict_of(one.ratio, low, high)
+        found.append(one.model_copy(update=judged))
+    return found
 
 
-def _judged(one: ComparisonResult, count: int) -> ComparisonResult:
-    """With interval and verdict as one of so many."""
-    level, low, high = 1.0 - ALPHA / count, None, None
-    if one.error is not None and one.freedom is not None:
-        width = Spread(one.error, one.freedom).half_width(level)
-        low, high = (float(bound) for bound in one.ratio * np.exp([-width, width]))
-    verdict = verdict_of(one.ratio, low, high)
-    return one.model_copy(update={"level": level, "low": low, "high": high, "verdict": verdict})
-
-
-def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> Spread | None:
+def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> tuple[float, float] | None:
     """Standard error of the mean over motions of log(error with second / error with first).
 
     A hierarchical bootstrap: repetitions of the first, repetitions of the second and motions are
@@ -141,7 +129,11 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> Spread | 
     consecutive repetitions are resampled, which may resemble their neighbours.
 
     `first` and `second` are inner products of the errors of the repetitions, by motion (m, r, r)
-    and (m, s, s). None with fewer than `FEWEST` repetitions, or one motion.
+    and (m, s, s).
+
+    Returns:
+        The standard error and its degrees of freedom; None with fewer than `FEWEST` repetitions,
+        or one motion.
     """
     motions = len(first)
     if motions < 2 or min(first.shape[1], second.shape[1]) < FEWEST:
@@ -163,10 +155,10 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> Spread | 
     )
     total = sum(variance for variance, _ in parts)
     if total <= 0.0:
-        return Spread(0.0, float(motions - 1))
+        return 0.0, float(motions - 1)
     freedom = total**2 / sum(variance**2 / count for variance, count in parts)
     wider = parts[0][0] - single[0] + parts[1][0] - single[1]
-    return Spread(float(np.sqrt(together.var(ddof=1) + wider)), freedom)
+    return float(np.sqrt(together.var(ddof=1) + wider)), freedom
 
 
 def _resampled(
@@ -208,26 +200,6 @@ def _logs(kernels: Array, weights: Array) -> Array:
     return np.asarray(0.5 * np.log(np.maximum(found, np.finfo(float).tiny)))
 
 
-def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
-    """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
-    if len(fits) < 2:
-        return None
-    whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
-    other, cut = sorted(whole, key=lambda key: whole[key])
-    count = max(1, round(whole[other] / fits[cut].duration))
-    if count >= len(fits[cut].values):
-        return None
-    return EqualDataResult(
-        cut=cut,
-        name=f"{cut}-equal",
-        repetitions=count,
-        seconds=count * fits[cut].duration,
-        other=other,
-        other_seconds=whole[other],
-        comparisons=[],
-    )
-
-
 def parameter_error(estimate: Array, base: Array, truth: Array) -> float | None:
     """Geometric mean over the parameters of distance to the truth, that of `base` being 1 (p,)."""
     own, reference = np.abs(estimate - truth), np.abs(base - truth)
@@ -251,31 +223,30 @@ def bands_of(
     if not 1 <= size < len(values):
         return []
     weights = _subsets(len(values), size)
-    found: list[AblationBand] = []
-
-    def add(
-        quantity: Literal["error", "own", "parameter_error"], name: str | None, some: Array
-    ) -> None:
-        # Figures that exist: of few subsets the smallest and the largest.
-        low, high = np.percentile(some, (2.5, 97.5), method="inverted_cdf").tolist()
-        found.append(
-            AblationBand(
-                method=method, repetitions=size, quantity=quantity, motion_class=name,
-                low=low, high=high, subsets=len(some),
-            )
-        )  # fmt: skip
-
+    figures: list[tuple[Quantity, str | None, Array]] = []
     for name, one in forms.items():
-        scale = one.torque_squared.sum(axis=1)
-        add("error", name, _medians(one.torque_kernels(values), weights, scale))
+        errors = one.relative(one.torque_kernels(values), weights)
+        figures.append(("error", name, np.median(errors, axis=0)))
         if truth is not None:
-            add("own", name, _medians(one.own_kernels(values, truth), weights, scale))
+            own = one.relative(one.own_kernels(values, truth), weights)
+            figures.append(("own", name, np.median(own, axis=0)))
     if truth is not None:
-        errors = [parameter_error(estimate, reference, truth) for estimate in weights @ values]
-        known = [error for error in errors if error is not None]
-        if known:
-            add("parameter_error", None, np.array(known))
-    return found
+        distances = [parameter_error(one, reference, truth) for one in weights @ values]
+        known = np.array([one for one in distances if one is not None])
+        figures += [("parameter_error", None, known)] if len(known) else []
+    return [
+        AblationBand(
+            method=method,
+            repetitions=size,
+            quantity=quantity,
+            motion_class=name,
+            # Figures that exist: of few subsets the smallest and the largest.
+            low=float(np.percentile(some, 2.5, method="inverted_cdf")),
+            high=float(np.percentile(some, 97.5, method="inverted_cdf")),
+            subsets=len(some),
+        )
+        for quantity, name, some in figures
+    ]
 
 
 def _subsets(count: int, size: int) -> Array:
@@ -288,9 +259,3 @@ def _subsets(count: int, size: int) -> Array:
     weights = np.zeros((len(chosen), count))
     np.put_along_axis(weights, chosen, 1.0 / size, axis=1)
     return weights
-
-
-def _medians(kernels: Array, weights: Array, scale: Array) -> Array:
-    """Median over the motions of the relative error, for each row of weights."""
-    squared = ((weights @ kernels) * weights).sum(axis=2)  # (m, s)
-    return np.asarray(np.median(np.sqrt(np.maximum(squared, 0.0) / scale[:, None]), axis=0))

@@ -7,15 +7,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import pi
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.study.campaigns import noise_key
-from hil.study.records import CLASSES, ClassErrors, ClassForms, FitRecord, Fitted, ScoreRecord
-from hil.study.results import (
+from hil.version import software
+from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
+
+from .campaigns import AP, SINES, A, B, noise_key, variant_key
+from .records import CLASSES, ClassErrors, ClassForms, FitRecord, Fitted, ScoreRecord
+from .results import (
     AblationBand,
     AblationPoint,
     AblationResult,
@@ -24,14 +28,15 @@ from hil.study.results import (
     ComparisonResult,
     ConditionResult,
     CrossCell,
+    EqualDataResult,
     MethodResult,
     MotionRow,
     StudyParameter,
+    StudyResults,
+    conclusions,
 )
-from hil.study.searches import AP, SINES, A, B, fly_key, via_key, weight_key
-from hil.study.settings import StudySettings
-from hil.study.statistics import bands_of, compared_on, corrected, equal_data, parameter_error
-from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
+from .settings import StudySettings
+from .statistics import bands_of, compared_on, corrected, parameter_error
 
 Array = NDArray[np.float64]
 
@@ -49,14 +54,19 @@ TABLE1: Final = (
 """The paper's Table 1: method, N, log det in units that are not named, I_c, notes."""
 
 
-@dataclass(frozen=True)
-class Condition:
-    """What a condition is called, and whether its repetitions may resemble their neighbours."""
-
-    key: str
-    words: str
-    effects: tuple[str, ...]
-    drifts: bool = True
+def study_results(root: Path, cell: Cell, truth: Array | None, **tables: Any) -> StudyResults:
+    """Results of a study with what its numbers say; `tables` are the other fields."""
+    results = StudyResults(
+        name=root.resolve().name,
+        cell=cell.name,
+        software=software(),
+        joint_names=list(cell.joint_names),
+        n_base=len(cell.model.base.names),
+        parameters=parameters_of(cell, truth),
+        reading=[],
+        **tables,
+    )
+    return results.model_copy(update={"reading": conclusions(results)})
 
 
 def is_printed(cell: Cell) -> bool:
@@ -101,6 +111,26 @@ def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
     ]
 
 
+def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
+    """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
+    if len(fits) < 2:
+        return None
+    whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
+    other, cut = sorted(whole, key=lambda key: whole[key])
+    count = max(1, round(whole[other] / fits[cut].duration))
+    if count >= len(fits[cut].values):
+        return None
+    return EqualDataResult(
+        cut=cut,
+        name=f"{cut}-equal",
+        repetitions=count,
+        seconds=count * fits[cut].duration,
+        other=other,
+        other_seconds=whole[other],
+        comparisons=[],
+    )
+
+
 def repetitions_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
     """Estimates (r, p) of the repetitions of each method.
 
@@ -117,6 +147,16 @@ def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
     return {key: values.mean(axis=0) for key, values in repetitions_of(fits).items()}
 
 
+@dataclass(frozen=True)
+class Condition:
+    """What a condition is called, and whether its repetitions may resemble their neighbours."""
+
+    key: str
+    words: str
+    effects: tuple[str, ...]
+    drifts: bool = True
+
+
 def condition_result(
     condition: Condition,
     labels: Mapping[str, str],
@@ -124,46 +164,39 @@ def condition_result(
     scores: Mapping[str, ScoreRecord],
     parameters: Sequence[StudyParameter],
     joint_names: Sequence[str],
-    others: Sequence[str] = (),
 ) -> ConditionResult:
     """All tables of one condition.
 
-    `fits` of the methods are in the order of the tables, `scores` by class of motion, `others`
-    further estimates in the cross table, such as the planted parameters.
+    `fits` of the methods are in the order of the tables, `scores` by class of motion.
     """
     keys, equal, estimates = list(fits), equal_data(fits), repetitions_of(fits)
-    wanted = [*estimates, *others]
     classes = [_class_result(name, one, condition) for name, one in scores.items()]
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
     truth = None
-    if parameters and all(one.truth is not None for one in parameters):
+    if not condition.effects and all(one.truth is not None for one in parameters):
         truth = np.array([one.truth for one in parameters], dtype=np.float64)
 
     def pair(
-        name: str,
-        keys: tuple[str, str],
-        *,
-        joint: int | None = None,
-        truth: Array | None = None,
+        name: str, some: Sequence[str], joint: int | None = None, *, own: bool = False
     ) -> ComparisonResult:
         """Two estimates by the torque they miss, of one joint or all, or by their own error."""
-        one = forms[name]
         first, second = (
-            one.torque_kernels(estimates[key], joint)
-            if truth is None
-            else one.own_kernels(estimates[key], truth)
-            for key in keys
+            forms[name].own_kernels(estimates[key], truth)
+            if own and truth is not None
+            else forms[name].torque_kernels(estimates[key], joint)
+            for key in some
         )
-        named = None if joint is None else joint_names[joint]
-        return compared_on(name, keys, (first, second), joint=named, drifts=condition.drifts)
+        named, two = None if joint is None else joint_names[joint], (some[0], some[1])
+        return compared_on(name, two, (first, second), joint=named, drifts=condition.drifts)
 
-    two = (keys[0], keys[1]) if len(keys) > 1 else None
-    own = None if condition.effects else truth
-    if two is not None and equal is not None:
-        cut = tuple(equal.name if key == equal.cut else key for key in two)
-        rows = corrected([pair(name, (cut[0], cut[1])) for name in forms])
+    two = keys[:2] if len(keys) > 1 else None
+    own = [pair(name, two, own=True) for name in forms if two and truth is not None]
+    numbered = range(len(joint_names) if "fly-by" in forms else 0)
+    joints = [pair("fly-by", two, j) for j in numbered if two]
+    if equal is not None:
+        cut = [equal.name if key == equal.cut else key for key in keys[:2]]
+        rows = corrected([pair(name, cut) for name in forms])
         equal = equal.model_copy(update={"comparisons": rows})
-    joints = range(len(joint_names) if two and "fly-by" in forms else 0)
     example = scores.get("fly-by") or next(iter(scores.values()), None)
     return ConditionResult(
         key=condition.key,
@@ -171,16 +204,12 @@ def condition_result(
         effects=list(condition.effects),
         methods=[_method(key, labels[key], fits[key]) for key in keys],
         classes=classes,
-        cross=[_cell(one, key) for one in classes for key in wanted if key in one.overall],
+        cross=[_cell(one, key) for one in classes for key in one.overall],
         comparisons=corrected(
             [pair(name, some) for name in forms for some in compared_pairs(keys)]
         ),
-        own_comparisons=[]
-        if own is None or two is None
-        else corrected([pair(name, two, truth=own) for name in forms]),
-        joint_comparisons=[]
-        if two is None
-        else corrected([pair("fly-by", two, joint=j) for j in joints]),
+        own_comparisons=corrected(own),
+        joint_comparisons=corrected(joints),
         equal_data=equal,
         closeness=_closeness(fits, keys, parameters),
         examples=[] if example is None else example.examples,
@@ -243,21 +272,22 @@ def _closeness(
     paper_a, paper_b, c = (np.array(values, dtype=np.float64) for values in prints)
     closer = np.abs(columns[1] - c) < np.abs(columns[0] - c)
     printed = np.abs(paper_b - c) < np.abs(paper_a - c)
-    found = []
-    for group, rows in GROUPS.items():
-        members = [one.printed_id in rows for one in parameters] & np.isfinite(c)
-        found.append(
-            ClosenessResult(
-                group=group,
-                reference="pi_C",
-                first=keys[0],
-                second=keys[1],
-                parameters=int(members.sum()),
-                second_closer=int(closer[members].sum()),
-                printed_second_closer=int(printed[members].sum()),
-            )
+    groups = {
+        group: [one.printed_id in rows for one in parameters] & np.isfinite(c)
+        for group, rows in GROUPS.items()
+    }
+    return [
+        ClosenessResult(
+            group=group,
+            reference="pi_C",
+            first=keys[0],
+            second=keys[1],
+            parameters=int(members.sum()),
+            second_closer=int(closer[members].sum()),
+            printed_second_closer=int(printed[members].sum()),
         )
-    return found
+        for group, members in groups.items()
+    ]
 
 
 _TEXTS: Final = {
@@ -321,45 +351,34 @@ class Evidence:
     @cached_property
     def forms(self) -> dict[str, ClassForms]:
         """Of the held-out motions, by class: the error of any estimate."""
-        return {
-            name: ClassForms.of(
-                [form for own in self.scores if name in own for form in own[name].forms]
-            )
+        every = {
+            name: [form for own in self.scores if name in own for form in own[name].forms]
             for name in CLASSES
-            if any(name in own for own in self.scores)
         }
+        return {name: ClassForms.of(forms) for name, forms in every.items() if forms}
 
     def executed(self, key: str) -> Array:
         """Estimates (r, p) of the repetitions of an ablation's own campaign."""
         return np.array(self.fits[key].values)
 
     def point(
-        self,
-        value: float,
-        record: FitRecord,
-        values: Array,
-        reference: Array,
-        *,
-        method: str,
-        base: bool,
-        label: str = "",
+        self, value: float, record: FitRecord, values: Array, reference: Array, **named: Any
     ) -> AblationPoint:
         """One setting: estimates (r, p) of its repetitions beside a reference (p,)."""
-        own, truth = values.mean(axis=0), self.truth
+        estimate, truth, forms = values.mean(axis=0), self.truth, self.forms.items()
+        own = {}
+        if truth is not None:
+            own = {name: float(np.median(one.own(estimate, truth))) for name, one in forms}
         return AblationPoint(
             value=value,
-            label=label,
-            method=method,
-            base=base,
             repetitions=len(values),
             log10_det=record.log10_det,
             coupling_index=record.coupling_index,
             duration=record.duration,
-            parameter_error=None if truth is None else parameter_error(own, reference, truth),
-            error={name: float(np.median(one.overall(own))) for name, one in self.forms.items()},
-            own={}
-            if truth is None
-            else {name: float(np.median(one.own(own, truth))) for name, one in self.forms.items()},
+            parameter_error=None if truth is None else parameter_error(estimate, reference, truth),
+            error={name: float(np.median(one.overall(estimate))) for name, one in forms},
+            own=own,
+            **named,
         )
 
     def bands(self, methods: Sequence[str], size: int, reference: Array) -> list[AblationBand]:
@@ -375,44 +394,56 @@ class Evidence:
 
 def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResult]:
     """All of a simulated study."""
-    reference = evidence.executed(B).mean(axis=0)
+    of_b, fits = evidence.executed(B), evidence.fits
+    reference = of_b.mean(axis=0)
+    sines = [key for key in SINES if key in fits]
+    fly_by = evidence.forms["fly-by"]
+    inner = {key: fly_by.torque_kernels(evidence.executed(key)) for key in (*sines, B)}
+    beside_b = [
+        compared_on("fly-by", (key, B), (inner[key], inner[B]), drifts=False) for key in sines
+    ]
 
     def varied(
-        key: str, wanted: Sequence[tuple[float, str, str]], base: object, methods: Sequence[str]
-    ) -> AblationResult:
-        """By value, method and key of the fit; the setting of the study itself is `base`."""
+        name: Literal["via", "weight", "fly"], values: Sequence[float]
+    ) -> list[tuple[float, str, str]]:
+        return [(value, B, variant_key(name, value)) for value in values]
+
+    # By ablation: value, method and key of the fit of each setting; the setting of the study
+    # itself, by value or key; and the methods that have bands.
+    wanted: dict[str, tuple[list[tuple[float, str, str]], object, tuple[str, ...]]] = {
+        "sines": ([(k, A, key) for k, key in enumerate(sines)], evidence.sines, ()),
+        "fly": (varied("fly", settings.fly), B, (B,)),
+        "n_via": (varied("via", settings.n_via), B, (B,)),
+        "weight": (varied("weight", settings.coupling_weight), B, (B,)),
+        "repetitions": ([], None, ()),
+        "noise": (
+            [(f, method, noise_key(method, f)) for method in (A, B) for f in settings.noise],
+            1.0,
+            (A, B),
+        ),
+    }
+    found = []
+    for name, (rows, base, methods) in wanted.items():
+        if name == "repetitions":
+            found.append(repetition_ablation(evidence, settings.subsets, (A, B)))
+            continue
         points = [
             evidence.point(
                 float(value),
-                evidence.fits[fit],
-                evidence.executed(fit),
+                fits[key],
+                evidence.executed(key),
                 reference,
                 method=method,
-                base=base in (value, fit),
-                label=_LABELS.get(fit, ""),
+                base=base in (value, key),
+                label=_LABELS.get(key, ""),
             )
-            for value, method, fit in wanted
-            if fit in evidence.fits
+            for value, method, key in rows
+            if key in fits
         ]
-        return _result(key, points, evidence.bands(methods, len(evidence.executed(B)), reference))
-
-    sines = [key for key in SINES if key in evidence.fits]
-    fly_by = evidence.forms["fly-by"]
-    inner = {key: fly_by.torque_kernels(evidence.executed(key)) for key in (*sines, B)}
-    beside_b = corrected(
-        [compared_on("fly-by", (key, B), (inner[key], inner[B]), drifts=False) for key in sines]
-    )
-    noises = [(f, method, noise_key(method, f)) for method in (A, B) for f in settings.noise]
-    return [
-        varied(
-            "sines", [(k, A, key) for k, key in enumerate(sines)], evidence.sines, ()
-        ).model_copy(update={"comparisons": beside_b}),
-        varied("fly", [(one, B, fly_key(one)) for one in settings.fly], B, (B,)),
-        varied("n_via", [(one, B, via_key(one)) for one in settings.n_via], B, (B,)),
-        varied("weight", [(one, B, weight_key(one)) for one in settings.coupling_weight], B, (B,)),
-        repetition_ablation(evidence, settings.subsets, (A, B)),
-        varied("noise", noises, 1.0, (A, B)),
-    ]
+        more = {"comparisons": corrected(beside_b)} if name == "sines" else {}
+        bands = evidence.bands(methods, len(of_b), reference)
+        found.append(_result(name, points, bands).model_copy(update=more))
+    return found
 
 
 def repetition_ablation(
@@ -426,9 +457,10 @@ def repetition_ablation(
         values = np.array(record.values)
         for size in (one for one in sizes if one <= len(values)):
             reference, base = last[:size].mean(axis=0), size == len(values)
-            some = values[:size]
             points.append(
-                evidence.point(float(size), record, some, reference, method=method, base=base)
+                evidence.point(
+                    float(size), record, values[:size], reference, method=method, base=base
+                )
             )
             bands += evidence.bands((method,), size, reference)
     return _result("repetitions", points, bands)

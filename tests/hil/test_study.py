@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import stats
 from typer.testing import CliRunner
 
-from hil.archive import open_archive
-from hil.campaign import CampaignFolder
+from hil.batch.workers import LocalWorkers
+from hil.campaign import Campaign, CampaignFolder
+from hil.campaign.quick_design import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import InputError, OperatorStopError
@@ -23,78 +28,504 @@ from hil.progress import Silent
 from hil.simulation import planted_values
 from hil.study import StudyResults, StudySettings, run_study, study_campaigns, study_settings
 from hil.study.campaigns import (
+    AP,
+    B0,
+    PRINTED_SINES,
+    SINES,
+    A,
+    B,
     Execution,
+    Plans,
+    Search,
     StudyError,
+    best_sines,
     execute,
-    plan_study,
-    workers_of,
+    in_children,
 )
-from hil.study.records import ClassForms, Run, ScoreRecord, class_of, classes_of
-from hil.study.searches import SINES, run_searches, searches
-from hil.study.settings import Effort, StudyFolder
-from hil.study.statistics import compare, equal_data, parameter_error
-from hil.study.tables import estimates_of, parameters_of
+from hil.study.page import study_page
+from hil.study.records import ClassForms, FitRecord, MotionForm, Run, ScoreRecord, classes_of
+from hil.study.results import (
+    AblationBand,
+    AblationPoint,
+    AblationResult,
+    ConditionResult,
+    EqualDataResult,
+    StudyParameter,
+    conclusions,
+    summary_of,
+)
+from hil.study.run import homes, recorded_runs
+from hil.study.settings import Effort
+from hil.study.statistics import (
+    FEWEST,
+    bands_of,
+    compare,
+    compared_on,
+    corrected,
+    parameter_error,
+    spread,
+    verdict_of,
+)
+from hil.study.tables import (
+    Condition,
+    compared_pairs,
+    condition_result,
+    equal_data,
+    estimates_of,
+    parameters_of,
+)
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
-from tests.hil.study_numbers import fitted
 from tests.hil.test_report import assert_stands_alone
 
 Array = NDArray[np.float64]
+Whole = tuple[Path, StudyResults]
+
+# Numbers of which the errors are known beforehand
+
+
+def fitted(values: Array, duration: float = 8.0) -> FitRecord:
+    """Repetitions of one excitation with these estimates (r, p)."""
+    n = values.shape[1]
+    return FitRecord(
+        inputs="",
+        repetitions=[f"excitation_{k:03d}_a1.mcap" for k in range(len(values))],
+        values=values.tolist(),
+        pooled=values.mean(axis=0).tolist(),
+        pooled_std=[0.1] * n,
+        undetermined=[],
+        noise_std=[1.0, 1.0],
+        log10_det=50.0,
+        coupling_index=3.0,
+        n_samples=100,
+        correlation=np.eye(n).tolist(),
+        duration=duration,
+        time=[0.0, 1.0],
+        position=[[0.0, 1.0]] * 2,
+        velocity=[[0.0, 1.0]] * 2,
+    )
+
+
+def flagged(count: int, of: int, repetitions: int, noise: float = 0.0) -> Array:
+    """Estimates (r, of) of method `count`: its own parameter is 1 but for noise, the others 0."""
+    random = np.random.default_rng([0, count])
+    return np.eye(of)[count] + noise * random.standard_normal((repetitions, of))
+
+
+def scored(errors: Mapping[str, Array]) -> ScoreRecord:
+    """Motions on which the k-th method, whose own parameter is 1, has these errors (m,)."""
+    table = np.array(list(errors.values()))
+    motions = table.shape[1]
+    return ScoreRecord(
+        inputs="",
+        durations=[10.0] * motions,
+        samples=[100] * motions,
+        left_out=[[10, 30]] * motions,
+        forms=[form(np.diag([*column, 0.0]) ** 2) for column in table.T],
+        overall={name: values.tolist() for name, values in errors.items()},
+        all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
+        own={},
+        mean_abs={name: np.outer(values, [1.0, 2.0]).tolist() for name, values in errors.items()},
+        examples=[],
+    )
+
+
+def form(gram: Array, joints: int = 2) -> MotionForm:
+    """A motion whose Gram of [Phi | tau] (p + 1, p + 1) is shared equally by the joints."""
+    n = len(gram) - 1
+    return MotionForm(
+        archive="validation_000_a1.mcap",
+        torque_squared=[1.0 / joints] * joints,
+        columns=[list(range(n))] * joints,
+        slow=[(gram / joints).tolist()] * joints,
+        whole=gram[:n, :n].tolist(),
+    )
+
+
+def forms_of(*grams: Array) -> ClassForms:
+    """Motions with these Grams."""
+    return ClassForms.of([form(gram) for gram in grams])
+
+
+def random_forms(motions: int, n: int) -> ClassForms:
+    """Motions with torque that parameters (n,) of 0 predict exactly."""
+    random = np.random.default_rng(0)
+    tables = random.standard_normal((motions, 40, n)) * random.uniform(1, 3, (motions, 1, 1))
+    return forms_of(*(np.pad(table.T @ table, (0, 1)) for table in tables))
+
 
 errors = st.lists(
     st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_size=1, max_size=30
 ).map(lambda pairs: tuple(np.array(column) for column in zip(*pairs, strict=True)))
 
 
-# Paired statistics
+class TestErrors:
+    """Errors of estimates from the quadratic forms of motions."""
+
+    def test_a_form_gives_the_error_of_any_mean_of_estimates(self) -> None:
+        random = np.random.default_rng(1)
+        phi, tau = random.standard_normal((50, 3)), random.standard_normal(50)
+        table = np.column_stack([phi, tau])
+        forms = forms_of(table.T @ table)
+        values = random.standard_normal((4, 3))
+        mean = values.mean(axis=0)
+        left = np.linalg.norm(tau - phi @ mean)  # over torque of 1
+        assert forms.overall(mean) == pytest.approx([left])
+        assert np.sqrt(forms.torque_kernels(values).mean()) == pytest.approx(left)
+        one_joint = np.sqrt(forms.torque_kernels(values, 0).mean())
+        assert one_joint == pytest.approx(left / np.sqrt(2.0))
+        away = np.linalg.norm(phi @ (mean - 1.0))
+        assert forms.own(mean, np.ones(3)) == pytest.approx([away])
+        assert np.sqrt(forms.own_kernels(values, np.ones(3)).mean()) == pytest.approx(away)
+
+    def test_the_longer_excitation_is_cut_to_as_much_motion(self) -> None:
+        short = fitted(np.ones((6, 4)))
+        fits = {"a": fitted(np.arange(24.0).reshape(6, 4), 20.0), "b": short}  # 120 s and 48 s
+        equal = equal_data(fits)
+        assert equal is not None
+        assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
+        assert (equal.other, equal.other_seconds) == ("b", 48.0)
+        assert estimates_of(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
+        assert equal_data({"a": short, "b": short}) is None
+        assert equal_data({"a": short}) is None
+
+    def test_the_distance_of_the_base_itself_is_one(self) -> None:
+        truth, base = np.zeros(3), np.array([1.0, -2.0, 3.0])
+        assert parameter_error(base, base, truth) == pytest.approx(1.0)
+        assert parameter_error(-0.5 * base, base, truth) == pytest.approx(0.5)
+        assert parameter_error(truth, base, truth) is None
+
+    def test_the_band_holds_what_other_repetitions_give(self) -> None:
+        forms, values = {"fly-by": random_forms(5, 4)}, flagged(0, 4, 6, 0.1)
+        found = bands_of("b", values, 1, forms, np.zeros(4), values[0])
+        bands = {one.quantity: one for one in found}
+        singles = [float(np.median(forms["fly-by"].overall(one))) for one in values]
+        error = bands["error"]
+        assert (error.low, error.high) == pytest.approx((min(singles), max(singles)))
+        assert error.subsets == 6
+        assert bands["own"].low == pytest.approx(error.low)
+        assert bands["parameter_error"].low <= 1.0 <= bands["parameter_error"].high
+        assert bands_of("b", values, 6, forms, np.zeros(4), values[0]) == []
+        some = bands_of("b", values, 3, forms, None, values[0])
+        assert {one.quantity for one in some} == {"error"}
+
+    def test_planted_values_in_printed_units_are_the_manufacturers(self) -> None:
+        cell = Cell.load(CELL_PATH)
+        printed = [one for one in parameters_of(cell, planted_values(cell)) if one.printed_id]
+        known = [one for one in printed if one.printed_c is not None]
+        assert len(printed) == 58 and len(known) == 52
+        for one in known:
+            assert one.truth is not None and one.printed_c is not None
+            assert one.printed_factor * one.truth == pytest.approx(one.printed_c, abs=6e-4), one
 
 
-@settings(max_examples=8)
-@given(errors)
-def test_comparing_the_other_way_round_inverts_the_ratio_and_keeps_the_p_value(
-    pair: tuple[Array, Array],
-) -> None:
-    there, back = compare(*pair), compare(*reversed(pair))
-    assert there[0] * back[0] == pytest.approx(1.0)
-    assert there[2] == pytest.approx(back[2])
-    assert there[1] + back[1] + int(np.sum(pair[0] == pair[1])) == len(pair[0])
+class TestSpread:
+    """What other motions and other repetitions would have changed."""
+
+    def test_like_repetitions_leave_the_scatter_of_motions(self) -> None:
+        logs = np.random.default_rng(3).normal(0.1, 0.3, 12)
+        same = np.ones((12, 4, 4))
+        found = spread(same, same * np.exp(2.0 * logs)[:, None, None], drifts=False, seed=0)
+        assert found is not None
+        assert found[1] == pytest.approx(11.0)
+        # A standard deviation of 4000 draws is known to about 1 %.
+        assert found[0] == pytest.approx(stats.sem(logs), rel=0.05)
+
+    def test_noise_of_estimates_does_not_vanish_with_more_motions(self) -> None:
+        few, many = (
+            spread(
+                *(random_forms(m, 6).torque_kernels(flagged(k, 6, 5, 0.2)) for k in (0, 1)),
+                drifts=False,
+                seed=0,
+            )
+            for m in (10, 160)
+        )
+        assert few is not None and many is not None
+        assert many[0] > 0.5 * few[0]  # over motions alone it would fall to a quarter
+
+    @pytest.mark.parametrize("repetitions", [3, 10])
+    @pytest.mark.parametrize("off", [0.0, 3.0])
+    def test_a_method_seldom_differs_from_itself(self, repetitions: int, off: float) -> None:
+        trials, differ = 60, 0
+        random, forms = np.random.default_rng(4), random_forms(10, 12)
+        for _ in range(trials):
+            values = [off + random.standard_normal((repetitions, 12)) for _ in range(2)]
+            inner = forms.torque_kernels(values[0]), forms.torque_kernels(values[1])
+            differ += compared_on("fly-by", ("a", "b"), inner, drifts=False).differs
+        # At 5 %, or less, so many are exceeded once in 1000 times.
+        assert differ <= stats.binom(trials, 0.05).ppf(0.999)
+
+    def test_a_difference_that_exists_is_found(self) -> None:
+        forms, random = random_forms(10, 12), np.random.default_rng(5)
+        near, far = (off + 0.02 * random.standard_normal((10, 12)) for off in (1.0, 1.2))
+        inner = forms.torque_kernels(near), forms.torque_kernels(far)
+        one = compared_on("fly-by", ("a", "b"), inner, drifts=False)
+        assert one.ratio == pytest.approx(1.2, rel=0.02)
+        assert one.low is not None and one.low > 1.15
+        assert (one.verdict, one.repetitions) == ("worse", [10, 10])
+        assert compared_on("fly-by", ("b", "a"), inner[::-1], drifts=False).verdict == "better"
+        zero = np.zeros(12)
+        own_errors = forms.own_kernels(near, zero), forms.own_kernels(far, zero)
+        own = compared_on("fly-by", ("a", "b"), own_errors, drifts=False)
+        assert own.ratio == pytest.approx(one.ratio)  # these torques are those of parameters of 0
+
+    def test_repetitions_like_their_neighbours_count_as_blocks(self) -> None:
+        forms, random = random_forms(10, 4), np.random.default_rng(6)
+        slow = np.repeat(random.standard_normal((9, 4)), 3, axis=0)
+        other = 1.0 + random.standard_normal((27, 4))
+        inner = forms.torque_kernels(1.0 + slow), forms.torque_kernels(other)
+        single, blocks = (spread(*inner, drifts=drifts, seed=0) for drifts in (False, True))
+        assert single is not None and blocks is not None
+        assert blocks[0] > 1.1 * single[0]
+        assert blocks[1] < single[1]
+
+    @pytest.mark.parametrize(("repetitions", "motions"), [(FEWEST - 1, 10), (1, 10), (5, 1)])
+    def test_too_few_repetitions_or_motions(self, repetitions: int, motions: int) -> None:
+        forms = random_forms(motions, 4)
+        a, b = (forms.torque_kernels(flagged(k, 4, repetitions, 0.01)) for k in range(2))
+        one = compared_on("fly-by", ("a", "b"), (a, b), drifts=False)
+        assert (one.verdict, one.low, one.high, one.error) == ("too few", None, None, None)
+        assert not one.differs
 
 
-def test_equal_errors_are_no_difference() -> None:
-    same = np.array([0.1, 0.2, 0.3])
-    assert compare(same, same) == (1, 0, 1)
+class TestVerdict:
+    """Tests of ratios, and tables of them."""
+
+    @settings(max_examples=8)
+    @given(errors)
+    def test_comparing_in_reverse_inverts_the_ratio(self, pair: tuple[Array, Array]) -> None:
+        there, back = compare(*pair), compare(*reversed(pair))
+        assert there[0] * back[0] == pytest.approx(1.0)
+        assert there[2] == pytest.approx(back[2])
+        assert there[1] + back[1] + int(np.sum(pair[0] == pair[1])) == len(pair[0])
+        assert compare(pair[0], pair[0]) == (1, 0, 1)
+
+    @pytest.mark.parametrize(
+        ("ratio", "low", "high", "verdict"),
+        [
+            (0.9, 0.8, 0.99, "better"),
+            (0.985, 0.98, 0.99, "slightly better"),
+            (0.9, 0.8, 1.0, "none"),
+            (1.01, 1.001, 1.02, "slightly worse"),
+            (1.3, 1.1, 1.5, "worse"),
+            (1.3, None, None, "too few"),
+        ],
+    )
+    def test_it_is_that_of_the_interval(
+        self, ratio: float, low: float | None, high: float | None, verdict: str
+    ) -> None:
+        assert verdict_of(ratio, low, high) == verdict
+
+    def test_intervals_of_a_larger_table_are_wider(self) -> None:
+        error = 0.1 / stats.t.ppf(0.985, 8.0)  # leaves out 1 at 97 %
+        inner = np.ones((4, 3, 3)), np.ones((4, 3, 3))
+        one = compared_on("fly-by", ("a", "b"), inner, drifts=False)
+        own = {"ratio": np.exp(0.1), "error": error, "freedom": 8.0, "p_value": 0.01}
+        (alone,) = corrected([one.model_copy(update=own)])
+        among = corrected([one.model_copy(update=own)] * 4)
+        assert (alone.level, alone.verdict) == (0.95, "worse")
+        assert (among[0].level, among[0].verdict) == (0.9875, "none")
+        assert alone.low is not None and alone.low > 1.0
+        assert among[0].low is not None and among[0].low < 1.0
+        assert [one.p_corrected for one in among] == pytest.approx([0.04] * 4)
+
+    def test_the_printed_sines_are_compared_with_b_alone(self) -> None:
+        assert compared_pairs([A, B, B0]) == [(A, B), (A, B0), (B, B0)]
+        assert compared_pairs([A, B, B0, AP]) == [(A, B), (A, B0), (B, B0), (AP, B)]
 
 
-# Estimates
+PLAIN = Condition("plain", "without unmodelled effects", (), drifts=False)
+EFFECTS = Condition("effects", "with unmodelled effects", ("ripple",), drifts=False)
+PARAMETERS = [StudyParameter(name=f"p{k}", unit="kg", truth=0.0) for k in range(2)]
 
 
-def test_with_as_much_motion_of_each_the_longer_one_is_cut() -> None:
-    long, short = fitted(np.arange(24.0).reshape(6, 4)), fitted(np.ones((6, 4)))
-    fits = {"a": long.model_copy(update={"duration": 20.0}), "b": short}  # 120 s and 48 s
-    equal = equal_data(fits)
-    assert equal is not None
-    assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
-    assert (equal.other, equal.other_seconds) == ("b", 48.0)
-    assert estimates_of(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
-    assert equal_data({"a": short, "b": short}) is None
-    assert equal_data({"a": long}) is None
+def condition(
+    ratio: float,
+    *,
+    named: Condition = PLAIN,
+    scatter: float = 0.05,
+    repetitions: int = 5,
+    noise: float = 0.01,
+    labels: Sequence[str] = ("A", "B"),
+    classes: Sequence[str] = ("fly-by",),
+    parameters: Sequence[StudyParameter] = PARAMETERS,
+) -> ConditionResult:
+    """The second method's errors are so many times the first's, but for scatter over motions."""
+    random = np.random.default_rng(5)
+    a = random.uniform(0.01, 0.03, 30)
+    b = ratio * a * np.exp(scatter * random.standard_normal(30))
+    keys = [label.lower() for label in labels]
+    return condition_result(
+        named,
+        dict(zip(keys, labels, strict=True)),
+        {key: fitted(flagged(k, 2, repetitions, noise)) for k, key in enumerate(keys)},
+        {name: scored(dict(zip(keys, (a, b), strict=True))) for name in classes},
+        parameters,
+        ("hip", "knee"),
+    )
 
 
-def test_the_distance_to_the_truth_is_one_for_the_base_itself() -> None:
-    truth, base = np.zeros(3), np.array([1.0, -2.0, 3.0])
-    assert parameter_error(base, base, truth) == pytest.approx(1.0)
-    assert parameter_error(-0.5 * base, base, truth) == pytest.approx(0.5)
-    assert parameter_error(truth, base, truth) is None
+def study(*conditions: ConditionResult, ablations: Sequence[AblationResult] = ()) -> StudyResults:
+    results = StudyResults(
+        name="made up", cell="arm", simulated=True, quick=False, settings=None, software={},
+        joint_names=["hip", "knee"], n_base=2, parameters=PARAMETERS, searches=[], table1=[],
+        conditions=list(conditions), ablations=list(ablations), reading=[], missing=[], times={},
+    )  # fmt: skip
+    return results.model_copy(update={"reading": conclusions(results)})
 
 
-def test_the_planted_values_in_the_units_of_the_print_are_the_manufacturers() -> None:
-    cell = Cell.load(CELL_PATH)
-    printed = [one for one in parameters_of(cell, planted_values(cell)) if one.printed_id]
-    known = [one for one in printed if one.printed_c is not None]
-    assert len(printed) == 58 and len(known) == 52
-    for one in known:
-        assert one.truth is not None and one.printed_c is not None
-        assert one.printed_factor * one.truth == pytest.approx(one.printed_c, abs=6e-4), one.name
+def text_of(results: StudyResults) -> str:
+    return " ".join(text for one in results.reading for text in (one.verdict, *one.sentences))
+
+
+class TestConclusion:
+    """What the numbers say."""
+
+    @pytest.mark.parametrize(("ratio", "winner", "loser"), [(0.8, "B", "A"), (1.25, "A", "B")])
+    def test_a_clear_difference_has_direction_and_size(
+        self, ratio: float, winner: str, loser: str
+    ) -> None:
+        results = study(condition(ratio))
+        (one,) = results.conditions[0].comparisons
+        answer = results.reading[0]
+        assert one.low is not None and one.high is not None
+        saved = 100.0 * (1.0 - min(one.ratio, 1.0 / one.ratio))
+        assert answer.verdict == f"{winner} is better, its error {saved:.0f} % smaller."
+        assert f"{one.ratio:.3f} times" in answer.sentences[0]
+        assert f"(interval {one.low:.3f} to {one.high:.3f})" in answer.sentences[0]
+        assert f"{loser} is better" not in text_of(results)
+        summary = summary_of(results)
+        assert summary["line"] == f"{answer.heading} {answer.verdict}"
+        (ratios,) = summary["ratios"]
+        assert (ratios["condition"], ratios["interval"]) == ("plain", [one.low, one.high])
+
+    @pytest.mark.parametrize(
+        ("made", "verdict"),
+        [
+            ({"ratio": 1.0, "scatter": 0.3}, "No significant difference."),
+            ({"ratio": 0.99, "scatter": 0.002, "noise": 1e-3}, "B is slightly better, its"),
+            ({"ratio": 0.8, "repetitions": 1}, "Too few repetitions or motions"),
+            ({"ratio": 0.8, "classes": ()}, "There is no held-out motion"),
+        ],
+    )
+    def test_what_is_small_or_uncertain_is_called_so(
+        self, made: dict[str, Any], verdict: str
+    ) -> None:
+        results = study(condition(**made))
+        assert results.reading[0].verdict.startswith(verdict)
+        assert ("better" in text_of(results)) == ("better" in verdict)
+        assert "nan" not in text_of(results)
+        page = study_page(results).decode()
+        assert ("± –" in page) == ("repetitions" in made) and "± 0<" not in page
+
+    def test_it_names_the_conditions_where_they_differ(self) -> None:
+        turned = study(condition(0.8), condition(1.25, named=EFFECTS))
+        verdicts = {one.key: one.verdict for one in turned.reading}
+        assert verdicts["prediction"].startswith("Without unmodelled effects: B is better")
+        assert "With unmodelled effects: A is better" in verdicts["prediction"]
+        assert verdicts["effects"].startswith("Yes: A is better")
+        same = study(condition(0.8), condition(0.8, named=EFFECTS))
+        verdicts = {one.key: one.verdict for one in same.reading}
+        assert verdicts["effects"] == "No." and verdicts["prediction"].startswith("B is better")
+
+    @pytest.mark.parametrize(("ratio", "gone"), [(1.0, True), (1.25, False)])
+    def test_more_motion_alone_is_no_better_method(self, ratio: float, gone: bool) -> None:
+        """A's motion is the longer one; `ratio` is that of B over as much motion of A."""
+        cut = condition(ratio, scatter=0.3 if gone else 0.05).comparisons
+        equal = EqualDataResult(
+            cut="a", name="a-equal", repetitions=2, seconds=40.0, other="b", other_seconds=38.0,
+            comparisons=[one.model_copy(update={"first": "a-equal"}) for one in cut],
+        )  # fmt: skip
+        uneven = condition(1.25).model_copy(update={"equal_data": equal})
+        verdict = study(uneven).reading[0].verdict
+        assert verdict.startswith("A is better")
+        assert ("% smaller, but not with as much motion of each." in verdict) is gone
+
+    def test_of_unknown_methods_it_names_neither_a_nor_b(self) -> None:
+        print_ = {"printed_a": 1.0, "printed_b": 2.0, "printed_c": 0.5}
+        printed = [
+            one.model_copy(update=print_ | {"printed_id": k + 1})
+            for k, one in enumerate(PARAMETERS)
+        ]
+        recorded = Condition("recorded", "as recorded", ())
+        results = study(
+            condition(0.8, named=recorded, labels=("march", "june"), parameters=printed)
+        )
+        assert "with june is closer to π_C than that with march" in study_page(results).decode()
+        assert re.search(r"\b(than|with|of|and) [AB]\b|\b[AB]'s", text_of(results)) is None
+
+    def test_campaigns_that_contradict_each_other_are_named(self) -> None:
+        answer = study(
+            *(
+                condition(ratio, named=Condition(f"recorded-{k}", f"on the motions of {k}", ()))
+                for k, ratio in (("march", 1.3), ("june", 0.7))
+            )
+        ).reading[0]
+        assert answer.verdict.startswith("On the motions of march: A is better")
+        assert "On the motions of june: B is better" in answer.verdict
+        assert "opposite conclusions" in answer.sentences[0]
+
+    def test_settings_outside_the_range_of_chance_are_named(self) -> None:
+        points = [
+            AblationPoint(
+                value=value, method="b", base=value == 0.5, repetitions=3, log10_det=1.0,
+                coupling_index=2.0, duration=1.0, parameter_error=1.0, error={"fly-by": 0.01},
+                own={"fly-by": own},
+            )
+            for value, own in ((0.0, 1.5e-3), (0.5, 5e-3), (1.0, 2.5e-3))
+        ]  # fmt: skip
+        band = AblationBand(
+            method="b", repetitions=3, quantity="own", motion_class="fly-by", low=1e-3, high=2e-3,
+            subsets=400,
+        )  # fmt: skip
+        fly = AblationResult(
+            key="fly", title="Fly-by", variable="share", words="", points=points, bands=[band]
+        )
+        found = study(condition(1.0), ablations=[fly]).reading[-1]
+        assert found.key == "ablation-fly"
+        assert found.sentences[0].endswith("0.100 % to 0.200 %; outside: 1.")
+
+
+class TestPlans:
+    """What is searched and run."""
+
+    def test_the_best_sines_are_those_of_largest_determinant(self) -> None:
+        def found(**log10_det: float) -> dict[str, Search]:
+            return {
+                key.replace("_", "-"): cast(
+                    Search,
+                    SimpleNamespace(
+                        excitation=SimpleNamespace(criteria=SimpleNamespace(log10_det=one))
+                    ),
+                )
+                for key, one in log10_det.items()
+            }
+
+        both = found(a_middle=60.0, a_home=65.0, a_middle_fast=80.0, b=90.0)
+        assert best_sines(both) == "a-middle-fast"
+        assert best_sines(both, PRINTED_SINES) == "a-home"
+        assert best_sines(found(b=90.0)) is None
+
+    def test_an_excitation_that_the_arm_does_not_bear(self, tmp_path: Path) -> None:
+        def at(condition: str, key: str) -> Execution:
+            return cast(Execution, SimpleNamespace(root=tmp_path / condition / key))
+
+        keys = {"plain": (B, AP), "ablation": (B, "b-fly-0")}
+        executions = {name: {key: at(name, key) for key in own} for name, own in keys.items()}
+        plans = Plans({}, executions, [])
+        left = plans.without({tmp_path / "ablation" / "b-fly-0": "joint 2: drive fault"})
+        assert left.executions["ablation"].keys() == {B}
+        assert left.missing == ["b-fly-0 could not be run: joint 2: drive fault"]
+        left = plans.without({tmp_path / "plain" / AP: "drive fault"})
+        assert left.executions["plain"].keys() == {B}
+        for name in keys:
+            with pytest.raises(StudyError, match=rf"{name}/b: this arm cannot bear .* drive fault"):
+                plans.without({tmp_path / name / B: "drive fault"})
+
+    def test_a_refusal_in_a_child_is_one_sentence(self, tmp_path: Path) -> None:
+        calls = [(tmp_path, (tmp_path / "none.toml",))]
+        with LocalWorkers(2) as workers, pytest.raises(StudyError, match=r"none\.toml.*resume"):
+            in_children(Cell.load, calls, "loading", Silent(), workers, of=1)
 
 
 # A whole study on an arm of two joints
@@ -102,11 +533,11 @@ def test_the_planted_values_in_the_units_of_the_print_are_the_manufacturers() ->
 
 @pytest.fixture(scope="module")
 def small() -> StudySettings:
-    return study_settings(quick=True, repetitions=2, motions=5, effects=False).model_copy(
+    few = Effort(population=8, generations=1)
+    return study_settings(quick=True, repetitions=2, motions=3, effects=False).model_copy(
         update={
-            "motions": 3,
-            "effort_a": Effort(population=8, generations=1),
-            "effort_b": Effort(population=8, generations=1),
+            "effort_a": few,
+            "effort_b": few,
             "fly": (0.0, 0.5),
             "n_via": (6,),
             "coupling_weight": (0.3,),
@@ -133,9 +564,7 @@ def short_sines() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def whole(
-    tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: Cell
-) -> tuple[Path, StudyResults]:
+def whole(tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: Cell) -> Whole:
     """A study that Ctrl-C ended after its first campaign, and that was then started again."""
     root = tmp_path_factory.mktemp("first") / "study"
 
@@ -157,233 +586,196 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.study.page.study_page", lambda _: b"")
 
 
-@pytest.mark.slow
-def test_the_study_leaves_results_and_one_self_contained_page(
-    whole: tuple[Path, StudyResults],
-) -> None:
-    root, found = whole
-    assert StudyResults.load(root / "results.json") == found
-    page = (root / "report.html").read_text("utf-8")
-    for part in ("Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Table 1", "Table 2"):
-        assert f"paper, {part}" in page
-    assert_stands_alone(page)
-    assert "SIMULATED ARM" in page
-    for paragraph in found.reading:
-        assert paragraph.sentences
+class TestWhole:
+    """Searches, campaigns, estimates, tables and page."""
 
+    @pytest.mark.slow
+    def test_it_leaves_results_and_one_self_contained_page(self, whole: Whole) -> None:
+        root, found = whole
+        assert StudyResults.load(root / "results.json") == found
+        page = (root / "report.html").read_text("utf-8")
+        for part in ("Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Table 1", "Table 2"):
+            assert f"paper, {part}" in page
+        assert_stands_alone(page)
+        assert "SIMULATED ARM" in page
+        assert all(paragraph.sentences for paragraph in found.reading)
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_page")
-def test_one_seed_is_one_study_with_any_number_of_processes_and_however_often_interrupted(
-    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
-) -> None:
-    root, found = whole
-    again = tmp_path / "study"
-    # That a search does not depend on them either is tested where searches are.
-    shutil.copytree(root / "designs", again / "designs")
-    shutil.copy(root / "study.json", again)
-    straight = run_study(again, small, Silent(), workers=2, cell=arm)
-    not_the_same = {"times": {}, "software": {}}
-    texts = [one.model_copy(update=not_the_same).to_json() for one in (found, straight)]
-    assert texts[0] == texts[1]
+    @pytest.mark.slow
+    @pytest.mark.usefixtures("no_page")
+    def test_one_seed_is_one_study_however_interrupted(
+        self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
+    ) -> None:
+        """With any number of processes; of searches that is tested where they are."""
+        root, found = whole
+        again = tmp_path / "study"
+        shutil.copytree(root / "designs", again / "designs")
+        shutil.copy(root / "study.json", again)
+        straight = run_study(again, small, Silent(), workers=2, cell=arm)
+        not_the_same: dict[str, object] = {"times": {}, "software": {}}
+        texts = [one.model_copy(update=not_the_same).to_json() for one in (found, straight)]
+        assert texts[0] == texts[1]
 
-
-def test_the_kept_forms_give_the_errors_that_the_archives_gave(
-    whole: tuple[Path, StudyResults],
-) -> None:
-    root, found = whole
-    (condition,) = found.conditions
-    truth = np.array([one.truth for one in found.parameters], dtype=np.float64)
-    for one in condition.classes:
-        (path,) = (root / "fits" / "plain").glob(f"*-{one.motion_class}.json")
-        record = ScoreRecord.model_validate_json(path.read_bytes())
-        forms = ClassForms.of(record.forms)
-        for method in condition.methods:
-            own = np.array(method.mean)
-            assert forms.overall(own) == pytest.approx(one.overall[method.key], rel=1e-6)
-            assert forms.own(own, truth) == pytest.approx(one.own[method.key], rel=1e-6)
-
-
-def test_every_estimate_meets_every_class(whole: tuple[Path, StudyResults]) -> None:
-    _, found = whole
-    assert [one.key for one in found.conditions] == ["plain"]
-    for condition in found.conditions:
-        cells = {(one.method, one.motion_class) for one in condition.cross}
-        classes = ("fly-by", "stop-to-stop", "sinusoid")
+    def test_every_estimate_predicts_every_class(self, whole: Whole) -> None:
+        """And the forms in the records give the errors that the archives gave."""
+        root, found = whole
+        (plain,) = found.conditions
+        cells = {(one.method, one.motion_class) for one in plain.cross}
         methods = ["a", "b", "b0", "planted"]
-        if condition.equal_data is not None:
-            methods.append(condition.equal_data.name)
+        methods += [plain.equal_data.name] if plain.equal_data is not None else []
+        classes = ("fly-by", "stop-to-stop", "sinusoid")
         assert cells == {(m, c) for m in methods for c in classes}
-        assert len(condition.comparisons) == 9
-        assert all(len(one.archives) == 3 for one in condition.classes)
-    assert [one.key for one in found.ablations] == [
-        "sines", "fly", "n_via", "weight", "repetitions", "noise",
-    ]  # fmt: skip
+        assert len(plain.comparisons) == 9
+        truth = np.array([one.truth for one in found.parameters], dtype=np.float64)
+        for one in plain.classes:
+            assert len(one.archives) == 3
+            assert set(one.own) >= {"a", "b", "b0"} and "planted" not in one.own
+            (path,) = (root / "fits" / "plain").glob(f"*-{one.motion_class}.json")
+            forms = ClassForms.of(ScoreRecord.model_validate_json(path.read_bytes()).forms)
+            for method in plain.methods:
+                mean = np.array(method.mean)
+                assert forms.overall(mean) == pytest.approx(one.overall[method.key], rel=1e-6)
+                assert forms.own(mean, truth) == pytest.approx(one.own[method.key], rel=1e-6)
+        names = ["sines", "fly", "n_via", "weight", "repetitions", "noise"]
+        assert [one.key for one in found.ablations] == names
+        assert all(point.own for one in found.ablations for point in one.points)
 
+    def test_estimates_of_a_rigid_arm_are_near_the_planted_values(self, whole: Whole) -> None:
+        _, found = whole
+        truth = np.array([one.truth for one in found.parameters])
+        for method in found.conditions[0].methods:
+            assert not method.undetermined
+            distance = np.abs(np.array(method.pooled) - truth)
+            assert np.mean(distance <= 4.0 * np.array(method.pooled_std)) >= 0.8, method.key
 
-def test_estimates_of_a_rigid_arm_come_to_the_planted_values(
-    whole: tuple[Path, StudyResults],
-) -> None:
-    _, found = whole
-    plain = found.conditions[0]
-    truth = np.array([one.truth for one in found.parameters])
-    for method in plain.methods:
-        assert not method.undetermined
-        distance = np.abs(np.array(method.pooled) - truth)
-        assert np.mean(distance <= 4.0 * np.array(method.pooled_std)) >= 0.8, method.key
-
-
-def test_the_planted_values_have_no_error_of_their_own(whole: tuple[Path, StudyResults]) -> None:
-    _, found = whole
-    for one in found.conditions[0].classes:
-        assert set(one.own) >= {"a", "b", "b0"} and "planted" not in one.own
-    assert all(point.own for one in found.ablations for point in one.points)
-
-
-def test_held_out_motions_lie_where_their_class_is(whole: tuple[Path, StudyResults]) -> None:
-    root, _ = whole
-    for key, name in (("a", "sinusoid"), ("b", "fly-by"), ("b0", "stop-to-stop")):
-        run = Run(key, key, root / "campaigns" / "plain" / key)
+    @pytest.mark.parametrize(
+        ("key", "name"), [("a", "sinusoid"), ("b", "fly-by"), ("b0", "stop-to-stop")]
+    )
+    def test_held_out_motions_are_of_their_class(self, whole: Whole, key: str, name: str) -> None:
+        run = Run(key, key, whole[0] / "campaigns" / "plain" / key)
         assert {one: len(names) for one, names in classes_of(run).items()} == {name: 3}
-        first = CampaignFolder(run.root).completed("validation")[0]
-        assert class_of(json.loads(open_archive(first).attachments["plan.json"])) == name
+        assert len(CampaignFolder(run.root).completed("validation")) == 3
+
+    @pytest.mark.usefixtures("no_page")
+    def test_started_again_nothing_whole_is_done_again(
+        self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
+    ) -> None:
+        root, found = whole
+        copy = shutil.copytree(root, tmp_path / "copy")
+        patterns = ("designs/*/excitation.toml", "campaigns/*/*/archives/*.mcap", "fits/*/*.json")
+
+        def written() -> dict[Path, int]:
+            return {p: p.stat().st_mtime_ns for one in patterns for p in copy.glob(one)}
+
+        before = written()
+        assert len(before) > 30
+        lost = copy / "campaigns" / "plain" / "b" / "archives" / "excitation_001_a1.mcap"
+        lost.unlink()  # as if it had never been written whole
+        again = run_study(copy, small, Silent(), workers=1, cell=arm)
+        new = {path for path, when in written().items() if when != before.get(path)}
+        assert {path.parent.parent.name for path in new if path.suffix == ".mcap"} == {"b"}
+        assert not any(path.name == "excitation.toml" for path in new)
+        fits = {path.stem for path in new if path.parent.parent.name == "fits"}
+        # What rests on the lost repetition is estimated and predicted with again, and nothing else.
+        assert fits == {"b", "a-sinusoid", "b-fly-by", "b0-stop-to-stop"}
+        methods = zip(again.conditions[0].methods, found.conditions[0].methods, strict=True)
+        assert [now.mean == then.mean for now, then in methods] == [True, False, True]
+
+    @pytest.mark.slow
+    @pytest.mark.usefixtures("no_page")
+    def test_unmodelled_effects_are_another_condition(
+        self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
+    ) -> None:
+        again = tmp_path / "study"
+        shutil.copytree(whole[0] / "designs", again / "designs")
+        begun = StudySettings.model_validate_json((whole[0] / "study.json").read_text())
+        some = small.model_copy(update={"effects": True, "repetitions": 4, "cell": begun.cell})
+        (again / "study.json").write_text(some.to_json())
+        plain, effects = run_study(again, some, Silent(), workers=2, cell=arm).conditions
+        assert (plain.key, effects.key) == ("plain", "effects")
+        assert effects.effects and not effects.own_comparisons
+        assert all(one.repetitions == [4, 4] for one in effects.comparisons)
+        assert "too few" not in {one.verdict for one in effects.comparisons}
+        medians = [
+            {(one.method, one.motion_class): one.median for one in some.cross}[("b", "fly-by")]
+            for some in (plain, effects)
+        ]
+        assert medians[1] > medians[0]
+
+    def test_other_settings_are_refused_in_the_same_folder(
+        self, whole: Whole, small: StudySettings, arm: Cell
+    ) -> None:
+        root, _ = whole
+        with pytest.raises(InputError, match="seed: the study in this folder was begun with 1, no"):
+            run_study(root, small.model_copy(update={"seed": 2}), Silent(), workers=1, cell=arm)
+        with pytest.raises(InputError, match="is not empty and holds no study"):
+            run_study(root / "fits", small, Silent(), workers=1, cell=arm)
 
 
-@pytest.mark.usefixtures("no_page")
-def test_started_again_nothing_whole_is_done_again(
-    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
-) -> None:
-    root, found = whole
-    copy = shutil.copytree(root, tmp_path / "copy")
-    kept = ("designs/*/excitation.toml", "campaigns/*/*/archives/*.mcap", "fits/*/*.json")
-    before = {p: p.stat().st_mtime_ns for pattern in kept for p in copy.glob(pattern)}
-    assert len(before) > 30
-    lost = copy / "campaigns" / "plain" / "b" / "archives" / "excitation_001_a1.mcap"
-    lost.unlink()  # as if it had never been written whole
-    again = run_study(copy, small, Silent(), workers=1, cell=arm)
-    after = {p: p.stat().st_mtime_ns for pattern in kept for p in copy.glob(pattern)}
-    new = {path for path in after if after[path] != before.get(path)}
-    assert {path.parent.parent.name for path in new if path.suffix == ".mcap"} == {"b"}
-    assert not any(path.name == "excitation.toml" for path in new)
-    fits = {path.stem for path in new if path.parent.parent.name == "fits"}
-    # What rests on the lost repetition is estimated and predicted with again, and nothing else.
-    assert fits == {"b", "a-sinusoid", "b-fly-by", "b0-stop-to-stop"}
-    methods = zip(again.conditions[0].methods, found.conditions[0].methods, strict=True)
-    assert [now.mean == then.mean for now, then in methods] == [True, False, True]
+class TestRecorded:
+    """Campaigns that were recorded."""
+
+    @pytest.mark.usefixtures("no_page")
+    def test_they_give_what_they_allow(self, whole: Whole, tmp_path: Path) -> None:
+        """Their excitations say which is A and which is B, whatever the folders are called."""
+        root, found = whole
+        runs = [
+            Path(shutil.copytree(root / "campaigns" / "plain" / key, tmp_path / name))
+            for key, name in (("b", "tuesday"), ("a", "monday"))
+        ]
+        recorded = study_campaigns(tmp_path / "out", runs, Silent(), workers=1)
+        (condition,) = recorded.conditions
+        assert [one.label for one in condition.methods] == ["A (monday)", "B (tuesday)"]
+        assert recorded.reading[0].heading.startswith("Does B (tuesday) predict")
+        means = [one.mean for one in found.conditions[0].methods[:2]]
+        assert [one.mean for one in condition.methods] == means
+        assert {one.motion_class for one in condition.classes} == {"fly-by", "sinusoid"}
+        assert any("stop-to-stop" in sentence for sentence in recorded.missing)
+        assert [one.key for one in recorded.ablations] == ["repetitions"]
+        with pytest.raises(InputError, match="named twice"):
+            recorded_runs([runs[0], runs[0]])
+
+    @pytest.mark.slow
+    def test_a_folder_named_like_a_method_makes_no_method(self, tmp_path: Path) -> None:
+        """Two campaigns of method B, that run the same held-out motions; and one of another arm."""
+        cell = fast_cell(tmp_path, repetitions=1)
+        other = cell.text.replace("gear_ratio = [100.0", "gear_ratio = [110.0")
+        plan, folders = design(cell, Silent()), [tmp_path / name for name in ("a", "b", "other")]
+        for folder, text in zip(folders, (cell.text, cell.text, other), strict=True):
+            arm = Cell.from_texts(text, cell.urdf, cell.path)
+            own = plan if text == cell.text else design(arm, Silent())
+            Campaign.create(folder, arm, own).run(unrehearsed=True, durable=False)
+        runs = [one.run for one in recorded_runs(folders[:2])]
+        assert not {one.key for one in runs} & {"a", "b", "b0"}
+        assert [one.label for one in runs] == ["a", "b"]
+        assert homes(runs) == runs
+        with pytest.raises(InputError, match=r"another arm.*\[drive_train\]"):
+            recorded_runs([folders[0], folders[2]])
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_page")
-def test_unmodelled_effects_are_another_condition(
-    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
-) -> None:
-    root, _ = whole
-    again = tmp_path / "study"
-    shutil.copytree(root / "designs", again / "designs")
-    some = small.model_copy(update={"effects": True, "repetitions": 4})
-    some = some.model_copy(
-        update={"cell": StudySettings.model_validate_json((root / "study.json").read_text()).cell}
-    )
-    (again / "study.json").write_text(some.to_json())
-    found = run_study(again, some, Silent(), workers=2, cell=arm)
-    assert [one.key for one in found.conditions] == ["plain", "effects"]
-    plain, effects = found.conditions
-    assert effects.effects and not effects.own_comparisons
-    assert all(one.repetitions == [4, 4] for one in effects.comparisons)
-    assert "too few" not in {one.verdict for one in effects.comparisons}
-    errors = [
-        next(one.median for one in some.cross if (one.method, one.motion_class) == ("b", "fly-by"))
-        for some in (plain, effects)
-    ]
-    assert errors[1] > errors[0]
+class TestCommand:
+    """`hil study`."""
 
+    def test_one_campaign(self, whole: Whole, tmp_path: Path) -> None:
+        only = whole[0] / "campaigns" / "plain" / "b"
+        words = ["--campaign", str(only), "-o", str(tmp_path / "one"), "--json", "--workers", "1"]
+        done = CliRunner().invoke(app, ["study", *words])
+        assert done.exit_code == 0, done.output
+        assert any("nothing is compared" in line for line in json.loads(done.stdout)["missing"])
+        assert (tmp_path / "one" / "report.html").stat().st_size > 10_000
 
-def test_other_settings_are_refused_in_the_same_folder(
-    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell
-) -> None:
-    root, _ = whole
-    with pytest.raises(InputError, match="seed: the study in this folder was begun with 1, not 2"):
-        run_study(root, small.model_copy(update={"seed": 2}), Silent(), workers=1, cell=arm)
-    with pytest.raises(InputError, match="is not empty and holds no study"):
-        run_study(root / "fits", small, Silent(), workers=1, cell=arm)
+    def test_a_campaign_is_not_run_again(self, tmp_path: Path) -> None:
+        done = CliRunner().invoke(app, ["study", "--quick", "--campaign", str(tmp_path)])
+        assert isinstance(done.exception, InputError)
+        assert "is recorded already" in str(done.exception)
 
+    def test_ctrl_c_leaves_one_sentence_and_its_exit_status(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        def interrupted(*_: object, **__: object) -> None:
+            raise KeyboardInterrupt
 
-@pytest.mark.usefixtures("no_page")
-def test_recorded_campaigns_give_what_they_allow(
-    whole: tuple[Path, StudyResults], tmp_path: Path
-) -> None:
-    root, found = whole
-    runs = [
-        shutil.copytree(root / "campaigns" / "plain" / key, tmp_path / name)
-        for key, name in (("b", "tuesday"), ("a", "monday"))
-    ]
-    recorded = study_campaigns(tmp_path / "out", runs, Silent(), workers=1)
-    (condition,) = recorded.conditions
-    # Their excitations tell which is A and which is B, whatever they are called.
-    assert [one.label for one in condition.methods] == ["A (monday)", "B (tuesday)"]
-    assert recorded.reading[0].heading.startswith("Does B (tuesday) predict")
-    assert [one.mean for one in condition.methods] == [
-        one.mean for one in found.conditions[0].methods[:2]
-    ]
-    assert {one.motion_class for one in condition.classes} == {"fly-by", "sinusoid"}
-    assert any("stop-to-stop" in sentence for sentence in recorded.missing)
-    assert [one.key for one in recorded.ablations] == ["repetitions"]
-
-
-def test_one_campaign_from_the_command_line(
-    whole: tuple[Path, StudyResults], tmp_path: Path
-) -> None:
-    root, _ = whole
-    only = root / "campaigns" / "plain" / "b"
-    told = CliRunner().invoke(
-        app,
-        ["study", "--campaign", str(only), "-o", str(tmp_path / "one"), "--json", "--workers", "1"],
-    )
-    assert told.exit_code == 0, told.output
-    assert any("nothing is compared" in line for line in json.loads(told.stdout)["missing"])
-    assert (tmp_path / "one" / "report.html").stat().st_size > 10_000
-
-
-def test_a_campaign_is_not_run_again_by_a_study(tmp_path: Path) -> None:
-    told = CliRunner().invoke(app, ["study", "--quick", "--campaign", str(tmp_path)])
-    assert isinstance(told.exception, InputError)
-    assert "is recorded already" in str(told.exception)
-
-
-def test_ctrl_c_leaves_with_one_sentence_and_its_exit_status(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("hil.cli.study.run_study", interrupted)
-    ended = CliRunner().invoke(app, ["study", "--quick", "-o", str(tmp_path)])
-    assert isinstance(ended.exception, OperatorStopError)
-    assert ended.exception.exit_code == 130
-    assert f"what is complete stays in {tmp_path}" in str(ended.exception)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_refusal_in_any_process_is_one_sentence(count: int, tmp_path: Path) -> None:
-    with workers_of(count) as workers, pytest.raises(StudyError) as refused:
-        workers.map(Cell.load, [(tmp_path / "none.toml",)])
-    assert "none.toml" in str(refused.value)
-
-
-def test_an_excitation_that_the_arm_does_not_bear_ends_the_study_with_its_name(
-    whole: tuple[Path, StudyResults], small: StudySettings, arm: Cell, tmp_path: Path
-) -> None:
-    root, _ = whole
-    copy = shutil.copytree(root, tmp_path / "copy")
-    found = run_searches(
-        StudyFolder(copy), arm, searches(small, 2), Silent(), workers=1
-    )  # none is searched again
-    plans = plan_study(StudyFolder(copy), arm, small, found)
-    ended = {copy / "campaigns" / "ablation" / "b-fly-0": "joint 2: drive fault"}
-    left = plans.without(ended)
-    assert "b-fly-0" not in left.executions["ablation"]
-    assert left.missing == ["b-fly-0 could not be run: joint 2: drive fault"]
-    sines = {copy / "campaigns" / "ablation" / "a-middle-fast": "why"}
-    assert plans.without(sines).missing
-    with pytest.raises(StudyError, match=r"plain/b: this arm cannot bear .* drive fault"):
-        plans.without({copy / "campaigns" / "plain" / "b": "drive fault"})
+        monkeypatch.setattr("hil.cli.study.run_study", interrupted)
+        ended = CliRunner().invoke(app, ["study", "--quick", "-o", str(tmp_path)])
+        assert isinstance(ended.exception, OperatorStopError)
+        assert ended.exception.exit_code == 130
+        assert f"what is complete stays in {tmp_path}" in str(ended.exception)

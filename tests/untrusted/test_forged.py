@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hil.archive import Archive, ArchiveHeader
-from hil.study.records import class_of, plan_in
+from hil.study.records import class_in
 
 HEADER = {"kind": "move", "joint_names": '["a"]', "attachments": "[]"}
 
@@ -28,8 +28,7 @@ def test_planted_values_that_are_no_numbers_are_none(value: object) -> None:
 @pytest.mark.parametrize("text", [b"[1]", b"{bad", b"[" * 100_000, b"\xff", b'{"trajectory": 3}'])
 def test_a_plan_that_is_none_tells_no_other_class(text: bytes, tmp_path: Path) -> None:
     header = ArchiveHeader.of(HEADER)
-    told = plan_in(Archive(tmp_path, header, None, {"plan.json": text}, {}, (), None))
-    assert class_of(told) == "fly-by"
+    assert class_in(Archive(tmp_path, header, None, {"plan.json": text}, {}, (), None)) == "fly-by"
 
 
 def test_a_name_that_is_no_text_is_told_as_json(tmp_path: Path) -> None:
