@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 
 from hil.batch.types import Broken
-from hil.batch.workers import ArchiveTask, LocalWorkers, Part
+from hil.batch.workers import ArchiveTask, LocalWorkers
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.quick_design import plan_around
@@ -447,15 +447,12 @@ def in_children(
     Raises:
         StudyError: a call was refused, ended its process, or lasted too long.
     """
-    tasks = [ArchiveTask(str(place), _called, (function, own)) for place, own in calls]
+    tasks = [ArchiveTask(str(place), function, own) for place, own in calls]
+    found: list[T] = []
     with reporter.task(title, of) as task:
         task.advance(of - len(tasks))
-        found = list(workers.notes(tasks, done=lambda count: task.advance(count)))
-    for one in found:
-        if isinstance(one, Broken):
-            raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")
-    return [one for one in found if not isinstance(one, Broken)]
-
-
-def _called(function: Callable[..., T], arguments: tuple[Any, ...]) -> Part[None, T]:
-    return Part(None, function(*arguments))
+        for one in workers.results(tasks, task.advance):
+            if isinstance(one, Broken):
+                raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")
+            found.append(one)
+    return found
