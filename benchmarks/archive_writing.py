@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
-from drivers.exchange import ControlBlock, EventWriter, SharedCycleRing, SharedPacketRing, event_log
+from drivers.exchange import ControlBlock, CycleRing, EventWriter, PacketRing, event_log
 from drivers.exchange import control as control_memory
 from drivers.packets import AXIS_DTYPE, HEADER_LENGTH, Mode, next_number
 from hil.archive import ArchiveSpec, open_archive
@@ -40,11 +40,11 @@ class Exchange:
     """The memory of an exchange, and its descriptors."""
 
     def __init__(self, *, packets: bool) -> None:
-        self.ring = SharedCycleRing.create(JOINTS, 20_000)
+        self.ring = CycleRing.shared(JOINTS, 20_000)
         self.ring_fd, self.event_fd = self.ring.fd, event_log.create()
         self.control_fd = control_memory.create()
         self.events, self.control = EventWriter(self.event_fd), ControlBlock(self.control_fd)
-        self.packets = SharedPacketRing.create() if packets else None
+        self.packets = PacketRing.shared() if packets else None
         self.pid = os.getpid()
         self._rows = records(0)
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from benchmarks.session import AMPLITUDE, FREQUENCY, N, drive_train, init_packet
 from drivers import CyclicPacket, Mode
 from drivers.exchange.realtime import RealTimeSettings, enter
-from drivers.exchange.shared_ring import RingReader
 from drivers.motion_source import BoundsName
 from drivers.packets import DRIVE_ON, LAST_NUMBER, next_number
+from drivers.record import RingReader
 
 Array = NDArray[np.float64]
 

@@ -1,9 +1,23 @@
-"""One cycle as the PC saw it, and the ring buffer that keeps the last of them."""
+"""One cycle as the PC saw it, raw packets, and the rings that keep the last of either.
+
+A ring lies in memory of its own or in that of a descriptor, which other processes can read. The
+writer fills a row and then raises the count of rows written; it never waits and never looks back. A
+reader copies rows and then reads the count again, to find out which of them were overwritten
+meanwhile. That is sound where stores of one processor are seen by others in their order and loads
+are not moved ahead of earlier ones, as on x86.
+"""
 
 from __future__ import annotations
 
+import mmap
+import os
+import struct
+from typing import Final, NamedTuple, Self
+
 import numpy as np
 from numpy.typing import NDArray
+
+from drivers.packets import INIT_LENGTH
 
 Array = NDArray[np.float64]
 
@@ -51,24 +65,189 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     return np.dtype(fields, align=True)
 
 
-class CycleRecords:
-    """The last `capacity` records, written in place by the session, which never waits.
+LONGEST_PACKET: Final = INIT_LENGTH
+"""Bytes stored of a packet; none of a controller is longer."""
+CAPACITY: Final = 16_384
+"""Packets stored: 8 s of both directions at 1 kHz, more than a disk may keep an archive waiting."""
+_MOST_LENGTH: Final = 0xFFFF
+_ROW: Final = struct.Struct(f"<qdHBx{LONGEST_PACKET}s4x")
+PACKET_DTYPE: Final = np.dtype(
+    {
+        "names": ["cycle", "time", "length", "sent", "data"],
+        "formats": ["<i8", "<f8", "<u2", "u1", ("u1", (LONGEST_PACKET,))],
+        "offsets": [0, 8, 16, 18, 20],
+        "itemsize": _ROW.size,
+    }
+)
+"""One packet. ``cycle`` of the controller, as its cycle record has it; ``time`` s, on the link's
+clock, when it arrived or was sent; ``length`` in bytes; ``sent`` 1 if the PC sent it, 0 if it
+received it; ``data`` its bytes, then zeros (the first ones of a longer packet)."""
 
-    Whoever reads them does so beside the writer: `CycleRing` in the same thread, a reader of
-    shared memory in another process.
+
+def create_memory(name: str, size: int) -> int:
+    """Descriptor of `size` zero bytes to be shared; the name only shows in the system's lists."""
+    fd = os.memfd_create(name, os.MFD_CLOEXEC)
+    os.ftruncate(fd, size)
+    return fd
+
+
+def attach_memory(fd: int) -> mmap.mmap:
+    """Map all of it, to read and to write, shared with whoever else does."""
+    return mmap.mmap(fd, os.fstat(fd).st_size)
+
+
+class _Kind(NamedTuple):
+    """Tag in the header of a ring, its name there, what its rows are, what their width counts."""
+
+    tag: int
+    name: str
+    rows: str
+    unit: str
+
+
+_CYCLES: Final = _Kind(0x31474E4952434948, "hil-cycles", "cycle records", "joints")
+_PACKETS: Final = _Kind(0x31474E4952504948, "hil-packets", "raw packets", "bytes a packet")
+_HEADER_BYTES: Final = 256
+# Indices of 8-byte words, those of different writers on different cache lines.
+_TAG, _WIDTH, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
+
+
+class _Ring:
+    """Rows behind a header, with a reader's place in them.
 
     Args:
-        n_joints: n.
-        capacity: number of rows, unless they are given.
-        rows: (capacity,) of `cycle_dtype`, memory to keep them in (shared with a reader, say).
+        kind: of rows.
+        width: of a row, in the unit of its kind.
+        dtype: of a row.
+        capacity: rows of memory of its own; only where there is no `fd`.
+        fd: descriptor of memory that was made by `_create`.
+        acknowledge: whether the writer learns how far this reader got, so that it counts what it
+            overwrites; one reader at a time may.
+
+    Raises:
+        ValueError: that memory is none of such a ring.
     """
 
     def __init__(
-        self, n_joints: int, capacity: int = 4096, rows: NDArray[np.void] | None = None
+        self,
+        kind: _Kind,
+        width: int,
+        dtype: np.dtype[np.void],
+        *,
+        capacity: int = 0,
+        fd: int | None = None,
+        acknowledge: bool = True,
     ) -> None:
+        size = _HEADER_BYTES + capacity * dtype.itemsize
+        memory = memoryview(bytearray(size)) if fd is None else memoryview(attach_memory(fd))
+        self._words = words = memory.cast("B")[:_HEADER_BYTES].cast("q")
+        if fd is None:
+            words[_TAG], words[_WIDTH], words[_CAPACITY] = kind.tag, width, capacity
+        if len(words) < _HEADER_BYTES // 8 or words[_TAG] != kind.tag:
+            raise ValueError(f"this memory is not a ring of {kind.rows}")
+        if words[_WIDTH] != width:
+            raise ValueError(f"this ring is for {words[_WIDTH]} {kind.unit}, not {width}")
+        self.capacity = int(words[_CAPACITY])
+        self._memory = memory.cast("B")[_HEADER_BYTES:]
+        self.rows: NDArray[np.void] = np.frombuffer(self._memory, dtype, self.capacity)
+        # Beside another process the row behind the last one written may be half overwritten.
+        self._readable = self.capacity if fd is None else self.capacity - 1
+        self._acknowledge = acknowledge
+        self._read = self._oldest()
+        self._missed = 0
+
+    @staticmethod
+    def _create(kind: _Kind, width: int, dtype: np.dtype[np.void], capacity: int) -> int:
+        """Descriptor of memory for `capacity` rows."""
+        if capacity < 2:
+            raise ValueError(f"a shared ring of {capacity} {kind.rows}; at least 2 are needed")
+        fd = create_memory(kind.name, _HEADER_BYTES + capacity * dtype.itemsize)
+        words = memoryview(attach_memory(fd)).cast("B")[:_HEADER_BYTES].cast("q")
+        words[_WIDTH], words[_CAPACITY], words[_TAG] = width, capacity, kind.tag
+        return fd
+
+    def _oldest(self) -> int:
+        return max(0, self._words[_WRITTEN] - self._readable)
+
+    def drain(self) -> NDArray[np.void]:
+        """A copy of the rows not read yet, (k,), oldest first."""
+        end = self._words[_WRITTEN]
+        begin = max(self._read, self._oldest())
+        rows = self.rows.take(np.arange(begin, end), mode="wrap")
+        torn = min(max(0, self._oldest() - begin), len(rows))
+        self._missed += begin - self._read + torn
+        self._read = end
+        if self._acknowledge:
+            self._words[_READ] = end
+        return rows[torn:]
+
+
+class _Reader(_Ring):
+    """Reads rows that another process writes, from the oldest one still there."""
+
+    @property
+    def overflow(self) -> int:
+        """Rows that were overwritten before this reader had them."""
+        return self._missed
+
+
+class RingReader(_Reader):
+    """Reads a ring of cycle records of `n_joints` joints; see `_Ring` for `acknowledge`."""
+
+    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
+        super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), fd=fd, acknowledge=acknowledge)
+
+
+class PacketReader(_Reader):
+    """Reads a ring of raw packets, rows of `PACKET_DTYPE`."""
+
+    def __init__(self, fd: int) -> None:
+        super().__init__(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, fd=fd, acknowledge=False)
+
+
+class _Writer(_Ring):
+    """The writer's end; where rows are drained too rarely, the oldest are overwritten.
+
+    Attributes:
+        fd: descriptor of the memory, -1 for memory of its own.
+    """
+
+    fd: int
+    _written = 0
+    _lost = 0
+
+    @property
+    def written(self) -> int:
+        """Rows written so far."""
+        return self._written
+
+    @property
+    def overflow(self) -> int:
+        """Rows overwritten before they were drained, so far."""
+        return self._lost
+
+    def commit(self) -> None:
+        """Make the next row part of the ring."""
+        words, written = self._words, self._written
+        if words[_READ] <= written - self.capacity:
+            self._lost += 1
+        self._written = words[_WRITTEN] = written + 1
+
+
+class CycleRing(_Writer):
+    """The last `capacity` cycle records, written in place by the session.
+
+    Args:
+        n_joints: n.
+        capacity: rows, unless they lie in the memory of a descriptor.
+        fd: such a descriptor, see `shared`.
+    """
+
+    def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
+        super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), capacity=capacity, fd=fd)
+        self.fd = -1 if fd is None else fd
+        self._written = self._words[_WRITTEN]
         self.n_joints = n_joints
-        self.rows = np.zeros(capacity, cycle_dtype(n_joints)) if rows is None else rows
-        self.capacity = len(self.rows)
         # Column views: assigning through them costs a third of assigning to a record's field.
         self.cycle = self.rows["cycle"]
         self.arrival = self.rows["arrival"]
@@ -79,21 +258,25 @@ class CycleRecords:
         self.status = self.rows["status"]
         self.mode = self.rows["mode"]
         self.age = self.rows["age"]
-        joint_bytes = 8 * n_joints
-        self.measured = self._block(MEASURED[0], len(MEASURED), joint_bytes)
-        self.commanded = self._block(COMMANDED[0], len(COMMANDED), joint_bytes)
-        self._written = 0
+        self.measured = self._block(MEASURED)
+        self.commanded = self._block(COMMANDED)
 
-    def _block(self, first: str, count: int, joint_bytes: int) -> Array:
+    @classmethod
+    def shared(cls, n_joints: int, capacity: int) -> Self:
+        """Ask for memory for `capacity` records that other processes can read."""
+        dtype = cycle_dtype(n_joints)
+        return cls(n_joints, fd=cls._create(_CYCLES, n_joints, dtype, capacity))
+
+    def _block(self, names: tuple[str, ...]) -> Array:
         """Consecutive joint fields of all rows as one array (capacity, count, n)."""
         fields = self.rows.dtype.fields
         assert fields is not None
         return np.ndarray(
-            (self.capacity, count, self.n_joints),
+            (self.capacity, len(names), self.n_joints),
             np.float64,
             self.rows.view(np.uint8),
-            offset=fields[first][1],
-            strides=(self.rows.itemsize, joint_bytes, 8),
+            offset=fields[names[0]][1],
+            strides=(self.rows.itemsize, 8 * self.n_joints, 8),
         )
 
     @property
@@ -101,36 +284,29 @@ class CycleRecords:
         """Index of the row to fill before `commit`."""
         return self._written % self.capacity
 
-    def commit(self) -> None:
-        """Make the row at `slot` part of the ring."""
-        self._written += 1
-
     def last(self, count: int) -> NDArray[np.void]:
         """A copy of the newest `count` records (fewer if there are fewer), oldest first."""
         count = min(count, self._written, self.capacity)
         return self.rows.take(np.arange(self._written - count, self._written), mode="wrap")
 
 
-class CycleRing(CycleRecords):
-    """Records drained by the thread that writes them.
+class PacketRing(_Writer):
+    """The last `capacity` packets; arguments as of `CycleRing`."""
 
-    Where it drains too rarely, the oldest records are overwritten and counted in `overflow`.
-    Drained records stay readable through `last` until they are overwritten.
-    """
+    def __init__(self, capacity: int = CAPACITY, *, fd: int | None = None) -> None:
+        width = PACKET_DTYPE.itemsize
+        super().__init__(_PACKETS, width, PACKET_DTYPE, capacity=capacity, fd=fd)
+        self.fd = -1 if fd is None else fd
+        self._written = self._words[_WRITTEN]
 
-    def __init__(self, n_joints: int, capacity: int = 4096) -> None:
-        super().__init__(n_joints, capacity)
-        self._read = 0
-        self._lost = 0
+    @classmethod
+    def shared(cls, capacity: int = CAPACITY) -> Self:
+        """Ask for memory for `capacity` packets that other processes can read."""
+        return cls(fd=cls._create(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, capacity))
 
-    @property
-    def overflow(self) -> int:
-        """Records overwritten before they were drained, so far."""
-        return self._lost + max(0, self._written - self._read - self.capacity)
-
-    def drain(self) -> NDArray[np.void]:
-        """A copy of the records not drained yet, (k,), oldest first."""
-        self._lost = self.overflow
-        fresh = self.last(self._written - self._read)
-        self._read = self._written
-        return fresh
+    def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
+        """Store one packet, over the oldest where there is no room; see `PACKET_DTYPE`."""
+        place = self._written % self.capacity * _ROW.size
+        length = min(len(packet), _MOST_LENGTH)
+        _ROW.pack_into(self._memory, place, cycle, time, length, sent, packet)
+        self.commit()

@@ -51,7 +51,7 @@ from drivers.guard import Guard
 from drivers.init_check import compare
 from drivers.open_mode import CorrectionMode, OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
-from drivers.record import CycleRecords
+from drivers.record import CycleRing
 from drivers.replies import D1, Reader, Reading, ReplyFrame, Words
 from drivers.state_machine import Machine
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
@@ -253,7 +253,7 @@ class ReplyPolicy:
         return execution.leaving
 
     def record(
-        self, ring: CycleRecords, row: int, reading: Reading, words: Words, ages: Ages | None
+        self, ring: CycleRing, row: int, reading: Reading, words: Words, ages: Ages | None
     ) -> None:
         """Put what a packet says into its record; nothing was commanded yet.
 

@@ -67,7 +67,7 @@ from drivers.packets import (
     is_init,
     packet_number,
 )
-from drivers.record import CycleRecords
+from drivers.record import CycleRing
 from drivers.replies import MODE, words_of
 from drivers.reply_policy import ReplyPolicy
 from drivers.state_machine import Machine
@@ -218,7 +218,7 @@ class Session:
         self,
         drive_train: DriveTrain,
         guard: Guard,
-        ring: CycleRecords,
+        ring: CycleRing,
         *,
         mode: int = Mode.POSITION,
         max_gap: int = 2,

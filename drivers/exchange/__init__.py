@@ -26,11 +26,11 @@ from drivers.exchange.process import (
     WithdrawnError,
 )
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
-from drivers.exchange.shared_ring import (
+from drivers.record import (
+    CycleRing,
     PacketReader,
+    PacketRing,
     RingReader,
-    SharedCycleRing,
-    SharedPacketRing,
 )
 
 __all__ = [
@@ -57,8 +57,8 @@ __all__ = [
     "RealTimeSettings",
     "ResumeRefused",
     "RingReader",
-    "SharedCycleRing",
-    "SharedPacketRing",
+    "CycleRing",
+    "PacketRing",
     "WithdrawnError",
     "exchange",
 ]

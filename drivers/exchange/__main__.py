@@ -24,11 +24,10 @@ from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFaile
 from drivers.exchange.loop import exchange
 from drivers.exchange.process import ExchangeSettings
 from drivers.exchange.serving import Serving, portable
-from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
 from drivers.packets import DRIVE_ON, INIT_NUMBER, CyclicPacket, InitPacket, Mode, next_number
-from drivers.record import CycleRing
+from drivers.record import CycleRing, PacketRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
@@ -133,13 +132,13 @@ def main(arguments: Sequence[str]) -> int:
             settings: ExchangeSettings = pickle.load(file)
         for module in settings.preload:
             importlib.import_module(module)
-        ring = SharedCycleRing.attach(ring_fd, settings.drive_train.n_joints)
+        ring = CycleRing(settings.drive_train.n_joints, fd=ring_fd)
         guard = Guard(settings.guard_limits, settings.period)
         session = Session(settings.drive_train, guard, ring, **settings.session)
         max_late = settings.late_allowed
         transport = settings.transport.open()
         for fd in packets_fd:
-            transport = TappedTransport(transport, SharedPacketRing(fd), lambda: session.cycle)
+            transport = TappedTransport(transport, PacketRing(fd=fd), lambda: session.cycle)
         control = ControlBlock(control_fd)
         serving = Serving(
             session,

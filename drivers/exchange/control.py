@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TypeAlias
 
-from drivers.exchange import memory
+from drivers.record import attach_memory, create_memory
 
 STALE: Final = 0.5
 """s after which a heartbeat counts as that of a dead process."""
@@ -189,7 +189,7 @@ class ControlBlock(ctypes.Structure):
 
     def __new__(cls, fd: int) -> Self:
         """Return the block that lies in shared memory."""
-        mapped = memory.attach(fd)
+        mapped = attach_memory(fd)
         if len(mapped) != ctypes.sizeof(cls):
             raise ValueError("this memory is not a control block")
         return cls.from_buffer(mapped)
@@ -210,7 +210,7 @@ class ControlBlock(ctypes.Structure):
 
 def create() -> int:
     """Descriptor of memory for a block; every field is 0."""
-    return memory.create("hil-control", ctypes.sizeof(ControlBlock))
+    return create_memory("hil-control", ctypes.sizeof(ControlBlock))
 
 
 LONGEST_LOOK: Final = 0.5

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.events import Event
-from drivers.exchange import memory
 from drivers.exchange.realtime import RealTimeReport
+from drivers.record import attach_memory, create_memory
 
 NO_SUPERVISOR: Final = "the supervisor gives no sign of life"
 """Why the exchange leaves that missed the heartbeats of the process that started it."""
@@ -114,12 +114,12 @@ _HEAD, _TAIL = 8, 16
 
 def create(capacity: int = CAPACITY) -> int:
     """Descriptor of memory for a log of `capacity` bytes."""
-    return memory.create("hil-events", _HEADER_BYTES + capacity)
+    return create_memory("hil-events", _HEADER_BYTES + capacity)
 
 
 class _Log:
     def __init__(self, fd: int) -> None:
-        whole = memoryview(memory.attach(fd))
+        whole = memoryview(attach_memory(fd))
         self._words = whole[:_HEADER_BYTES].cast("Q")
         self._bytes = whole[_HEADER_BYTES:]
         self._capacity = len(self._bytes)

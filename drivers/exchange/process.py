@@ -16,15 +16,15 @@ from typing import Any, Final
 
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError, RequestError
-from drivers.exchange import control, event_log, memory
+from drivers.exchange import control, event_log
 from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventReader, ExchangeEvent
 from drivers.exchange.loop import MAX_LATE
 from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
-from drivers.exchange.shared_ring import SharedCycleRing, SharedPacketRing
 from drivers.guard import GuardLimits
 from drivers.motion_source import MotionSource
+from drivers.record import CycleRing, PacketRing, create_memory
 from drivers.transports.base import TransportSpec
 
 
@@ -111,17 +111,17 @@ class ExchangeProcess:
 
     def __init__(self, settings: ExchangeSettings) -> None:
         n_joints = settings.drive_train.n_joints
-        self.ring_fd = SharedCycleRing.create(n_joints, settings.ring_capacity).fd
-        self.packets_fd = SharedPacketRing.create(settings.packets).fd if settings.packets else -1
+        self.ring_fd = CycleRing.shared(n_joints, settings.ring_capacity).fd
+        self.packets_fd = PacketRing.shared(settings.packets).fd if settings.packets else -1
         self.event_fd = event_log.create()
         self.control_fd = control.create()
-        self._log_fd = memory.create("hil-exchange-log", 0)
+        self._log_fd = create_memory("hil-exchange-log", 0)
         self._control = ControlBlock(self.control_fd)
         self._events = EventReader(self.event_fd)
         self._offers = 0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.beat()
-        settings_fd = memory.create("hil-settings", 0)
+        settings_fd = create_memory("hil-settings", 0)
         try:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
             fds = [theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd]

@@ -34,10 +34,9 @@ from drivers.exchange.event_log import (
 )
 from drivers.exchange.loop import POLL
 from drivers.exchange.motion_transfer import WITHDRAWN, Inbox
-from drivers.exchange.shared_ring import SharedCycleRing
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket
-from drivers.record import MEASURED
+from drivers.record import MEASURED, CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
@@ -139,7 +138,7 @@ class Serving:
         self,
         session: Session,
         transport: Transport,
-        ring: SharedCycleRing,
+        ring: CycleRing,
         events: EventWriter,
         control: ControlBlock,
         channel: socket.socket,

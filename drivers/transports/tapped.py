@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.packet_records import PacketSink
+from drivers.record import PacketRing
 from drivers.transports.base import Transport
 
 MOST_WAITING: Final = 256
@@ -37,7 +37,7 @@ class TappedTransport:
         cycle: the controller's cycle of the packet answered last.
     """
 
-    def __init__(self, transport: Transport, sink: PacketSink, cycle: Callable[[], int]) -> None:
+    def __init__(self, transport: Transport, sink: PacketRing, cycle: Callable[[], int]) -> None:
         self._transport = transport
         self._sink = sink
         self._cycle = cycle

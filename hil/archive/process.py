@@ -35,7 +35,7 @@ from drivers.exchange import (
     RingReader,
 )
 from drivers.exchange.control import Pulse
-from drivers.packet_records import PACKET_DTYPE
+from drivers.record import PACKET_DTYPE
 from hil.archive.live import LivePublisher, Serve
 from hil.archive.recorder import Recorder
 from hil.archive.supervised import (

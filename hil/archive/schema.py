@@ -16,7 +16,7 @@ import numpy as np
 from mcap.records import Schema
 from numpy.typing import NDArray
 
-from drivers.packet_records import LONGEST_PACKET
+from drivers.record import LONGEST_PACKET
 from hil.archive.cdr import (
     LayoutBuilder,
     LayoutError,
@@ -293,7 +293,7 @@ class PacketEncoder:
         self._layout = fixed_layout(self.channel.definition)
 
     def encode(self, packets: Rows) -> Batch:
-        """Encode k packets, rows of `drivers.packet_records.PACKET_DTYPE`."""
+        """Encode k packets, rows of `drivers.record.PACKET_DTYPE`."""
         stamp = np.rint(packets["cycle"] * self._period_ns).astype(np.int64)
         rows = stamped(self._layout, stamp)
         for name in packets.dtype.names or ():

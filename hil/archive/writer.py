@@ -349,7 +349,7 @@ class ArchiveWriter:
         into the next.
 
         Args:
-            packets: shape (k,), structure `drivers.packet_records.PACKET_DTYPE`, cycles not
+            packets: shape (k,), structure `drivers.record.PACKET_DTYPE`, cycles not
                 falling; held until written, so hand over a copy.
 
         Raises:

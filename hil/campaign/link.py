@@ -20,8 +20,7 @@ from drivers.events import Event, MotionEnded, MotionStarted
 from drivers.exchange import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
-from drivers.packet_records import PacketRing
-from drivers.record import CycleRing
+from drivers.record import CycleRing, PacketRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
 from drivers.transports import SimulatedTransport, Transport

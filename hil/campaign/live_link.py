@@ -34,7 +34,7 @@ from drivers.exchange import (
 )
 from drivers.exchange.control import Pulse
 from drivers.motion_source import MotionSource
-from drivers.packet_records import CAPACITY
+from drivers.record import CAPACITY
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec

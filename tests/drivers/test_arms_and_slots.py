@@ -13,10 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from drivers import (
-    FollowingError,
     InitReceived,
-    MotionEnded,
-    Refused,
     RequestError,
     State,
 )
@@ -43,70 +40,10 @@ def layouts(draw, *, complete: bool = True, most: int = 20):
     return tuple(draw(st.permutations(axes))), wanted, n
 
 
-others = st.sampled_from([0, 0, 4, 5, 1, 2, 7, 8, 9, 10, 3, 500, 501, 502, 504, 508, -1])
-statuses = st.sampled_from([5, 5, 5, 0, 1, 255])
-
-
 def sideways(n: int, rows: int) -> np.ndarray:
     """Each joint by its own distance, slowly enough for the guard."""
     share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, rows))[:, None]
     return share * np.linspace(0.0002, 0.001, n)
-
-
-@settings(max_examples=80)
-@given(layouts(), st.data())
-def test_the_wanted_arm_s_joints_move_and_every_other_axis_gets_its_safe_answer(layout, data):
-    slots, arm, n = layout
-    bench = Bench(slots, arm, n)
-    bench.start()
-    path = bench.train.joint_position([bench.d1[s] for s in bench.joint_slots]) + sideways(n, 12)
-    bench.session.request(Table(path))
-    rest = [k for k, axis in enumerate(slots) if axis not in [(arm, j) for j in range(n)]]
-    moved = 0
-    for cycle in range(18):
-        for slot in rest:
-            bench.modes[slot] = data.draw(others)
-        for other in set(bench.arms) - {arm}:
-            bench.status[other - 1] = data.draw(statuses)
-        bench.set_joints(CLOSED if cycle < 2 else OPEN)
-        received, answer = bench.cycle()
-        expected = oracle.safe_answer(received, bench.arms)
-        leaving = bench.session.state is State.EXITING
-        if leaving and cycle == 2 + 12 + 2:
-            status = bytearray(expected.status)
-            status[arm - 1] = 1
-            expected = expected._replace(status=bytes(status))
-        if cycle >= 2:
-            row = path[min(cycle - 2, 11)]
-            axes = list(expected.axes)
-            for joint, slot in enumerate(bench.joint_slots):
-                step = answer.axes[slot].d[1]
-                motor = struct.pack("<f", bench.train.motor_revolutions(row)[joint])
-                axes[slot] = oracle.Axis(OPEN, (motor, step, *(oracle.ZERO,) * 6))
-                moved += answer.axes[slot].floats[1] != 0.0
-            expected = expected._replace(axes=tuple(axes))
-        assert oracle.differences(answer, expected) == [], (cycle, slots)
-        bench.obey(answer)
-    assert moved == 11 * n
-    bench.set_joints(CLOSED)
-    bench.cycle()
-    (ended,) = bench.seen(MotionEnded)
-    assert ended.outcome == "completed"
-
-
-@pytest.mark.parametrize(
-    ("arm", "status"), [(1, "01000000"), (2, "00010000"), (3, "00000100"), (4, "00000001")]
-)
-def test_the_end_of_open_mode_is_asked_for_in_the_status_byte_of_the_arm(arm, status):
-    slots = tuple((a, axis) for axis in (1, 0) for a in (4, 3, 2, 1))
-    bench = Bench(slots, arm, 2)
-    bench.start()
-    bench.session.request(Table(np.tile(bench.q, (2, 1))))
-    bench.cycle()
-    bench.set_joints(OPEN)
-    answers = [bench.cycle()[1].status.hex() for _ in range(12)]
-    assert answers.count(status) == 1
-    assert set(answers) == {status, "00000000"}
 
 
 def opened(slots, arm, n, **options) -> Bench:
@@ -141,47 +78,6 @@ def test_the_drive_of_the_wanted_arm_going_off_ends_open_mode_whatever_the_other
     received, answer = bench.cycle()
     assert bench.session.state is State.DRIVE_OFF
     assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
-
-
-@settings(max_examples=40)
-@given(layouts(), st.data())
-def test_a_following_error_is_reported_in_the_slot_of_the_joint_and_nowhere_else(layout, data):
-    slots, arm, n = layout
-    bench = opened(slots, arm, n)
-    joint = data.draw(st.integers(0, n - 1))
-    offending = bench.joint_slots[joint]
-    bench.error[offending] = 2.5
-    received, answer = bench.cycle()
-    expected = oracle.safe_answer(received, bench.arms)
-    axes = list(expected.axes)
-    axes[offending] = axes[offending]._replace(mode=oracle.FOLLOWING_ERROR)
-    assert oracle.differences(answer, expected._replace(axes=tuple(axes))) == []
-    error = bench.seen(Refused)[-1].error
-    assert type(error) is FollowingError
-    assert error.joint == joint
-
-
-@settings(max_examples=40)
-@given(layouts())
-def test_drive_off_is_requested_in_every_slot(layout):
-    slots, arm, n = layout
-    bench = opened(slots, arm, n)
-    bench.d1[bench.joint_slots[0]] = np.nan
-    _, answer = bench.cycle()
-    assert {axis.mode for axis in answer.axes} == {oracle.DRIVE_OFF_REQUEST}
-    assert all(np.isfinite(axis.floats).all() for axis in answer.axes)
-
-
-def test_axes_that_open_one_after_the_other_are_answered_each_by_its_own_mode():
-    slots = ((1, 4), (1, 0), (1, 5), (1, 3), (1, 1), (1, 2))
-    bench = Bench(slots, 1, 6)
-    bench.start()
-    bench.cycle()
-    for slot in (3, 0, 5, 1, 4, 2):
-        bench.modes[slot] = OPEN
-        received, answer = bench.cycle()
-        assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
-    assert bench.session.state is State.OPEN
 
 
 class TestLinearTrack:

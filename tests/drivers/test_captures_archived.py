@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, InitPacket
-from drivers.packet_records import PacketRing
 from drivers.packets import INIT_LENGTH
+from drivers.record import PacketRing
 from drivers.transports import SimulatedTransport
 from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveWriter, open_archive

@@ -26,7 +26,6 @@ from drivers.exchange import (
     EventsLost,
     EventWriter,
     RingReader,
-    SharedCycleRing,
     control,
     event_log,
     motion_transfer,
@@ -58,7 +57,7 @@ def write(ring: CycleRing, numbers) -> None:
 
 class TestRing:
     def test_what_is_written_is_read_elsewhere_once(self):
-        ring = SharedCycleRing.create(N, 100)
+        ring = CycleRing.shared(N, 100)
         reader = RingReader(ring.fd, N)
         write(ring, range(5))
         records = reader.drain()
@@ -69,21 +68,21 @@ class TestRing:
         assert len(reader.drain()) == 0
 
     def test_it_keeps_what_a_private_ring_keeps(self):
-        shared, private = SharedCycleRing.create(N, 50), CycleRing(N, 50)
+        shared, private = CycleRing.shared(N, 50), CycleRing(N, 50)
         write(shared, range(70))
         write(private, range(70))
         assert shared.last(50).tobytes() == private.last(50).tobytes()
         assert shared.rows.dtype == cycle_dtype(N)
 
     def test_a_reader_that_comes_later_begins_with_what_is_still_there(self):
-        ring = SharedCycleRing.create(N, 10)
+        ring = CycleRing.shared(N, 10)
         write(ring, range(25))
         reader = RingReader(ring.fd, N)
         assert reader.drain()["number"].tolist() == list(range(16, 25))
         assert reader.overflow == 0
 
     def test_the_writer_counts_what_it_overwrites_unread(self):
-        ring = SharedCycleRing.create(N, 10)
+        ring = CycleRing.shared(N, 10)
         reader = RingReader(ring.fd, N)
         write(ring, range(10))
         assert ring.overflow == 0
@@ -96,7 +95,7 @@ class TestRing:
         assert ring.overflow == 4
 
     def test_a_spectator_changes_nothing(self):
-        ring = SharedCycleRing.create(N, 10)
+        ring = CycleRing.shared(N, 10)
         spectator = RingReader(ring.fd, N, acknowledge=False)
         write(ring, range(10))
         assert len(spectator.drain()) == 9
@@ -105,7 +104,7 @@ class TestRing:
 
     @given(st.lists(st.integers(0, 25), max_size=30))
     def test_every_record_is_read_in_order_or_counted_as_lost(self, steps):
-        ring = SharedCycleRing.create(1, 10)
+        ring = CycleRing.shared(1, 10)
         reader = RingReader(ring.fd, 1)
         seen, written = [], 0
         for count in steps:
@@ -117,28 +116,28 @@ class TestRing:
         os.close(ring.fd)
 
     def test_records_overwritten_while_they_are_copied_are_not_given_out(self):
-        ring = SharedCycleRing.create(N, 10)
+        ring = CycleRing.shared(N, 10)
         reader = RingReader(ring.fd, N)
         write(ring, range(9))
-        rows = reader._rows
+        rows = reader.rows
 
         class Overtaken:
             def take(self, index, mode):
                 write(ring, range(9, 13))
                 return rows.take(index, mode=mode)
 
-        reader._rows = Overtaken()
+        reader.rows = Overtaken()
         assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
         assert reader.overflow == 4
 
     def test_memory_of_something_else_is_refused(self):
-        ring = SharedCycleRing.create(N, 10)
+        ring = CycleRing.shared(N, 10)
         with pytest.raises(ValueError, match="for 6 joints, not 7"):
             RingReader(ring.fd, 7)
         with pytest.raises(ValueError, match="not a ring"):
-            SharedCycleRing.attach(control.create(), N)
+            CycleRing(N, fd=control.create())
         with pytest.raises(ValueError, match="at least 2"):
-            SharedCycleRing.create(N, 1)
+            CycleRing.shared(N, 1)
 
 
 def gaps(numbers):
@@ -266,7 +265,7 @@ class TestControlBlock:
 
     def test_memory_of_something_else_is_refused(self):
         with pytest.raises(ValueError, match="not a control block"):
-            ControlBlock(SharedCycleRing.create(N, 10).fd)
+            ControlBlock(CycleRing.shared(N, 10).fd)
 
     def test_the_names_of_the_ends_are_those_of_the_events(self):
         names = {ended.name.lower() for ended in Ended if ended is not Ended.NONE}

@@ -14,12 +14,12 @@ from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
 from drivers.exchange import (
     NO_SUPERVISOR,
     ControlBlock,
+    CycleRing,
     Ended,
     EventReader,
     EventWriter,
     HoldRefused,
     Leaving,
-    SharedCycleRing,
     control,
     event_log,
 )
@@ -72,7 +72,7 @@ class Bench:
     def __init__(self, clock):
         self.clock = clock
         self.session = Told()
-        self.ring = SharedCycleRing.create(N, 16)
+        self.ring = CycleRing.shared(N, 16)
         event_fd = event_log.create()
         self.reader = EventReader(event_fd)
         self.control = ControlBlock(control.create())

@@ -1,3 +1,5 @@
+"""What the guard lets pass: laws, limits, and each bound at its edge."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -5,10 +7,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import AccelerationLimit, Guard, GuardError, JerkLimit, VelocityLimit
+from drivers import Guard, GuardError, GuardLimits, JerkLimit
+from drivers.errors import (
+    AccelerationLimit,
+    CurrentLimit,
+    FirstSetPoint,
+    FollowingError,
+    JerkLimit,
+    MotionHeld,
+    MotionNotCarriedOn,
+    NotAtStandstill,
+    NotFinite,
+    PositionLimit,
+    VelocityLimit,
+    VelocityMismatch,
+)
+from tests.drivers import edges
+from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
 from tests.drivers.rig import PERIOD, START, N, limits
-
-REST = np.zeros(N)
 
 
 def begun(**changes) -> Guard:
@@ -47,15 +63,6 @@ def test_a_motion_exactly_at_its_limits_passes():
     feed(begun(), rows)
 
 
-@pytest.mark.parametrize("excess", [1e-4, 1e-2, 1.0])
-def test_a_little_more_does_not(excess):
-    with pytest.raises(JerkLimit) as caught:
-        feed(begun(), jerk_profile([100.0 * (1.0 + excess)] * 10))
-    assert caught.value.joint == 5
-    # The third difference has all of the jerk from the third step on, 5/6 in the second.
-    assert caught.value.cycle <= 3
-
-
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60), st.sampled_from([1.0, 1.7, 3.0]))
 def test_whatever_keeps_its_jerk_passes_the_check_on_jerk(shares, factor):
     """The k-th difference of a motion is a mean of its k-th derivative."""
@@ -63,16 +70,6 @@ def test_whatever_keeps_its_jerk_passes_the_check_on_jerk(shares, factor):
     bounds = {1.0: "plan", 1.7: "override", 3.0: "stop"}[factor]
     rows = jerk_profile([100.0 * factor * share for share in shares])
     feed(begun(**wide, lower=np.full(N, -1e3), upper=np.full(N, 1e3)), rows, bounds)
-
-
-@pytest.mark.parametrize(("bounds", "factor"), [("plan", 1.0), ("override", 1.3), ("stop", 2.0)])
-def test_each_set_of_bounds_has_its_acceleration(bounds, factor):
-    t = PERIOD * np.arange(1, 40)[:, None]
-    path = START + 0.5 * 8.0 * factor * t**2 * np.array([0, 1, 0, 0, 0, 0])
-    wide = {"jerk": np.full(N, 1e9)}
-    feed(begun(**wide), START + 0.999 * (path - START), bounds)
-    with pytest.raises(AccelerationLimit):
-        feed(begun(**wide), START + 1.001 * (path - START), bounds)
 
 
 @given(st.integers(0, N - 1), st.sampled_from([np.nan, np.inf, -np.inf]), st.booleans())
@@ -84,39 +81,6 @@ def test_what_is_not_finite_never_passes(joint, value, in_velocity):
     assert caught.value.check == "finiteness"
     assert "where a number must be" in str(caught.value)
     assert caught.value.joint == joint
-
-
-def test_a_planner_that_keeps_its_limits_to_a_millionth_passes():
-    feed(begun(), jerk_profile([100.0 * (1.0 + 8e-7)] * 30))
-
-
-@pytest.mark.parametrize("turns", [0, 1, 10, 30])
-def test_rounding_of_joint_angles_of_many_turns_is_not_mistaken_for_jerk(turns):
-    """At 1 ms the last bit of 200 rad is 2e-5 rad/s³ in a third difference."""
-    T = 0.001
-    reach = 2.0 * np.pi * (turns + 1)
-    wide = limits(lower=np.full(N, -reach), upper=np.full(N, reach), jerk=np.full(N, 10.0))
-    guard = Guard(wide, T)
-    start = 2.0 * np.pi * turns + np.arange(N) * 0.1
-    guard.begin(start, REST, REST, np.zeros((2, N)), 0)
-    before = start
-    for cycle in range(1, 300):
-        row = start + 10.0 * (cycle * T) ** 3 / 6.0
-        guard.check_set_point(row, (row - before) / T, "plan", cycle)
-        before = row
-
-
-def test_speed_is_judged_by_the_step_as_well_as_by_the_stated_velocity():
-    guard = begun(jerk=np.full(N, 1e9), velocity=np.full(N, 0.5))
-    q, speed = START.copy(), 0.0
-    with pytest.raises(VelocityLimit) as caught:
-        for cycle in range(1, 100):
-            speed += 7.9 * PERIOD
-            q = q + np.array([0, speed * PERIOD, 0, 0, 0, 0])
-            stated = np.array([0, min(speed, 0.499), 0, 0, 0, 0])
-            guard.check_set_point(q, stated, "plan", cycle)
-    assert caught.value.value == pytest.approx(speed)
-    assert 0.5 < speed < 0.5 + 7.9 * PERIOD
 
 
 def test_errors_carry_joint_value_bound_and_cycle():
@@ -134,27 +98,429 @@ def test_errors_carry_joint_value_bound_and_cycle():
 
 class TestLimits:
     @pytest.mark.parametrize(
-        "changes",
-        [
-            {"velocity": np.full(5, 1.0)},
-            {"velocity": np.full(N, 0.0)},
-            {"jerk": np.full(N, np.nan)},
-            {"lower": np.full(N, 3.0)},
-            {"following_error": np.full(N, -1.0)},
-            {"override_jerk": 0.9},
-            {"stop_acceleration": 1.2},
-            {"standstill": 0.0},
-        ],
+        "name",
+        ["lower", "upper", "velocity", "acceleration", "jerk", "following_error", "current"],
     )
-    def test_limits_that_cannot_be_are_refused_by_name(self, changes):
-        with pytest.raises(ValueError, match="guard limits"):
-            limits(**changes)
+    def test_each_has_one_finite_number_per_joint(self, name):
+        wrongs = (np.full(N - 1, 1.0), np.full((N, 1), 1.0), np.append(np.ones(N - 1), np.inf))
+        for wrong in wrongs:
+            if name == "lower" and wrong.shape == (N - 1,):
+                continue  # it says how many joints there are
+            with pytest.raises(ValueError, match=f"{name} must be {N} finite numbers"):
+                limits(**{name: wrong})
 
-    def test_a_period_has_to_be_positive(self):
-        with pytest.raises(ValueError, match="period"):
-            Guard(limits(), 0.0)
+    @pytest.mark.parametrize(
+        "name", ["velocity", "acceleration", "jerk", "following_error", "current"]
+    )
+    def test_magnitudes_are_positive_in_every_joint(self, name):
+        for value in (0.0, -1.0):
+            wrong = np.full(N, 1.0)
+            wrong[3] = value
+            with pytest.raises(ValueError, match=f"{name} must be positive"):
+                limits(**{name: wrong})
 
-    def test_the_narrower_of_cell_and_controller_is_in_force_and_nan_is_no_limit(self):
+    def test_a_range_is_not_empty_in_any_joint(self):
+        upper = np.full(N, 2.0)
+        upper[4] = -2.0
+        with pytest.raises(ValueError, match="is not below"):
+            limits(upper=upper)
+
+    @pytest.mark.parametrize("name", ["standstill", "current_rise"])
+    def test_other_figures_are_positive(self, name):
+        for value in (0.0, -1.0, np.nan):
+            with pytest.raises(ValueError, match=f"{name} {value} is not positive"):
+                limits(**{name: value})
+        limits(**{name: 1e-9})
+
+    @pytest.mark.parametrize("what", ["acceleration", "jerk"])
+    def test_the_sets_of_bounds_widen_from_plan_to_override_to_stop(self, what):
+        ordered = limits(**{f"override_{what}": 1.0, f"stop_{what}": 1.0})
+        assert getattr(ordered, f"override_{what}") == 1.0
+        for override, stop in ((0.99, 1.5), (1.5, 1.49), (np.nan, 2.0), (1.2, np.nan)):
+            with pytest.raises(ValueError, match="factors 1 <="):
+                limits(**{f"override_{what}": override, f"stop_{what}": stop})
+
+    def test_they_are_taken_as_they_are_and_cannot_be_changed_from_outside(self):
+        velocity = np.full(N, 2.0)
+        taken = limits(velocity=velocity, jerk=[100] * N)
+        velocity[:] = 9.0
+        np.testing.assert_array_equal(taken.velocity, np.full(N, 2.0))
+        assert taken.jerk.dtype == np.float64
+        assert taken.n_joints == N
+
+    def test_one_joint_is_enough(self):
+        one = np.ones(1)
+        assert GuardLimits(-one, one, one, one, one, one, one).n_joints == 1
+
+    @pytest.mark.parametrize("period", [0.0, -0.002, np.nan])
+    def test_a_period_has_to_be_positive(self, period):
+        with pytest.raises(ValueError, match="is not positive"):
+            Guard(limits(), period)
+
+
+EVERY = np.ones(N, dtype=bool)
+TURNS = np.array([40.0, -30.0, 20.0, -10.0, 5.0, -2.0])
+"""Motor revolutions at which an arm may stand."""
+RATES = {"velocity": VelocityLimit, "acceleration": AccelerationLimit, "jerk": JerkLimit}
+
+names = pytest.mark.parametrize("bounds", FACTORS)
+
+
+def only(**bounds: float) -> Guard:
+    """At START, at rest; every rate but those given is out of reach."""
+    guard = Guard(edges.only(**bounds), PERIOD)
+    guard.begin(START, REST, REST, np.zeros((2, N)), 0)
+    return guard
+
+
+class TestPositions:
+    LOWER, UPPER = -1.0, 0.2
+
+    @joints
+    @pytest.mark.parametrize("limit", [LOWER, UPPER])
+    def test_the_range_need_not_lie_about_zero(self, joint, limit):
+        ranges = {"lower": np.full(N, self.LOWER), "upper": np.full(N, self.UPPER)}
+        outwards = np.sign(limit)
+        Guard(limits(**ranges), PERIOD).begin(at(joint, limit), REST, REST, np.zeros((2, N)), 0)
+        just_in = at(joint, limit + 3e-7 * outwards)
+        Guard(limits(**ranges), PERIOD).begin(just_in, REST, REST, np.zeros((2, N)), 0)
+        just_out = at(joint, limit + 2e-6 * outwards)
+        guard = Guard(limits(**ranges), PERIOD)
+        error = refused(PositionLimit, guard.begin, just_out, REST, REST, np.zeros((2, N)), 3)
+        assert (error.joint, error.bound, error.cycle) == (joint, limit, 3)
+        assert error.value == pytest.approx(just_out[joint], abs=1e-12)
+
+    @joints
+    def test_the_range_is_kept_whatever_the_speed(self, joint):
+        guard, speed = only(), at(joint, 1.5)
+        edge = START + at(joint, 2.0 - START[joint])
+        guard.check_set_point(edge, speed, "plan", 1)
+        guard.check_set_point(edge, -speed, "plan", 2)
+        beyond = edge + at(joint, 1e-3)
+        error = refused(PositionLimit, guard.check_set_point, beyond, -speed, "plan", 3)
+        assert (error.joint, error.bound) == (joint, 2.0)
+
+
+class TestRates:
+    @joints
+    @signs
+    def test_velocity_by_the_step(self, joint, sign):
+        for share, kind in ((JUST_BELOW, None), (JUST_ABOVE, VelocityLimit)):
+            guard, speed = only(velocity=0.5), sign * 0.5 * share
+            step = START + at(joint, speed * PERIOD)
+            if kind is None:
+                guard.check_set_point(step, REST, "plan", 1)
+                continue
+            error = refused(kind, guard.check_set_point, step, REST, "plan", 1)
+            assert (error.joint, error.cycle) == (joint, 1)
+            assert error.value == pytest.approx(speed)
+            assert error.bound == pytest.approx(0.5, rel=1e-5)
+
+    @joints
+    @signs
+    def test_velocity_as_it_is_stated(self, joint, sign):
+        only(velocity=0.5).check_set_point(START, at(joint, sign * 0.5 * JUST_BELOW), "plan", 1)
+        stated = at(joint, sign * 0.5 * JUST_ABOVE)
+        error = refused(VelocityLimit, only(velocity=0.5).check_set_point, START, stated, "plan", 1)
+        assert (error.joint, error.value) == (joint, stated[joint])
+
+    @joints
+    @signs
+    @names
+    def test_a_stated_velocity_is_off_by_no_more_than_one_period_of_acceleration(
+        self, joint, sign, bounds
+    ):
+        """The step is small: only the two together are wrong."""
+        largest = 8.0 * FACTORS[bounds][0] * PERIOD
+        speed = 0.25 * largest
+        step = START + at(joint, sign * speed * PERIOD)
+        for share, kind in ((JUST_BELOW, None), (JUST_ABOVE, VelocityMismatch)):
+            guard, stated = only(acceleration=8.0), at(joint, sign * (speed + largest * share))
+            if kind is None:
+                guard.check_set_point(step, stated, bounds, 1)
+            else:
+                error = refused(kind, guard.check_set_point, step, stated, bounds, 1)
+                assert error.joint == joint
+                assert error.value == pytest.approx(sign * largest, rel=1e-5)
+                assert error.bound == pytest.approx(largest, rel=1e-5)
+
+    @joints
+    @signs
+    @names
+    @pytest.mark.parametrize(
+        ("field", "order", "kind"), [("acceleration", 2, AccelerationLimit), ("jerk", 3, JerkLimit)]
+    )
+    def test_acceleration_and_jerk_of_each_set(self, joint, sign, bounds, field, order, kind):
+        rate = sign * 50.0 * FACTORS[bounds][order - 2]
+        for share, expected in ((JUST_BELOW, None), (JUST_ABOVE, kind)):
+            guard = only(**{field: 50.0})
+            step = START + at(joint, rate * share * PERIOD**order)
+            stated = (step - START) / PERIOD
+            if expected is None:
+                guard.check_set_point(step, stated, bounds, 1)
+            else:
+                error = refused(expected, guard.check_set_point, step, stated, bounds, 1)
+                assert error.joint == joint
+                assert error.value == pytest.approx(rate, rel=1e-5)
+                assert error.bound == pytest.approx(abs(rate), rel=1e-5)
+
+    @pytest.mark.parametrize("name", RATES)
+    def test_what_rounding_of_a_far_angle_makes_is_no_motion_and_little_more_is(self, name):
+        """At a million rad an angle toggles in its last bit, of an arm that must hardly move."""
+        reach = 2.0**20
+        wide = {"lower": np.full(N, -reach), "upper": np.full(N, reach)} | dict.fromkeys(
+            RATES, np.full(N, 100.0)
+        )
+        start = np.full(N, reach - 1.0)
+        last_bit = np.spacing(start)
+
+        def toggle(bits: float, stated: float = 0.0) -> None:
+            guard = Guard(limits(**wide | {name: np.full(N, 1e-12)}), PERIOD)
+            guard.begin(start, REST, REST, np.zeros((2, N)), 0)
+            before = start
+            for cycle, up in enumerate([1, 0, 1, 1, 0, 0, 1]):
+                row = start + up * bits * last_bit
+                guard.check_set_point(row, stated * (row - before) / PERIOD, "plan", cycle)
+                before = row
+
+        toggle(1.0)
+        refused(RATES[name], toggle, 24.0, stated=1.0)
+
+    @pytest.mark.parametrize("after", ["plan", "override"])
+    def test_wider_bounds_last_until_no_difference_reaches_back_to_them(self, after):
+        """A third difference has four set-points: after two more the last wide one is the first."""
+        jerk = 50.0 * 0.5 * (FACTORS[after][1] + FACTORS["stop"][1])
+        t = PERIOD * np.arange(1, 8)
+        rows = [START + at(2, jerk * s**3 / 6.0) for s in t]
+        guard = only(jerk=50.0)
+        for cycle, row in enumerate(rows[:2]):
+            guard.check_set_point(row, REST, "stop", cycle)
+        guard.check_set_point(rows[2], REST, after, 2)
+        guard.check_set_point(rows[3], REST, after, 3)
+        error = refused(JerkLimit, guard.check_set_point, rows[4], REST, after, 4)
+        assert error.bound == pytest.approx(50.0 * FACTORS[after][1], rel=1e-5)
+
+    def test_each_wide_set_point_begins_the_waiting_anew(self):
+        guard, jerk = only(jerk=50.0), 140.0
+        wide = ["stop", "plan", "stop", "plan", "plan"]
+        rows = [START + at(2, jerk * (PERIOD * k) ** 3 / 6.0) for k in range(1, 8)]
+        for cycle, (row, bounds) in enumerate(zip(rows, wide, strict=False)):
+            guard.check_set_point(row, REST, bounds, cycle)
+        refused(JerkLimit, guard.check_set_point, rows[5], REST, "plan", 5)
+
+    def test_an_arm_that_begins_anew_has_no_past(self):
+        """Neither the way it came nor the bounds it was granted there."""
+        guard = only(jerk=50.0)
+        for cycle in range(1, 4):
+            row = START + at(2, 140.0 * (PERIOD * cycle) ** 3 / 6.0)
+            guard.check_set_point(row, REST, "stop", cycle)
+        guard.begin(START, REST, REST, np.zeros((2, N)), 9)
+        guard.check_set_point(START, REST, "plan", 10)
+        step = START + at(2, 60.0 * PERIOD**3)
+        refused(JerkLimit, guard.check_set_point, step, REST, "plan", 11)
+
+
+class TestFeedback:
+    """Thresholds of 2 revolutions and 20 A, unless the controller has narrower ones."""
+
+    STILL = (REST, REST, REST, REST)
+
+    @joints
+    @signs
+    def test_the_arm_follows_what_was_sent_and_what_the_controller_reports(self, joint, sign):
         guard = Guard(limits(), PERIOD)
-        guard.narrow(np.array([1.0, 3.0, np.nan, 2.0, 0.5, 2.0]), np.full(N, np.nan))
-        np.testing.assert_array_equal(guard.following_error, [1.0, 2.0, 2.0, 2.0, 0.5, 2.0])
+        off = at(joint, sign * 2.0)
+        guard.check_feedback(REST, off * JUST_BELOW, REST, REST, 1)
+        far = off * JUST_ABOVE
+        for target, commanded in ((far, REST), (REST, far)):
+            error = refused(FollowingError, guard.check_feedback, target, REST, REST, commanded, 7)
+            assert (error.joint, error.cycle) == (joint, 7)
+            assert error.value == pytest.approx(2.0, rel=1e-5)
+            assert error.bound == pytest.approx(2.0, rel=1e-5)
+
+    @joints
+    @signs
+    def test_the_servo_asks_for_no_more_than_the_limit(self, joint, sign):
+        guard = Guard(limits(), PERIOD)
+        guard.check_feedback(REST, REST, at(joint, sign * 20.0 * JUST_BELOW), REST, 1)
+        current = at(joint, sign * 20.0 * JUST_ABOVE)
+        error = refused(CurrentLimit, guard.check_feedback, REST, REST, current, REST, 1)
+        assert (error.joint, error.bound) == (joint, pytest.approx(20.0, rel=1e-5))
+
+    def test_only_the_joints_asked_for_matter(self):
+        guard = Guard(limits(following_error=np.full(N, 0.5), current=np.full(N, 0.5)), PERIOD)
+        where = EVERY.copy()
+        where[2] = False
+        wild = at(2, 1e3)
+        guard.check_feedback(wild, -wild, wild, wild, 1, where=where)
+        refused(FollowingError, guard.check_feedback, wild, -wild, wild, wild, 1, where=~where)
+
+    def test_the_controller_s_narrower_limits_are_in_force(self):
+        guard = Guard(limits(), PERIOD)
+        guard.narrow(at(1, 1.0) + at(0, 3.0) + 0.5, at(1, 4.5) + at(0, 30.0) + 5.0)
+        np.testing.assert_array_equal(guard.following_error, [2.0, 1.5, 0.5, 0.5, 0.5, 0.5])
+        np.testing.assert_array_equal(guard.current, [20.0, 9.5, 5.0, 5.0, 5.0, 5.0])
+        for joint, threshold in ((0, 2.0), (1, 1.5)):
+            guard.check_feedback(REST, at(joint, threshold * JUST_BELOW), REST, REST, 1)
+            far = at(joint, threshold * JUST_ABOVE)
+            refused(FollowingError, guard.check_feedback, REST, far, REST, REST, 1)
+        guard.check_feedback(REST, REST, at(1, 9.5 * JUST_BELOW), REST, 1)
+        strong = at(1, 9.5 * JUST_ABOVE)
+        refused(CurrentLimit, guard.check_feedback, REST, REST, strong, REST, 1)
+
+    def test_what_the_controller_leaves_out_is_no_limit_and_a_new_word_replaces_the_old(self):
+        guard = Guard(limits(), PERIOD)
+        guard.narrow(np.full(N, 0.5), np.full(N, 5.0))
+        guard.narrow(np.full(N, np.nan), np.full(N, np.nan))
+        np.testing.assert_array_equal(guard.following_error, np.full(N, 2.0))
+        np.testing.assert_array_equal(guard.current, np.full(N, 20.0))
+
+
+class TestHeldTargets:
+    @joints
+    @signs
+    def test_an_axis_is_held_only_near_its_target(self, joint, sign):
+        guard, where = Guard(limits(), PERIOD), at(joint, 1.0) > 0.0
+        guard.check_hold(TURNS, TURNS + at(joint, sign * 2.0 * JUST_BELOW), where, 1)
+        far = TURNS + at(joint, sign * 2.0 * JUST_ABOVE)
+        error = refused(FollowingError, guard.check_hold, TURNS, far, where, 4)
+        assert (error.joint, error.cycle) == (joint, 4)
+        guard.check_hold(TURNS, far, ~where, 1)
+
+    def test_a_target_that_is_no_number_is_named_as_such(self):
+        guard = Guard(limits(), PERIOD)
+        target = np.where(np.arange(N) == 3, np.nan, 0.0)
+        error = refused(NotFinite, guard.check_hold, target, REST, EVERY, 5)
+        assert (error.joint, error.cycle, error.bound) == (3, 5, np.inf)
+        assert np.isnan(error.value)
+        guard.check_hold(target, REST, np.arange(N) != 3, 5)
+
+
+class TestFirstSetPoint:
+    """A tenth of 2 revolutions, and 5e-4 revolutions per cycle."""
+
+    @joints
+    @signs
+    def test_the_arm_is_where_its_target_is(self, joint, sign):
+        guard, still = Guard(limits(), PERIOD), np.zeros((2, N))
+        guard.check_start(TURNS, TURNS + at(joint, sign * 0.1999), still, 1)
+        far = TURNS + at(joint, sign * 0.2 * JUST_ABOVE)
+        for target, actual in ((TURNS, far), (far, TURNS)):
+            error = refused(FirstSetPoint, guard.check_start, target, actual, still, 6)
+            assert (error.joint, error.cycle) == (joint, 6)
+            assert error.value == pytest.approx(0.2, rel=1e-5)
+            assert error.bound == pytest.approx(0.2)
+
+    @joints
+    @signs
+    @pytest.mark.parametrize("row", [0, 1])
+    def test_neither_target_nor_arm_moves(self, joint, sign, row):
+        guard = Guard(limits(), PERIOD)
+        step = np.zeros((2, N))
+        step[row] = at(joint, sign * 5e-4)
+        guard.check_start(REST, REST, step, 1)
+        step *= JUST_ABOVE
+        error = refused(NotAtStandstill, guard.check_start, REST, REST, step, 2)
+        assert (error.joint, error.bound, error.cycle) == (joint, 5e-4, 2)
+
+    def test_an_arm_that_is_nowhere_is_named_as_such(self):
+        actual = np.where(np.arange(N) == 2, np.inf, 0.0)
+        check = Guard(limits(), PERIOD).check_start
+        assert refused(NotFinite, check, REST, actual, np.zeros((2, N)), 8).joint == 2
+
+    def test_a_target_that_is_no_number_begins_nothing(self):
+        target = np.full(N, np.nan)
+        check = Guard(limits(), PERIOD).check_start
+        error = refused(NotFinite, check, target, target, np.zeros((2, N)), 8)
+        assert (error.joint, error.cycle) == (0, 8)
+        check = Guard(limits(), PERIOD).begin
+        refused(NotFinite, check, START, target, target, np.zeros((2, N)), 8)
+
+
+class TestAfterAGap:
+    """A tenth of 2 revolutions; half of the step sent last, at least 5e-4 per cycle."""
+
+    STILL = np.zeros((2, N))
+
+    @joints
+    @signs
+    def test_the_target_is_where_it_was_sent(self, joint, sign):
+        guard = Guard(limits(), PERIOD)
+        near = TURNS + at(joint, sign * 0.1999)
+        guard.check_after_gap(near, self.STILL, TURNS, REST, 1, EVERY)
+        far, check = TURNS + at(joint, sign * 0.2 * JUST_ABOVE), guard.check_after_gap
+        error = refused(MotionNotCarriedOn, check, far, self.STILL, TURNS, REST, 2, EVERY)
+        assert (error.joint, error.cycle) == (joint, 2)
+        guard.check_after_gap(far, self.STILL, TURNS, REST, 1, np.arange(N) != joint)
+
+    @joints
+    @signs
+    @pytest.mark.parametrize(
+        ("sent", "off"), [(0.0, 5e-4), (8e-4, 5e-4), (1e-3, 5e-4), (4e-3, 2e-3)]
+    )
+    def test_the_target_s_velocity_is_the_one_sent(self, joint, sign, sent, off):
+        guard, step = Guard(limits(), PERIOD), at(joint, sign * sent)
+        for way in (-1.0, 1.0):
+            found = np.zeros((2, N))
+            found[0] = step + at(joint, way * off * 0.999)
+            found[1] = step  # the arm does as it was told
+            guard.check_after_gap(REST, found, REST, step, 1, EVERY)
+            found[0] = step + at(joint, way * off * 1.001)
+            error = refused(MotionHeld, guard.check_after_gap, REST, found, REST, step, 3, EVERY)
+            assert (error.joint, error.cycle) == (joint, 3)
+            assert error.value == pytest.approx(1.001 * off)
+            assert error.bound == pytest.approx(off)
+            guard.check_after_gap(REST, found, REST, step, 1, np.arange(N) != joint)
+
+    @joints
+    @signs
+    def test_an_arm_that_stands_was_not_carried_on_and_one_that_lags_may_have_been(
+        self, joint, sign
+    ):
+        guard, step = Guard(limits(), PERIOD), at(joint, sign * 4e-3)
+        stands = np.array([step, at(joint, sign * 5e-4)])
+        error = refused(MotionHeld, guard.check_after_gap, REST, stands, REST, step, 3, EVERY)
+        assert error.joint == joint
+        guard.check_after_gap(REST, stands, REST, step, 3, np.arange(N) != joint)
+        lags = np.array([step, at(joint, sign * 5e-4 * 1.001)])
+        guard.check_after_gap(REST, lags, REST, step, 3, EVERY)
+
+
+class TestCarriedOn:
+    """A controller's own steps: velocity and acceleration count on, jerk for some cycles not."""
+
+    BOUND = 2.0 * 8.0 * PERIOD**2  # of a stop, per cycle
+
+    @joints
+    @signs
+    def test_acceleration_is_bounded_and_jerk_from_the_fifth_cycle_on(self, joint, sign):
+        guard, q, step = Guard(limits(), PERIOD), START, at(joint, sign * 1.5 * PERIOD)
+        guard.go_on_from(q, step / PERIOD, 2)
+        for way in (1.0, -1.0, 1.0, -1.0):
+            step = step + at(joint, way * JUST_BELOW * self.BOUND)
+            q = q + step
+            guard.check_set_point(q, step / PERIOD, "stop", 1)
+        far = q + step + at(joint, JUST_BELOW * self.BOUND)
+        refused(JerkLimit, guard.check_set_point, far, step / PERIOD, "stop", 2)
+        guard.go_on_from(q, step / PERIOD, 2)
+        far = q + step + at(joint, 1.1 * self.BOUND)
+        refused(AccelerationLimit, guard.check_set_point, far, (far - q) / PERIOD, "stop", 3)
+
+
+class TestWhatIsReportedFirst:
+    def test_the_first_joint_of_the_first_check_that_fails(self):
+        guard = only(velocity=0.5, jerk=50.0)
+        step = START + at(1, 60.0 * PERIOD**3) + at(4, PERIOD)
+        stated = (step - START) / PERIOD
+        assert refused(VelocityLimit, guard.check_set_point, step, stated, "plan", 1).joint == 4
+        both = START + at(1, PERIOD) + at(4, PERIOD)
+        guard = only(velocity=0.5)
+        assert refused(VelocityLimit, guard.check_set_point, both, REST, "plan", 1).joint == 1
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_what_is_no_number_comes_before_what_is_too_large(self, value):
+        guard = Guard(limits(), PERIOD)
+        current, actual = at(0, 1.0), at(1, 100.0)
+        current[0] = value
+        error = refused(NotFinite, guard.check_feedback, REST, actual, current, REST, 1)
+        assert error.joint == 0

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.exchange import PacketReader, RingReader, SharedCycleRing, SharedPacketRing
-from drivers.packet_records import PacketRing
+from drivers.exchange import PacketReader, RingReader
+from drivers.record import CycleRing, PacketRing
 from drivers.transports.tapped import MOST_WAITING, TappedTransport
 
 
@@ -126,7 +126,7 @@ def test_a_reader_gets_every_packet_in_order_or_counts_it(
     capacity: int, steps: list[int | None]
 ) -> None:
     """Steps are packets written, None a look of the reader."""
-    ring = SharedPacketRing.create(capacity)
+    ring = PacketRing.shared(capacity)
     reader = PacketReader(ring.fd)
     seen, written = 0, 0
     for step in [*steps, None]:
@@ -146,12 +146,12 @@ def test_a_reader_gets_every_packet_in_order_or_counts_it(
 
 
 def test_one_kind_of_memory_is_not_taken_for_the_other() -> None:
-    packets, cycles = SharedPacketRing.create(4), SharedCycleRing.create(2, 4)
+    packets, cycles = PacketRing.shared(4), CycleRing.shared(2, 4)
     with pytest.raises(ValueError, match="not a ring of raw packets"):
         PacketReader(cycles.fd)
     with pytest.raises(ValueError, match="not a ring of cycle records"):
         RingReader(packets.fd, 2)
     with pytest.raises(ValueError, match="at least 2"):
-        SharedPacketRing.create(1)
+        PacketRing.shared(1)
     os.close(packets.fd)
     os.close(cycles.fd)

@@ -14,14 +14,11 @@ from drivers import (
     Mode,
     ModeRefused,
     NotFinite,
-    PositionLimit,
     RefusalError,
     Refused,
     RequestError,
     SourceFailed,
     State,
-    VelocityLimit,
-    VelocityMismatch,
 )
 from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
 from tests.drivers.rig import (
@@ -69,47 +66,6 @@ class TestRefusedSetPoints:
         rig, answer = play(rows, velocities)
         assert assert_refused(rig, answer, NotFinite).joint == 3
         assert np.isfinite(answer.axes["d"]).all()
-
-    def test_position(self):
-        speed_limits = limits(lower=START - 0.1, upper=START + 0.1, **WIDE)
-        rows = constant_acceleration(8.0, 90)
-        first = int(np.argmax(rows[:, 1] > START[1] + 0.1))
-        rig, answer = play(rows[: first + 1], guard_limits=speed_limits)
-        error = assert_refused(rig, answer, PositionLimit)
-        assert error.joint == 1
-        assert error.bound == pytest.approx(START[1] + 0.1)
-        assert error.value == pytest.approx(rows[first, 1], abs=1e-6)
-
-    def test_velocity(self):
-        rows = constant_acceleration(7.9, 200)
-        speed = np.diff(rows[:, 1]) / 0.002
-        first = int(np.argmax(speed > 1.0)) + 1
-        slow = limits(velocity=np.full(N, 1.0), **WIDE)
-        rig, answer = play(rows[: first + 1], guard_limits=slow)
-        error = assert_refused(rig, answer, VelocityLimit)
-        assert error.value == pytest.approx(speed[first - 1], rel=1e-6)
-
-    def test_stated_velocity(self):
-        rows = np.tile(START, (5, 1))
-        velocities = np.zeros((5, N))
-        velocities[4, 2] = 2.5
-        rig, answer = play(rows, velocities)
-        assert assert_refused(rig, answer, VelocityLimit).joint == 2
-
-    def test_velocity_that_is_not_the_derivative_of_the_positions(self):
-        rows = np.tile(START, (5, 1))
-        velocities = np.zeros((5, N))
-        velocities[4, 2] = 0.1
-        rig, answer = play(rows, velocities)
-        assert assert_refused(rig, answer, VelocityMismatch).joint == 2
-
-    def test_acceleration(self):
-        rig, _ = play(constant_acceleration(7.99), guard_limits=limits(**WIDE))
-        assert rig.state is State.OPEN
-        rig, answer = play(constant_acceleration(8.01)[:3], guard_limits=limits(**WIDE))
-        # The first step from rest shows half of it, the second all.
-        error = assert_refused(rig, answer, AccelerationLimit)
-        assert error.value == pytest.approx(8.01, rel=1e-4)
 
     def test_jerk(self):
         rig, answer = play(constant_acceleration(0.5)[:2])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, InitReceived, LinkLost, Mode, MotionEnded, PacketRejected, State
-from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
-from tests.drivers.rig import N, Rig, init_packet, still
+from drivers.packets import DRIVE_ON, INIT_LENGTH
+from drivers.replies import D1, Reader, safe_answer
+from tests.drivers.rig import START, N, Rig, all_drive_off, still
 
 WORDS = 9
 
@@ -92,35 +93,6 @@ class TestSafeAnswers:
         assert answer.functionality == bytes(4)
         return rig, CyclicPacket.decode(packet, N), answer
 
-    def test_drive_off_is_echoed_whole(self):
-        rig, packet, answer = self.filled(Mode.CLOSED, status=3)
-        np.testing.assert_array_equal(words(answer), words(packet))
-        assert answer.status == bytes([3, 0, 0, 0])
-        assert rig.state is State.DRIVE_OFF
-
-    @pytest.mark.parametrize(
-        ("mode", "state"),
-        [(Mode.DRIVING_ON, State.DRIVING_ON), (Mode.CLOSED, State.CLOSED)],
-    )
-    def test_target_position_and_velocity_are_given_back(self, mode, state):
-        rig, packet, answer = self.filled(mode)
-        assert rig.state is state
-        assert answer.status == bytes(4)
-        np.testing.assert_array_equal(words(answer)[:, :3], words(packet)[:, :3])
-        assert not words(answer)[:, 3:].any()
-
-    def test_mode_10_gets_all_five_data_back_and_no_extras(self):
-        rig, packet, answer = self.filled(Mode.CLOSED_MIRRORED)
-        assert rig.state is State.CLOSED
-        np.testing.assert_array_equal(words(answer)[:, :6], words(packet)[:, :6])
-        assert not words(answer)[:, 6:].any()
-
-    @pytest.mark.parametrize("mode", [3, 6, 500, 502, 506, 507, 508, -1, 162])
-    def test_a_mode_that_is_not_available_is_answered_by_mode_0_and_zeros(self, mode):
-        _, _, answer = self.filled(mode)
-        assert not words(answer).any()
-        assert answer.status == bytes(4)
-
     @pytest.mark.parametrize("mode", [500, 502])
     def test_a_pause_is_a_state_of_its_own_with_a_patient_deadline(self, mode):
         rig, _, _ = self.filled(mode)
@@ -150,25 +122,6 @@ class TestSafeAnswers:
         reply = rig.send(packet + b"\xa5" * (732 - len(packet)))
         assert len(reply) == 228
         assert b"\xa5\xa5\xa5\xa5" not in reply
-
-    def test_nan_in_a_field_that_is_given_back_goes_back_bit_for_bit(self):
-        rig = Rig()
-        rig.start()
-        rig.axes["d"].view(np.uint32)[2, 1] = 0x7F8ABCDE
-        answer = CyclicPacket.decode(rig.send(rig.packet()), N)
-        assert answer.axes["d"].view(np.uint32)[2, 1] == 0x7F8ABCDE
-
-    def test_each_arm_is_answered_by_its_own_drive(self):
-        axes_map = np.full((4, 10), NO_SLOT)
-        axes_map[0, :N] = range(N)
-        axes_map[1, 0] = N
-        rig = Rig(init=init_packet(n_axes=7, open_axes_map=axes_map))
-        rig.start()
-        rig.axes["d"][6] = [9, 8, 7, 6, 5]
-        answer = rig.cycle()
-        assert rig.state is State.CLOSED
-        np.testing.assert_array_equal(answer.axes["d"][6], [9, 8, 7, 6, 5])
-        np.testing.assert_array_equal(answer.axes["d"][0, 2:], 0.0)
 
 
 class TestWhoGetsAnAnswer:
@@ -211,18 +164,6 @@ class TestWhoGetsAnAnswer:
         assert rig.send(packet) is None
         assert rig.state is State.INIT
         assert rig.session.counters.malformed == 1
-
-    def test_numbers_go_on_with_1_after_0x7fff(self):
-        rig = Rig()
-        rig.close()
-        rig.cycle(0x7FFF - rig.number)
-        assert rig.number == 0x7FFF
-        before = rig.records["cycle"][-1]
-        rig.cycle(12)
-        assert rig.number == 12
-        assert rig.records["cycle"][-1] == before + 12
-        assert rig.session.counters.missed == 0
-        assert rig.state is State.CLOSED
 
     def test_a_cyclic_packet_with_number_10_is_no_init(self):
         rig = Rig()
@@ -396,3 +337,140 @@ class TestConstruction:
     def test_modes_whose_meaning_is_not_known_are_refused(self, mode):
         with pytest.raises(ValueError, match="mode"):
             Rig(mode=mode)
+
+
+def test_what_the_link_discarded_is_counted_and_told_once():
+    rig = Rig()
+    rig.session.discarded("foreign", 3)
+    rig.session.discarded("torn", 1)
+    rig.session.discarded("foreign", 2)
+    assert rig.session.counters.discarded == {"foreign": 5, "torn": 1}
+    assert rig.session.events() == [PacketRejected("foreign", 5), PacketRejected("torn", 1)]
+    assert rig.session.events() == []
+    rig.session.discarded("foreign", 1)
+    assert rig.session.events() == [PacketRejected("foreign", 1)]
+    assert rig.session.counters.discarded == {"foreign": 6, "torn": 1}
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_nothing_discarded_is_not_told(count):
+    rig = Rig()
+    rig.session.discarded("foreign", count)
+    assert rig.session.counters.discarded == {}
+    assert rig.session.events() == []
+
+
+def test_sessions_do_not_share_their_counts():
+    one, other = Rig(), Rig()
+    one.session.discarded("torn", 1)
+    assert other.session.counters.discarded == {}
+
+
+def test_it_is_told_together_with_what_the_session_rejected():
+    rig = Rig()
+    rig.close()
+    rig.session.events()
+    rig.send(b"short")
+    rig.send(rig.transcript[0][0][:100])
+    rig.session.discarded("malformed", 3)
+    assert rig.session.counters.malformed == 2
+    assert [event for event in rig.events + rig.session.events()
+            if isinstance(event, PacketRejected)] == [
+        PacketRejected("malformed", 1), PacketRejected("malformed", 1),
+        PacketRejected("malformed", 3),
+    ]  # fmt: skip
+
+
+class TestReasons:
+    """What arrived and was not understood says why it got no answer."""
+
+    def test_a_packet_that_is_none(self):
+        rig = Rig()
+        for _ in range(40):
+            rig.send(bytes(12))
+        whys = {event.why for event in rig.seen(PacketRejected)}
+        assert whys == {"12 bytes: packet number is 0; expected 1..32767"}
+
+    def test_a_packet_of_a_session_that_began_before(self):
+        rig = Rig()
+        rig.number = 500
+        rig.cycle()
+        assert "no drive on before init" in rig.seen(PacketRejected)[-1].why
+
+    def test_packets_that_do_not_follow_are_not_silence(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        for _ in range(30):
+            rig.number = 3
+            assert rig.cycle() is None
+        rig.session.tick(rig.now + 2.0)
+        rig.events += rig.session.events()
+        assert [event.stale for event in rig.seen(LinkLost)] == [30]
+        assert rig.ended.reason == "only packets that do not follow the last one came (30)"
+        assert rig.seen(PacketRejected)[-1].why.endswith("does not follow 11")
+
+
+def test_the_same_packet_after_a_silence_is_answered_anew():
+    rig = Rig()
+    rig.close()
+    packet = rig.packet()
+    before = rig.send(packet)
+    rig.now += 2.0
+    answered = rig.session.counters.answered
+    assert rig.send(packet) == before
+    assert rig.session.counters.answered == answered + 1
+    assert rig.session.counters.duplicates == 0
+
+
+def test_a_number_before_that_of_the_init_packet_is_no_answer_s():
+    rig = Rig()
+    rig.start()
+    rig.number = 8
+    assert rig.cycle() is None
+    assert rig.session.counters.stale == 1
+
+
+class TestDrives:
+    """Which arm a slot belongs to is not always known."""
+
+    CLOSED = np.zeros(2, np.int32)
+
+    @pytest.mark.parametrize("arms", [None, (1, 1)])
+    def test_of_slots_nobody_knows_any_drive_that_is_on_counts(self, arms):
+        reader = Reader(np.arange(2), arms, 1, Mode.POSITION)
+        opened = np.full(2, Mode.POSITION, np.int32)
+        reading = reader.read(bytes([0, 0, 5, 0]), opened)
+        assert reading.powered == (arms is None)
+        assert not reader.read(bytes(4), opened).powered
+
+    @pytest.mark.parametrize("arms", [None, (1, 1), (1, 4)])
+    @pytest.mark.parametrize("status", [bytes(4), bytes([5, 0, 0, 0]), bytes([9, 5, 7, 3])])
+    def test_four_status_bytes_go_back_and_none_says_that_a_drive_is_on(self, arms, status):
+        answer = safe_answer(status, self.CLOSED, arms)
+        assert len(answer.status) == 4
+        assert 5 not in answer.status
+
+
+def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
+    rig = Rig()
+    rig.open()
+    rig.axes["d"][2, :] = np.nan
+    rig.axes["d"][4, 2] = np.inf
+    answer = rig.cycle()
+    assert all_drive_off(answer)
+    expected = rig.train.motor_revolutions(START)
+    expected[2] = 0.0
+    np.testing.assert_allclose(answer.axes["d"][:, 0], expected, rtol=1e-6)
+    np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
+
+
+def test_slots_of_unknown_arms_are_the_first_arms_and_driven_if_any_drive_is_on():
+    modes = np.full(2, Mode.CLOSED, np.int32)
+    off, other_on = bytes([3, 4, 7, 9]), bytes([3, DRIVE_ON, 7, 9])
+    answer = safe_answer(off, modes, None)
+    assert answer.status == bytes([3, 0, 0, 0])
+    assert answer.mask[:, D1:].all()  # echoed whole, as with the drive off
+    answer = safe_answer(other_on, modes, None)
+    assert answer.status == bytes(4)
+    assert not answer.mask[:, D1:].all()

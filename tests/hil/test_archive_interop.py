@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from drivers.packet_records import LONGEST_PACKET, PacketRing
-from drivers.record import cycle_dtype
+from drivers.record import LONGEST_PACKET, PacketRing, cycle_dtype
 from hil.archive import (
     Archive,
     ArchiveWriter,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket
-from drivers.packet_records import LONGEST_PACKET, PacketRing
 from drivers.packets import INIT_LENGTH, is_init, next_number
+from drivers.record import LONGEST_PACKET, PacketRing
 from drivers.transports import Lose, SimulatedTransport
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive

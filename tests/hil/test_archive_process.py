@@ -30,18 +30,17 @@ from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketReject
 from drivers.exchange import (
     ArchiveState,
     ControlBlock,
+    CycleRing,
     Ended,
     EventReader,
     EventWriter,
     PacketReader,
+    PacketRing,
     RingReader,
-    SharedCycleRing,
-    SharedPacketRing,
     event_log,
 )
 from drivers.exchange import control as control_memory
-from drivers.exchange.shared_ring import _READ
-from drivers.record import cycle_dtype
+from drivers.record import _READ, cycle_dtype
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.archive.check import check_archive
 from hil.archive.process import ArchiveProcess
@@ -64,7 +63,7 @@ class Memory:
     """What an exchange process would share, and a process to be taken for it."""
 
     def __init__(self) -> None:
-        self.ring = SharedCycleRing.create(2, 4000)
+        self.ring = CycleRing.shared(2, 4000)
         self.ring_fd = self.ring.fd
         self.event_fd = event_log.create(4096)
         self.control_fd = control_memory.create()
@@ -284,9 +283,9 @@ def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
 
 
 @contextmanager
-def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, SharedPacketRing]]:
+def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, PacketRing]]:
     """An archive process in this one, with an archive of raw packets open; room for ten."""
-    memory, ring = Memory(), SharedPacketRing.create(10)
+    memory, ring = Memory(), PacketRing.shared(10)
     ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
     channel, exchange = Channel(theirs), os.pidfd_open(memory.pid)
     process = ArchiveProcess(

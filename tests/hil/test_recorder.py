@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, StateChanged
-from drivers.packet_records import PACKET_DTYPE
 from drivers.packets import InitPacket
-from drivers.record import cycle_dtype
+from drivers.record import PACKET_DTYPE, cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import RECENT, Recent

@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.exchange import ControlBlock, RingReader, shared_ring
+from drivers import record
+from drivers.exchange import ControlBlock, RingReader
 
 EXCHANGE: Final = "drivers.exchange"
 ARCHIVE: Final = "hil.archive.process"
@@ -78,12 +79,12 @@ class ArchivedSoFar:
     @property
     def begun(self) -> bool:
         """Whether it has begun to."""
-        return bool(self._words[shared_ring._READ])
+        return bool(self._words[record._READ])
 
     @property
     def behind(self) -> int:
         """Records written and not taken yet."""
-        return int(self._words[shared_ring._WRITTEN] - self._words[shared_ring._READ])
+        return int(self._words[record._WRITTEN] - self._words[record._READ])
 
 
 class Memory:
@@ -103,7 +104,7 @@ class Memory:
     @property
     def written(self) -> int:
         """Records written so far."""
-        return int(self._words[shared_ring._WRITTEN])
+        return int(self._words[record._WRITTEN])
 
     def records(self) -> NDArray[np.void]:
         """All records of the session: the ring is larger than any of these."""

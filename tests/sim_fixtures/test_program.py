@@ -36,15 +36,6 @@ def advance_to(loop: LoopProgram, phase: Phase) -> None:
     raise AssertionError(f"{phase!r} never came; stuck in {loop.phase!r}")
 
 
-def test_a_cold_start_is_nine_sync_packets_init_and_two_more() -> None:
-    loop = program()
-    steps = []
-    while loop.phase is Phase.START:
-        steps.append(loop.start_step)
-        advance(loop)
-    assert steps == [StartStep.SYNC] * 9 + [StartStep.INIT] + [StartStep.SYNC] * 2
-
-
 def test_a_warm_start_begins_with_init() -> None:
     loop = program(cold_start=False)
     assert loop.start_step is StartStep.INIT
@@ -95,52 +86,6 @@ def test_axes_open_one_after_the_other() -> None:
     ]
     assert loop.phase is Phase.OPEN
     assert loop.intervals == 1
-
-
-def test_exit_closes_for_some_cycles_and_the_loop_opens_again() -> None:
-    loop = program()
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=Answer(valid=True, exit=True))
-    assert loop.phase is Phase.CLOSING
-    assert all(loop.open_axes)
-    assert not loop.listening
-    advance(loop, 2)
-    assert loop.phase is Phase.CLOSED
-    advance_to(loop, Phase.OPEN)
-    assert loop.intervals == 2
-
-
-def test_505_switches_off_until_somebody_switches_on() -> None:
-    loop = program()
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=Answer(valid=True, drive_off=True))
-    advance(loop, 50)
-    assert loop.phase is Phase.DRIVE_OFF
-    assert "505" in loop.reason
-    loop.drive_on()
-    advance_to(loop, Phase.OPEN)
-
-
-def test_508_goes_to_closed_with_the_drive_on() -> None:
-    loop = program()
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=Answer(valid=True, following_error=True))
-    assert loop.phase is Phase.CLOSED
-    assert loop.powered
-
-
-def test_missing_replies_end_open_mode_and_only_open_mode() -> None:
-    loop = program(missed_replies=2)
-    advance_to(loop, Phase.CLOSED)
-    advance(loop, answer=MISSING)
-    assert loop.phase is Phase.CLOSED
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=MISSING)
-    advance(loop)
-    advance(loop, answer=MISSING)
-    assert loop.phase is Phase.OPEN
-    advance(loop, answer=MISSING)
-    assert loop.phase is Phase.CLOSED
 
 
 def lose_opening(loop: LoopProgram) -> None:
