@@ -10,7 +10,6 @@ hold may last, but a source that does not come to rest in it is stopped.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Final, cast
 
 import numpy as np
@@ -37,14 +36,14 @@ _AT_REST: Final = 1e-9
 """rad per cycle and rad/s: what rounding leaves of standstill."""
 
 
-class Execution(ABC):
+class Execution:
     """What motions and corrections have in common.
 
     Args:
         source: the motion or correction.
         n_joints: n.
         settle_cycles: how long its end is held.
-        stop_cycles: how many set-points it may give after a stop was requested.
+        stop_cycles: how many of the controller's cycles it may take to rest once asked to.
 
     Attributes:
         started: the first set-point was taken.
@@ -69,8 +68,7 @@ class Execution(ABC):
         self._settle_cycles = settle_cycles
         self._stop_cycles = stop_cycles
         self._granted: tuple[BoundsName, ...] = ("plan",)
-        self._stopping = 0
-        self._holding: int | None = None
+        self._rest_by: int | None = None  # the cycle from which on it takes too long
         self._resting = 0
         self.finished = False
         self.started = False
@@ -90,13 +88,23 @@ class Execution(ABC):
         """The widest bounds granted so far."""
         return self._granted[-1]
 
-    @abstractmethod
     def begin(self, position: Array, cycle: int) -> None:
-        """Take the first set-point, (n,) rad.
+        """Take the first set-point, (n,) rad; held at once if that was asked for before.
 
         Raises:
-            SourceFailed: the source does not begin there.
+            SourceFailed: the source does not begin there, or does not hold.
         """
+        try:
+            self._begin_source(position)
+            self.finished = bool(self._source.finished)
+        except BaseException as error:
+            raise _failed("cannot begin", error, cycle) from error
+        self.started = True
+        if self.held and (reason := self.hold(cycle)) is not None:
+            raise SourceFailed(f"{reason}, before it began", cycle)
+
+    def _begin_source(self, position: Array) -> None:
+        raise NotImplementedError
 
     def stop(self, reason: str, cycle: int) -> None:
         """Come to rest on the path. The first reason stays.
@@ -109,6 +117,7 @@ class Execution(ABC):
         self.outcome = "stopped"
         self.reason = reason
         self.held = False
+        self._rest_by = cycle + self._stop_cycles
         self._grant("stop")
         try:
             self._source.stop()
@@ -132,7 +141,7 @@ class Execution(ABC):
         self.fraction = float(fraction)
         return None
 
-    def hold(self) -> str | None:
+    def hold(self, cycle: int) -> str | None:
         """Come to rest on the path until `resume`; says why that cannot be, or None.
 
         Before the beginning it is kept: the motion begins at rest, and stays there.
@@ -149,13 +158,14 @@ class Execution(ABC):
         except BaseException as error:
             return f"the motion source failed to hold: {in_words(error)}"
         self.held = True
-        if self._holding is None and self.started:
-            self._holding = 0
+        if self._rest_by is None and self.started:
+            self._rest_by = cycle + 1 + self._stop_cycles
         return None
 
     def rested(self) -> None:
         """It is at rest: as far as a hold goes, that is what was asked for."""
-        self._holding = None
+        if self.outcome != "stopped":
+            self._rest_by = None
 
     def resume(self) -> str | None:
         """Go on after a hold; says why that cannot be, or None."""
@@ -169,18 +179,8 @@ class Execution(ABC):
                 source.resume()
         except BaseException as error:
             return f"the motion source refused it: {in_words(error)}"
-        self._holding, self.held = None, False
+        self._rest_by, self.held = None, False
         return None
-
-    def _started(self, cycle: int) -> None:
-        """The source has begun; it is held at once if that was asked for before.
-
-        Raises:
-            SourceFailed: it does not hold.
-        """
-        self.started = True
-        if self.held and (reason := self.hold()) is not None:
-            raise SourceFailed(f"{reason}, before it began", cycle)
 
     def _grant(self, bounds: BoundsName) -> None:
         if bounds not in self._granted:
@@ -194,24 +194,18 @@ class Execution(ABC):
             )
         return array
 
-    def _count_cycles(self, cycle: int) -> None:
+    def _require_rest(self, cycle: int) -> None:
+        """A stop that takes too long is a failure, and a hold that does becomes a stop."""
+        if self._rest_by is None or cycle < self._rest_by:
+            return
         if self.outcome != "stopped":
-            self._count_holding(cycle)
-            return
-        self._stopping += 1
-        if self._stopping > self._stop_cycles:
-            raise SourceFailed(
-                f"the motion source did not come to rest in the {self._stop_cycles} cycles after "
-                "a stop was requested",
-                cycle,
-            )
-
-    def _count_holding(self, cycle: int) -> None:
-        if self._holding is None:
-            return
-        self._holding += 1
-        if self._holding > self._stop_cycles:
             self.stop(f"it did not come to rest in {self._stop_cycles} cycles of a hold", cycle)
+            return
+        raise SourceFailed(
+            f"the motion source did not come to rest in the {self._stop_cycles} cycles after "
+            "a stop was requested",
+            cycle,
+        )
 
 
 class MotionExecution(Execution):
@@ -231,19 +225,9 @@ class MotionExecution(Execution):
         self.position = self._still
         self.feeds_forward = callable(getattr(source, "feed_forward", None))
 
-    def begin(self, position: Array, cycle: int) -> None:
-        """Take the first set-point, (n,) rad.
-
-        Raises:
-            SourceFailed: the source does not begin there.
-        """
+    def _begin_source(self, position: Array) -> None:
         self.position = position
-        try:
-            self._source.begin(position.copy())
-            self.finished = bool(self._source.finished)
-        except BaseException as error:
-            raise _failed("cannot begin", error, cycle) from error
-        self._started(cycle)
+        self._source.begin(position.copy())
 
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
         """The next set-point (n,) rad, rad/s, and the bounds it keeps; the end is held.
@@ -264,9 +248,9 @@ class MotionExecution(Execution):
             raise
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
-        if self._holding is not None and self._stands(position, velocity):
+        if self._rest_by is not None and self._stands(position, velocity):
             self.rested()
-        self._count_cycles(cycle)
+        self._require_rest(cycle)
         # The source may reuse its arrays.
         self.position = position.copy()
         return self.position, velocity, bounds
@@ -332,18 +316,8 @@ class CorrectionExecution(Execution):
         if self.outcome != "stopped":
             self._granted = tuple(name for name in self._granted if name != "stop")
 
-    def begin(self, position: Array, cycle: int) -> None:  # noqa: ARG002  nobody asks where
-        """Every axis is open.
-
-        Raises:
-            SourceFailed: the source does not begin.
-        """
-        try:
-            self._source.begin()
-            self.finished = bool(self._source.finished)
-        except BaseException as error:
-            raise _failed("cannot begin", error, cycle) from error
-        self._started(cycle)
+    def _begin_source(self, position: Array) -> None:  # noqa: ARG002  nobody asks where
+        self._source.begin()
 
     def advance(self, cycle: int) -> tuple[Array, Array]:
         """The next correction: motion (n,), see `CorrectionSource`, and motor current (n,) A.
@@ -363,7 +337,7 @@ class CorrectionExecution(Execution):
             raise
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
-        self._count_cycles(cycle)
+        self._require_rest(cycle)
         return motion.copy(), current.copy()
 
 

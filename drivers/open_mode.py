@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Final
 
 import numpy as np
@@ -171,7 +170,7 @@ half of it bends so little, at less than 10 rad/s² within 1e-3 rad, that spread
 well within those bounds; and nothing goes on beside the path for as long as a gap may last."""
 
 
-class OpenMode(ABC):
+class _OpenMode:
     """Writes into `frame` what is sent, and into the record (2, n) what was commanded.
 
     The frame holds the safe answer already.
@@ -215,50 +214,6 @@ class OpenMode(ABC):
         raw = self._wire.raw
         self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
 
-    @abstractmethod
-    def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """The last wanted axis opened in this packet: the first answer in open mode.
-
-        Raises:
-            GuardError: it must not be sent.
-        """
-
-    @abstractmethod
-    def next(
-        self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
-    ) -> None:
-        """One period on: what the source gives, or rest where nothing was begun.
-
-        Raises:
-            RefusalError: the arm does not follow, the source failed or the guard said no.
-        """
-
-    @abstractmethod
-    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
-        """The packet read last, the first after a long gap, against what was sent last.
-
-        Axes that have closed, or did so since the first set-point, do not matter.
-
-        Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld, SourceFailed: going on would be a jump.
-        """
-
-    @abstractmethod
-    def require_no_pause(self, reading: Reading, cycle: int) -> None:
-        """The packet read last came late by the clock: the arm moves as it should, all the same.
-
-        Raises:
-            NotFinite, MotionPaused: going on would be a jump.
-        """
-
-    @abstractmethod
-    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Axes still open stay at rest; those that closed have the safe answer.
-
-        Raises:
-            GuardError: an axis still open does not follow, or takes too much current.
-        """
-
     def require_start(self, cycle: int) -> None:
         """A motion begins where the arm was held: the conditions of the first set-point.
 
@@ -284,7 +239,7 @@ class OpenMode(ABC):
             require(where, age[row].astype(np.float64), self._still, error, cycle)
 
 
-class PositionMode(OpenMode):
+class PositionMode(_OpenMode):
     """Modes 1, 4 and 5: the PC generates the targets."""
 
     def __init__(
@@ -304,7 +259,11 @@ class PositionMode(OpenMode):
         )
 
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """The first set-point is the target received, at zero velocity."""
+        """The last wanted axis opened: the target received is the first set-point, at rest.
+
+        Raises:
+            GuardError: it must not be sent.
+        """
         self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
         raw = self._wire.raw
         target = raw[TARGET].copy()
@@ -333,7 +292,11 @@ class PositionMode(OpenMode):
         commanded: Array,
         cycle: int,
     ) -> None:
-        """The motion's next set-point, or the last one where nothing moves."""
+        """The motion's next set-point, or the last one where nothing moves.
+
+        Raises:
+            RefusalError: the arm does not follow, the source failed or the guard said no.
+        """
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
         stopping = execution is not None and execution.outcome == "stopped"
@@ -410,9 +373,13 @@ class PositionMode(OpenMode):
         wire.put(frame, D5, current)
 
     def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
-        """Target and velocity received against the set-point sent last, and some steps more.
+        """After a long gap: target and velocity received against the set-point sent last.
 
-        A motion goes on from there: as many steps further on its path, or at rest.
+        A motion goes on from there: some steps further on its path, or at rest. Axes that have
+        closed, or did so since the first set-point, do not matter.
+
+        Raises:
+            NotFinite, MotionNotCarriedOn, MotionHeld, SourceFailed: going on would be a jump.
         """
         where = self._continuing & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
@@ -439,14 +406,22 @@ class PositionMode(OpenMode):
         self.held, self._sent = position, target
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:
-        """Velocity of the arm against that of the set-points sent last."""
+        """A packet came late by the clock: the arm moves as the set-points sent last.
+
+        Raises:
+            NotFinite, MotionPaused: going on would be a jump.
+        """
         where = self._continuing & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), MotionUnknown, cycle, where)
         velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Axes open all the time keep the last set-point; those open again, their target."""
+        """Axes open all the time keep the last set-point; those open again, their target.
+
+        Raises:
+            GuardError: an axis still open does not follow, or takes too much current.
+        """
         raw, continuing, held = self._wire.raw, self._continuing, reading.held
         continuing &= reading.ready
         self.require_holdable(held & ~continuing, held | reading.ready, cycle)
@@ -477,7 +452,7 @@ class PositionMode(OpenMode):
 _CURRENT_FIELD: Final = 5
 
 
-class CorrectionMode(OpenMode):
+class CorrectionMode(_OpenMode):
     """Zeros, until a source corrects what the controller does.
 
     ====  ==============================  ===================================================
@@ -610,3 +585,6 @@ class CorrectionMode(OpenMode):
             np.add(measured[0], motion, out=commanded[0])
         elif self._velocity:
             commanded[1] = motion
+
+
+OpenMode = PositionMode | CorrectionMode

@@ -138,7 +138,7 @@ class Machine:
             raise RequestError(self.state.name.lower(), _NONE, "hold")
         if self.stop_reason is not None:
             return
-        before, reason = execution.held, execution.hold()
+        before, reason = execution.held, execution.hold(self.cycle)
         if reason is not None:
             self.stop(reason)
         elif execution.held is not before:

@@ -14,11 +14,9 @@ import os
 import pickle
 import socket
 import struct
-from dataclasses import dataclass
 from typing import Final
 
 from drivers.errors import RequestError
-from drivers.exchange import motion_transfer
 from drivers.motion_source import MotionSource
 
 SMALLEST_MAPPED: Final = 4096
@@ -100,25 +98,6 @@ _IDENTITY: Final = struct.Struct("<Q")
 _DESCRIPTOR: Final = struct.Struct("@i")
 
 
-@dataclass(frozen=True)
-class HandedOver:
-    """A program that arrived, still in its sealed memory."""
-
-    identity: int
-    fd: int
-
-    def unpacked(self) -> MotionSource:
-        """The motion source; the descriptor is closed, the memory stays mapped as needed."""
-        try:
-            return motion_transfer.unpack(self.fd)
-        finally:
-            os.close(self.fd)
-
-    def drop(self) -> None:
-        """Nobody wants it any more."""
-        os.close(self.fd)
-
-
 class Inbox:
     """The exchange's end; never waits.
 
@@ -139,8 +118,8 @@ class Inbox:
         except OSError:
             return True
 
-    def take(self) -> HandedOver | None:
-        """The next program, if one has arrived."""
+    def take(self) -> int | None:
+        """Descriptor of the next program, if one has arrived; whoever asks closes it."""
         try:
             # Not `socket.recv_fds`, which waits whatever flags it is given.
             message, ancillary, _, _ = self._channel.recvmsg(
@@ -152,7 +131,7 @@ class Inbox:
             return None
         (fd,) = _DESCRIPTOR.unpack(ancillary[0][2])
         self.identity = _IDENTITY.unpack(message)[0]
-        return HandedOver(self.identity, fd)
+        return int(fd)
 
     def read(self) -> None:
         """Say that the program received last was read."""
@@ -170,7 +149,7 @@ class Inbox:
 
 def hand_over(channel: socket.socket, identity: int, source: MotionSource) -> None:
     """Send a program, from the supervisor's end."""
-    fd = motion_transfer.pack(source)
+    fd = pack(source)
     try:
         socket.send_fds(channel, [_IDENTITY.pack(identity)], [fd])
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import pickle
 import socket
 import time
@@ -33,7 +34,7 @@ from drivers.exchange.event_log import (
     ResumeRefused,
 )
 from drivers.exchange.loop import POLL
-from drivers.exchange.motion_transfer import WITHDRAWN, Inbox
+from drivers.exchange.motion_transfer import WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket
 from drivers.record import MEASURED, CycleRing
@@ -275,15 +276,14 @@ class Serving:
 
     def _read_program(self, now: float) -> None:
         """Read the program that was handed over. That takes time, in which it may be withdrawn."""
-        handed_over = self._inbox.take()
-        if handed_over is None:
-            return  # its descriptor is still on the way
+        fd = self._inbox.take()
+        if fd is None:
+            return  # it is still on the way
         self._offered = None
         try:
-            if self._withdrawn(handed_over.identity):
-                handed_over.drop()
+            if self._withdrawn(self._inbox.identity):
                 raise RequestError(self._state, WITHDRAWN)
-            self._offered = handed_over.unpacked()
+            self._offered = unpack(fd)
             self._offered_to = self._session.init
         except RequestError as error:
             self._answer(error)
@@ -291,6 +291,8 @@ class Serving:
             self._answer(RequestError(self._state, f"the program cannot be read: {error!r}"))
         else:
             self._inbox.read()
+        finally:
+            os.close(fd)
         self._control.pickup_us = 1e6 * (time.monotonic() - now)
 
     def _take_program(self, source: MotionSource) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import degrees
@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_fixtures.errors import FixtureError
 from sim_fixtures.ns16 import geometry
 
 TRUTH_PATH = Path(__file__).with_name("truth.json")
@@ -219,11 +220,44 @@ CELL_PATH = FOLDER / "cell.toml"
 TABLE2 = table2()
 
 
-def urdf_text() -> str:
-    """Return the URDF of the arm with its planted inertias; those of ns16.urdf are nominal."""
-    from sim_fixtures.ns16.build_urdf import build_urdf  # which `python -m` runs, and imports this
+def _numbers(values: Sequence[float]) -> str:
+    """Write numbers with as many digits (up to 17) as carry a double without loss."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 
-    return build_urdf()
+
+def inertial(link: LinkInertia, name: str, scale: float = 1.0) -> str:
+    """Line of a URDF with the inertia of a link over `scale`.
+
+    Raises:
+        FixtureError: no rigid body could have it.
+    """
+    xx, xy, xz, yy, yz, zz = tensor = link.tensor_at_centre
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if link.mass <= 0.0 or moments[0] <= 0.0 or moments[2] >= moments[0] + moments[1]:
+        raise FixtureError(f"{name}: no rigid body has mass {link.mass} and moments {moments}")
+    entries = zip(TENSOR_KEYS, tensor, strict=True)
+    text = " ".join(f'i{key}="{_numbers([value / scale])}"' for key, value in entries)
+    return (
+        f'    <inertial><origin xyz="{_numbers(link.centre_of_mass)}" rpy="0 0 0"/>'
+        f'<mass value="{_numbers([link.mass / scale])}"/><inertia {text}/></inertial>\n'
+    )
+
+
+def urdf_text(inertia_scale: Sequence[float] = (1.0,) * 6) -> str:
+    """Return the URDF with the planted inertias over `inertia_scale`; ns16.urdf has nominal ones.
+
+    Link frame i stands at O_{i-1} with the axes of DH frame i, so that the standard parameters that
+    a rigid-body library reads from joint frame i *are* those of the paper: mass, first moment, and
+    the tensor about the frame's origin. Joint i stands at p_{i-1} of link i-1, turned by
+    Rx(alpha_i); its axis is Rx(-alpha_i) z, because DH turns about z before it twists.
+    """
+    links = enumerate(zip(load_truth().links, inertia_scale, strict=True), start=1)
+    lines = URDF_PATH.read_text(encoding="utf-8").splitlines(keepends=True)
+    for at, line in enumerate(lines):
+        if line.lstrip().startswith("<inertial>"):
+            number, (link, scale) = next(links)
+            lines[at] = inertial(link, f"link_{number}", scale)
+    return "".join(lines)
 
 
 __all__ = [
@@ -238,6 +272,7 @@ __all__ = [
     "table2",
     "base_from_standard",
     "LinkInertia",
+    "inertial",
     "Ns16Truth",
     "load_truth",
     "standard_parameters",

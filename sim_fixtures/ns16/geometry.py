@@ -43,35 +43,3 @@ VELOCITY_DEG: Final = (155.0, 155.0, 170.0, 360.0, 350.0, 550.0)
 
 HOME_DEG: Final = (0.0, 0.0, -90.0, 0.0, 90.0, 0.0)
 """The maker's home posture, controller angles."""
-
-
-def quarter_turn_sine(quarter_turns: int) -> int:
-    """Return the exact sine of a number of right angles."""
-    return (0, 1, 0, -1)[quarter_turns % 4]
-
-
-def joint_axis(i: int) -> tuple[int, int, int]:
-    """Return the axis of joint `i` (0-based) in the axes of link frame `i`: Rx(-alpha_i) z."""
-    turns = -ALPHA_QUARTER_TURNS[i]
-    return (0, -quarter_turn_sine(turns), quarter_turn_sine(turns + 1))
-
-
-def next_origin(i: int) -> tuple[float, float, float]:
-    """Return p_i = O_i - O_{i-1} of link `i` (0-based) in its own axes [m].
-
-    The height d_1 is left out: O_0 is placed on the axis of joint 1 at the height of joint 2.
-    """
-    offset = 0.0 if i == 0 else D[i]
-    x, y, z = joint_axis(i)
-    return (A[i] + offset * x, offset * y + 0.0, offset * z + 0.0)
-
-
-def joint_limits_deg() -> tuple[tuple[float, float], ...]:
-    """Return (lower, upper) of every joint as DH angles [deg]."""
-    limits = []
-    for lower, upper, sign, offset in zip(
-        LOWER_DEG, UPPER_DEG, JOINT_SIGN, JOINT_OFFSET_DEG, strict=True
-    ):
-        ends = (sign * (lower - offset), sign * (upper - offset))
-        limits.append((min(ends), max(ends)))
-    return tuple(limits)

@@ -42,6 +42,7 @@ class Conduct:
         stopping: a stop was asked for (or a long gap was, or too many answers were not taken) in
             this interval.
         overridden: a change of override was accepted in this interval.
+        aged: the targets in the packet were sent in an earlier cycle: answers lost do not show.
         tally: how often which law was put to use.
     """
 
@@ -58,6 +59,7 @@ class Conduct:
     entitled: bool = False
     stopping: bool = False
     overridden: bool = False
+    aged: bool = False
     barrier: bool = True
     sent: list[np.ndarray] = field(default_factory=list)
     motor: np.ndarray | None = None
@@ -300,6 +302,9 @@ class Conduct:
         lag = self._lag(target)
         last = np.abs(self.motors[-1] - self.motors[-2]).max() if len(self.motors) > 1 else 0.0
         slow = last <= 4.0 * self.limits.standstill * (1 + 1e-6)
+        if self.aged:
+            self.lag = lag if slow else self.lag
+            return
         assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
         self.lost += max(0, lag - self.lag)
         self.lag = self.lag if self.repeats and not lag else lag

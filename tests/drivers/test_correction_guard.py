@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import Guard, GuardError, GuardLimits, JerkLimit, NotFinite
+from drivers import Guard, GuardError, GuardLimits, NotFinite
 from drivers.errors import (
     AccelerationLimit,
     CommandedCurrentLimit,
@@ -24,7 +24,6 @@ from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joint
 from tests.drivers.rig import PERIOD, N, limits
 
 BOUNDS = limits()
-FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}
 
 shares = st.lists(st.floats(-1.3, 1.3), min_size=1, max_size=60)
 names = st.sampled_from(sorted(FACTORS))

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import MotionEnded, MotionStarted, RequestError, State, StateChanged
+from drivers import MotionEnded, MotionStarted, RequestError, State
 from drivers.exchange import (
     ArchiveState,
     ControlBlock,
@@ -26,16 +26,13 @@ from drivers.exchange import (
     ExchangeProcess,
     ExchangeSettings,
     ExchangeStarted,
-    HoldRefused,
     Leaving,
     OverrideRefused,
     RealTimeSettings,
-    ResumeRefused,
     RingReader,
     WithdrawnError,
     process,
 )
-from drivers.exchange.serving import LONGEST_LINGER
 from drivers.transports import TransportError, UdpSpec, UdpTransport
 from hil.demo_link import free_port
 from tests.drivers.rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
@@ -118,20 +115,6 @@ def test_a_whole_motion_is_run_recorded_and_told():
         assert exchange.status().finished
         assert the(ExchangeEnded, events).reason == "the supervisor wants to end"
         assert exchange.log == ""
-
-
-@pytest.mark.slow
-def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end():
-    with running() as (exchange, controller):
-        controller.cycle_time = PERIOD
-        exchange.finish()
-        end = time.monotonic() + LONGEST_LINGER + 5.0
-        while exchange.alive:
-            assert time.monotonic() < end, "the exchange does not end"
-            controller.open = True  # it closes when asked to, and opens with the next packet
-            controller.cycle(3)
-        assert controller.exits > 10
-        assert exchange.wait(30.0) == 0
 
 
 def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_the_arm():
@@ -425,21 +408,6 @@ class TestHold:
             controller.until(lambda: not controller.open)
             controller.assert_stopped_on_its_path(PERIOD)
 
-    def test_without_a_motion_there_is_nothing_to_go_on_with(self):
-        with running() as (exchange, controller):
-            exchange.resume()
-            controller.cycle(3)
-            assert "no motion" in the(ResumeRefused, exchange.events()).reason
-
-    def test_a_hold_without_a_motion_is_refused_and_holds_no_later_one(self):
-        with running() as (exchange, controller):
-            exchange.hold()
-            controller.cycle(3)
-            assert "no motion" in the(HoldRefused, exchange.events()).reason
-            set_going(exchange, controller)
-            moved = controller.moved
-            controller.until(lambda: controller.moved > moved + 0.1)
-
     def test_a_motion_that_cannot_rest_is_stopped(self):
         with running() as (exchange, controller):
             set_going(exchange, controller)
@@ -519,16 +487,6 @@ class TestStops:
             controller.assert_stopped_on_its_path(PERIOD)
             assert "no sign of life" in the(Leaving, events).reason
             assert exchange.wait(30.0) == 0
-
-    def test_an_arm_that_is_only_held_is_let_go_too(self):
-        with running() as (exchange, controller):
-            controller.open = True
-            controller.cycle(20)
-            exchange.terminate()
-            events = run_to_the_end(exchange, controller)
-            assert controller.exits == 1
-            assert controller.moved == 0.0
-            assert the(ExchangeEnded, events)
 
     def test_without_supervisor_and_controller_it_ends(self):
         with running(session={"silence_timeout": 1.0}) as (exchange, controller):
@@ -701,14 +659,6 @@ def test_a_live_change_of_speed_that_a_motion_cannot_make_is_refused():
         controller.cycle(5)
         assert np.isnan(the(OverrideRefused, exchange.events()).fraction)
         assert controller.open
-
-
-def test_states_are_told_in_order():
-    with running() as (exchange, controller):
-        controller.open = True
-        controller.cycle(5)
-        states = [event.after for event in exchange.events() if isinstance(event, StateChanged)]
-        assert states == [State.INIT, State.CLOSED, State.OPEN]
 
 
 def test_a_process_that_cannot_be_started_is_an_error_of_ours_and_leaves_nothing_open(monkeypatch):

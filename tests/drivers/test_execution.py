@@ -75,10 +75,10 @@ def begun(source) -> Execution:
     return execution
 
 
-def fails(execution: Execution, words: str) -> None:
+def fails(execution: Execution, words: str, cycle: int = 7) -> None:
     with pytest.raises(SourceFailed, match=words) as caught:
-        execution.advance(7)
-    assert caught.value.cycle == 7
+        execution.advance(cycle)
+    assert caught.value.cycle == cycle
 
 
 class TestEnd:
@@ -128,10 +128,16 @@ class TestStop:
     def test_it_may_take_so_many_cycles_and_no_more(self, kind):
         execution = begun(kind())
         execution.advance(1)
-        execution.stop("enough", 1)
+        execution.stop("enough", 2)
         for cycle in range(STOP):
             execution.advance(2 + cycle)
         fails(execution, f"did not come to rest in the {STOP} cycles")
+
+    def test_cycles_count_in_which_no_set_point_was_asked_for(self, kind):
+        execution = begun(kind())
+        execution.stop("enough", 1)
+        execution.advance(1)
+        fails(execution, "did not come to rest", cycle=1 + STOP)
 
     def test_the_first_reason_stays_and_it_is_told_once(self, kind):
         source = kind()
@@ -149,16 +155,16 @@ class TestStop:
         execution.advance(1)
         execution.stop("late", 2)
         assert execution.outcome == "completed"
-        assert execution.hold() is None
+        assert execution.hold(0) is None
         assert not execution.held
 
     def test_one_that_stops_is_neither_held_nor_resumed(self, kind):
         execution = begun(kind())
-        assert execution.hold() is None
+        assert execution.hold(0) is None
         assert execution.held
         execution.stop("enough", 1)
         assert not execution.held
-        assert execution.hold() is None
+        assert execution.hold(0) is None
         assert not execution.held
         assert execution.resume() == "the motion is being stopped"
 
@@ -167,7 +173,7 @@ class TestHold:
     @pytest.mark.parametrize("kind", [Motion, Correction])
     def test_one_that_goes_on_for_as_long_as_a_stop_may_take_is_stopped(self, kind):
         execution = begun(kind())
-        execution.hold()
+        execution.hold(0)
         for cycle in range(STOP):
             execution.advance(1 + cycle)
             assert execution.outcome == "completed"
@@ -177,17 +183,17 @@ class TestHold:
 
     def test_a_second_hold_is_no_new_time(self):
         execution = begun(Motion())
-        execution.hold()
+        execution.hold(0)
         for cycle in range(STOP):
             execution.advance(1 + cycle)
-            execution.hold()
+            execution.hold(1 + cycle)
         execution.advance(9)
         assert execution.outcome == "stopped"
 
     def test_one_that_rests_may_rest_for_ever(self):
         source = Motion()
         execution = begun(source)
-        execution.hold()
+        execution.hold(0)
         execution.advance(1)
         source.step = 0.0
         for cycle in range(5 * STOP):
@@ -200,7 +206,7 @@ class TestHold:
         """Seen over one cycle; what rounding leaves is none."""
         source = Motion(step=0.0)
         execution = begun(source)
-        execution.hold()
+        execution.hold(0)
         tiny = {"step": 0.9e-9, "speed": 0.9e-9}
         large = {"step": 0.0, "speed": 0.0, what: 1.1e-9}
 
@@ -226,7 +232,7 @@ class TestHold:
         execution = begun(source)
         execution.advance(1)
         source.step = 0.01
-        execution.hold()
+        execution.hold(1)
         for cycle in range(STOP + 1):
             execution.advance(2 + cycle)
         assert execution.outcome == "stopped"
@@ -235,11 +241,11 @@ class TestHold:
         source = Motion()
         execution = execution_of(source, Mode.POSITION, N, SETTLE, STOP)
         assert isinstance(execution, MotionExecution)
-        assert execution.hold() is None
+        assert execution.hold(0) is None
         assert (execution.held, source.told, execution.granted) == (True, [], "plan")
         assert execution.resume() is None
         assert (execution.held, source.told) == (False, [])
-        execution.hold()
+        execution.hold(0)
         execution.begin(HERE, 0)
         assert (source.told, execution.granted) == (["hold"], "stop")
         for cycle in range(STOP + 1):
@@ -249,7 +255,7 @@ class TestHold:
     def test_resuming_ends_the_count(self):
         source = Motion()
         execution = begun(source)
-        execution.hold()
+        execution.hold(0)
         execution.advance(1)
         assert execution.resume() is None
         assert not execution.held
@@ -264,7 +270,7 @@ class TestBounds:
         execution = begun(source)
         for needs, call in (
             ("override", lambda: execution.override(0.5)),
-            ("stop", execution.hold),
+            ("stop", lambda: execution.hold(1)),
         ):
             source.bounds = needs
             fails(execution, f"named bounds '{needs}'")
@@ -286,7 +292,7 @@ class TestBounds:
     def test_a_correction_at_rest_has_those_of_a_stop_no_longer_unless_it_stops(self):
         execution = begun(Correction())
         assert isinstance(execution, CorrectionExecution)
-        execution.hold()
+        execution.hold(0)
         assert execution.granted == "stop"
         execution.rested()
         assert execution.granted == "plan"

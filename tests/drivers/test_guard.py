@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import Guard, GuardError, GuardLimits, JerkLimit
+from drivers import Guard, GuardError, GuardLimits
 from drivers.errors import (
     AccelerationLimit,
     CurrentLimit,

@@ -1,11 +1,19 @@
+"""Records of cycles and raw packets, and the rings that keep the last of either."""
+
 from __future__ import annotations
 
+import os
+from collections import deque
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import CycleRing, cycle_dtype
-from drivers.record import COMMANDED, MEASURED
+from drivers import cycle_dtype
+from drivers.exchange import PacketReader, RingReader
+from drivers.record import COMMANDED, MEASURED, CycleRing, PacketRing
+from drivers.transports.tapped import MOST_WAITING, TappedTransport
 
 
 def put(ring: CycleRing, count: int, first: int = 0) -> None:
@@ -74,3 +82,145 @@ def test_drained_records_are_copies():
     drained = ring.drain()
     put(ring, 4, 100)
     assert drained["cycle"].tolist() == [0, 1, 2, 3]
+
+
+class Wire:
+    """A link that gives what is put into it."""
+
+    ages = None
+
+    def __init__(self, *packets: bytes) -> None:
+        self.now = 0.0
+        self.packets = deque(packets)
+        self.sent: list[bytes] = []
+        self.closed = False
+
+    def receive(self, timeout: float) -> bytes | None:
+        self.now += 0.25
+        return self.packets.popleft() if self.packets else None
+
+    def send(self, packet: bytes) -> None:
+        self.now += 0.25
+        self.sent.append(packet)
+
+    def rejected(self) -> dict[str, int]:
+        return {"torn": 3}
+
+    def forget_peer(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class StampedWire(Wire):
+    arrived: float | None = 0.125
+
+
+def drained(ring: PacketRing) -> list[tuple[int, float, int, bytes]]:
+    return [
+        (
+            int(row["cycle"]),
+            float(row["time"]),
+            int(row["sent"]),
+            row["data"].tobytes().rstrip(b"\0"),
+        )
+        for row in ring.drain()
+    ]
+
+
+def test_packets_reach_the_ring_once_their_cycle_is_known() -> None:
+    ring, cycle = PacketRing(10), 6
+    link = TappedTransport(Wire(b"one", b"two"), ring, lambda: cycle)
+    assert link.receive(0.1) == b"one"
+    cycle = 7  # what the session makes of it
+    link.send(b"answer")
+    assert drained(ring) == []
+    assert link.receive(0.1) == b"two"
+    assert drained(ring) == [(7, 0.25, 0, b"one"), (7, 0.5, 1, b"answer")]
+    cycle = 8
+    link.close()
+    assert drained(ring) == [(8, 0.75, 0, b"two")]
+
+
+def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
+    ring, cycle = PacketRing(10), 6
+    link = TappedTransport(Wire(b"old", b"older", b"newest"), ring, lambda: cycle)
+    link.receive(0.1)
+    link.receive(0.0)
+    link.receive(0.0)
+    cycle = 9
+    link.settle()
+    assert [(row[0], row[3]) for row in drained(ring)] == [
+        (9, b"old"), (9, b"older"), (9, b"newest")
+    ]  # fmt: skip
+
+
+def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
+    ring = PacketRing(10_000)
+    link = TappedTransport(Wire(*[b"flood"] * 5000), ring, lambda: 3)
+    for _ in range(5000):
+        link.receive(0.0)
+    handed_on = drained(ring)
+    assert 5000 - MOST_WAITING <= len(handed_on) < 5000
+    link.close()
+    assert len(handed_on) + len(drained(ring)) == 5000
+
+
+def test_a_tap_changes_nothing_for_the_session() -> None:
+    wire = Wire(b"packet")
+    link = TappedTransport(wire, PacketRing(10), lambda: 0)
+    assert link.receive(0.1) == b"packet"
+    assert link.receive(0.1) is None
+    link.send(b"answer")
+    assert (wire.sent, link.rejected(), link.now) == ([b"answer"], {"torn": 3}, wire.now)
+    link.close()
+    assert wire.closed
+
+
+def test_of_a_link_that_knows_when_packets_arrived_that_time_is_kept() -> None:
+    ring = PacketRing(10)
+    link = TappedTransport(StampedWire(b"packet"), ring, lambda: 0)
+    assert link.arrived == 0.125
+    link.receive(0.1)
+    link.settle()
+    assert drained(ring)[0][1] == 0.125
+
+
+@given(
+    capacity=st.integers(2, 8),
+    steps=st.lists(st.one_of(st.integers(0, 12), st.none()), max_size=12),
+)
+def test_a_reader_gets_every_packet_in_order_or_counts_it(
+    capacity: int, steps: list[int | None]
+) -> None:
+    """Steps are packets written, None a look of the reader."""
+    ring = PacketRing.shared(capacity)
+    reader = PacketReader(ring.fd)
+    seen, written = 0, 0
+    for step in [*steps, None]:
+        for _ in range(step or 0):
+            ring.put(written, 0.5 * written, written % 2 == 1, written.to_bytes(2, "little"))
+            written += 1
+        if step is None:
+            lost = reader.overflow
+            rows = reader.drain()
+            seen += reader.overflow - lost
+            assert rows["cycle"].tolist() == list(range(seen, written))
+            assert rows["sent"].tolist() == [n % 2 for n in range(seen, written)]
+            numbers = rows["data"][:, :2].astype(int) @ [1, 256]
+            assert np.array_equal(numbers, np.arange(seen, written))
+            seen = written
+    os.close(ring.fd)
+
+
+def test_one_kind_of_memory_is_not_taken_for_the_other() -> None:
+    packets, cycles = PacketRing.shared(4), CycleRing.shared(2, 4)
+    with pytest.raises(ValueError, match="not a ring of raw packets"):
+        PacketReader(cycles.fd)
+    with pytest.raises(ValueError, match="not a ring of cycle records"):
+        RingReader(packets.fd, 2)
+    with pytest.raises(ValueError, match="at least 2"):
+        PacketRing.shared(1)
+    os.close(packets.fd)
+    os.close(cycles.fd)

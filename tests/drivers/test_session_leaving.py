@@ -11,7 +11,6 @@ from drivers import (
     FollowingError,
     Mode,
     MotionNotCarriedOn,
-    NotAtStandstill,
     NotFinite,
     Refused,
     RequestError,

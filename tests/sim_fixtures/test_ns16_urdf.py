@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
 from sim_fixtures import FixtureError, ns16
-from sim_fixtures.ns16 import LinkInertia, geometry
-from sim_fixtures.ns16.build_urdf import _inertial, nominal_urdf
+from sim_fixtures.ns16 import LinkInertia, geometry, inertial
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,10 @@ def wrist_and_flange(model: pin.Model, controller_deg: list[float]) -> tuple[Arr
     return np.array(data.oMi[6].translation), np.array(flange)
 
 
-def test_the_file_is_what_the_figures_give() -> None:
-    assert ns16.URDF_PATH.read_text(encoding="utf-8") == nominal_urdf()
+def test_the_file_has_the_nominal_inertias() -> None:
+    cell = tomllib.loads(ns16.CELL_PATH.read_text(encoding="utf-8"))
+    nominal = ns16.urdf_text(cell["simulation"]["inertia_scale"])
+    assert ns16.URDF_PATH.read_text(encoding="utf-8") == nominal
 
 
 def test_names(model: pin.Model) -> None:
@@ -60,7 +63,7 @@ def test_every_link_is_a_possible_rigid_body(model: pin.Model) -> None:
 
 def test_an_impossible_body_is_refused() -> None:
     with pytest.raises(FixtureError, match="link_9"):
-        _inertial(LinkInertia(1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.1, 0.0, 0.1)), "link_9")
+        inertial(LinkInertia(1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.1, 0.0, 0.1)), "link_9")
 
 
 def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) -> None:
