@@ -23,9 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
-from drivers.exchange import ControlBlock, CycleRing, EventWriter, PacketRing, event_log
 from drivers.exchange import control as control_memory
+from drivers.exchange import event_log
+from drivers.exchange.control import ControlBlock
+from drivers.exchange.event_log import EventWriter
 from drivers.packets import AXIS_DTYPE, HEADER_LENGTH, Mode, next_number
+from drivers.record import CycleRing, PacketRing
 from hil.archive import ArchiveSpec, open_archive
 from hil.archive.supervised import ArchiveProcessHandle, Close, Closed, Open, Opened
 

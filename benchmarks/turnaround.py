@@ -48,8 +48,9 @@ from benchmarks.turnaround_ends import (
     spin,
 )
 from drivers import GuardLimits, MotionEnded
-from drivers.exchange import ExchangeProcess, ExchangeSettings, RealTimeSettings
-from drivers.transports import UdpSpec
+from drivers.exchange.process import ExchangeProcess, ExchangeSettings
+from drivers.exchange.realtime import RealTimeSettings
+from drivers.transports.udp import UdpSpec
 
 Array = NDArray[np.float64]
 

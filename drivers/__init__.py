@@ -57,7 +57,7 @@ from drivers.events import (
     Refused,
     StateChanged,
 )
-from drivers.exchange import exchange
+from drivers.exchange.loop import exchange
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import (
     BoundsName,
@@ -72,22 +72,10 @@ from drivers.packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.record import CycleRing, cycle_dtype
 from drivers.session import Session
 from drivers.states import State
-from drivers.transports import (
-    Corrupt,
-    Delay,
-    Duplicate,
-    Fault,
-    FaultyLink,
-    Lose,
-    Peer,
-    Reorder,
-    SimulatedTransport,
-    Transport,
-    TransportError,
-    TransportSpec,
-    UdpSpec,
-    UdpTransport,
-)
+from drivers.transports.base import Transport, TransportError, TransportSpec
+from drivers.transports.faults import Corrupt, Delay, Duplicate, Fault, FaultyLink, Lose, Reorder
+from drivers.transports.simulated import Peer, SimulatedTransport
+from drivers.transports.udp import UdpSpec, UdpTransport
 
 __all__ = [
     "AccelerationLimit",

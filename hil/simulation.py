@@ -11,7 +11,7 @@ from xml.etree.ElementTree import SubElement, tostring
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Link
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker

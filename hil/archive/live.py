@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange import ExchangeEvent
+from drivers.exchange.event_log import ExchangeEvent
 from hil.archive.events import ArchivedEvent
 from hil.archive.recorder import describe, level_of
 from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder

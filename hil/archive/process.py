@@ -25,17 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import InitReceived, Outcome
-from drivers.exchange import (
-    ArchiveState,
-    ControlBlock,
-    Ended,
-    EventReader,
-    ExchangeEvent,
-    PacketReader,
-    RingReader,
-)
-from drivers.exchange.control import Pulse
-from drivers.record import PACKET_DTYPE
+from drivers.exchange.control import ArchiveState, ControlBlock, Ended, Pulse
+from drivers.exchange.event_log import EventReader, ExchangeEvent
+from drivers.record import PACKET_DTYPE, PacketReader, RingReader
 from hil.archive.live import LivePublisher, Serve
 from hil.archive.recorder import Recorder
 from hil.archive.supervised import (

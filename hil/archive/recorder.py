@@ -29,7 +29,7 @@ from drivers.events import (
     Refused,
     StateChanged,
 )
-from drivers.exchange import (
+from drivers.exchange.event_log import (
     EventsLost,
     ExchangeEnded,
     ExchangeEvent,

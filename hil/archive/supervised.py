@@ -17,8 +17,7 @@ from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Any, Protocol
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange import ControlBlock
-from drivers.exchange.control import Pulse
+from drivers.exchange.control import ControlBlock, Pulse
 from hil.archive.live import Serve
 from hil.archive.recorder import ArchiveSpec
 

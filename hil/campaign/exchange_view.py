@@ -14,16 +14,15 @@ from drivers.events import (
     PacketRejected,
     Refused,
 )
-from drivers.exchange import (
-    ControlBlock,
+from drivers.exchange.control import ControlBlock, Pulse
+from drivers.exchange.event_log import (
     EventsLost,
     ExchangeEnded,
     ExchangeEvent,
     ExchangeFailed,
-    ExchangeProcess,
     Leaving,
 )
-from drivers.exchange.control import Pulse
+from drivers.exchange.process import ExchangeProcess
 from drivers.states import State
 from hil.terminal_text import plural
 

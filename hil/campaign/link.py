@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from drivers.errors import RequestError
 from drivers.events import Event, MotionEnded, MotionStarted
-from drivers.exchange import exchange
+from drivers.exchange.loop import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
 from drivers.record import CycleRing, PacketRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
-from drivers.transports import SimulatedTransport, Transport
+from drivers.transports.base import Transport
+from drivers.transports.simulated import SimulatedTransport
 from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.cell import Cell

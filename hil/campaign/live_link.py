@@ -23,18 +23,12 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError, RequestError
 from drivers.events import MotionEnded, Outcome
-from drivers.exchange import (
-    NO_ARCHIVE,
-    NO_SUPERVISOR,
-    ExchangeProcess,
-    ExchangeSettings,
-    RealTimeSettings,
-    RingReader,
-    WithdrawnError,
-)
 from drivers.exchange.control import Pulse
+from drivers.exchange.event_log import NO_ARCHIVE, NO_SUPERVISOR
+from drivers.exchange.process import ExchangeProcess, ExchangeSettings, WithdrawnError
+from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
-from drivers.record import CAPACITY
+from drivers.record import CAPACITY, RingReader
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec

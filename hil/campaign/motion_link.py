@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, MotionEnded, Refused
-from drivers.exchange import ExchangeEvent
+from drivers.exchange.event_log import ExchangeEvent
 from drivers.init_check import compare
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import TURN, DriveTrain
 from drivers.errors import RequestError
-from drivers.exchange import ExchangeEvent, ExchangeProcess
 from drivers.exchange.control import quantile
+from drivers.exchange.event_log import ExchangeEvent
+from drivers.exchange.process import ExchangeProcess
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket

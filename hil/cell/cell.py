@@ -260,7 +260,7 @@ class Cell:
 
             return UdpSpec(peer_host=table.host, port=table.port, bind=table.bind)
         if table.transport == "can" and table.can is not None:
-            from drivers.transports.can import CanSpec
+            from drivers.transports.can.transport import CanSpec
 
             bus, axes = table.can.model_dump(), len(self.joint_names)
             spec = CanSpec(**bus, period=self.period, n_axes=axes)
@@ -461,7 +461,7 @@ def _required(cell: Cell, table: T | None, name: str) -> T:
 
 def stays_here(spec: TransportSpec) -> bool:
     """Whether a link ends on this computer; of a kind that is not known here it is not assumed."""
-    from drivers.transports.can import CanSpec
+    from drivers.transports.can.transport import CanSpec
     from drivers.transports.udp import UdpSpec
 
     if isinstance(spec, UdpSpec):

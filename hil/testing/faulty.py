@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign, Link, design
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port

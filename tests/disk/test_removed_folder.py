@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign
 from hil.campaign.link import Link
 from hil.errors import HilError

@@ -10,8 +10,9 @@ import numpy as np
 from can.interfaces.virtual import VirtualBus
 
 from drivers import CyclicPacket, DriveTrain, GuardLimits, InitPacket, TransportClosed
-from drivers.transports.can import BusRates, CanTransport
+from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd, PcEnd
+from drivers.transports.can.transport import CanTransport
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
 from sim_fixtures.can_end import CanFarEnd
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers import CycleRing, GapSeen, Guard, MotionEnded, PacketRejected, Session, State, exchange
-from drivers.transports.can import CanSpec
+from drivers.transports.can.transport import CanSpec
 from sim_fixtures.can_end import open_far_end
 from tests.drivers.can_bench import (
     HOME,

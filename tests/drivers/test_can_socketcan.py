@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers import CyclicPacket, MotionEnded
-from drivers.transports.can import CanSpec
+from drivers.transports.can.transport import CanSpec
 from sim_fixtures.can_end import open_far_end
 from tests.drivers.can_bench import PROFILES, init_packet
 from tests.drivers.can_contract import CanContract, Far

@@ -15,16 +15,14 @@ import pytest
 
 from drivers import CyclicPacket, TransportClosed
 from drivers.transports.base import TransportError
-from drivers.transports.can import (
+from drivers.transports.can.bus_load import (
     BusRates,
     CanAxesError,
     CanBusLoadError,
     CanModeError,
-    CanSpec,
-    CanTransport,
     CanValueError,
 )
-from drivers.transports.can.transport import BusLock
+from drivers.transports.can.transport import BusLock, CanSpec, CanTransport
 from sim_fixtures.can_end import CanFarEnd, open_far_end
 from sim_fixtures.far_end import FarEndError
 from tests.drivers.can_bench import (

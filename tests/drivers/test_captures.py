@@ -32,7 +32,7 @@ from drivers import (
 )
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, echo, is_init
 from drivers.record import PacketRing
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveWriter, open_archive
 from hil.archive.schema import PACKETS

@@ -19,28 +19,21 @@ from hypothesis import strategies as st
 
 from drivers import GapSeen, MotionEnded, StateChanged
 from drivers.events import AnswersLost, Outcome, PacketRejected
-from drivers.exchange import (
-    ControlBlock,
-    Ended,
-    EventReader,
-    EventsLost,
-    EventWriter,
-    RingReader,
-    control,
-    event_log,
-    motion_transfer,
-)
+from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.control import (
     BINS,
     LONGEST_LOOK,
     SHORTEST,
+    ControlBlock,
+    Ended,
     Pulse,
     bin_of,
     quantile,
     upper_edge,
 )
+from drivers.exchange.event_log import EventReader, EventsLost, EventWriter
 from drivers.exchange.serving import Digest
-from drivers.record import CycleRing, cycle_dtype
+from drivers.record import CycleRing, RingReader, cycle_dtype
 from drivers.states import State
 from tests.drivers.rig import Cruise, N, still
 

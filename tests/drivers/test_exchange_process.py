@@ -17,23 +17,25 @@ import numpy as np
 import pytest
 
 from drivers import MotionEnded, MotionStarted, RequestError, State
-from drivers.exchange import (
-    ArchiveState,
-    ControlBlock,
+from drivers.exchange import process
+from drivers.exchange.control import ArchiveState, ControlBlock
+from drivers.exchange.event_log import (
     ExchangeEnded,
-    ExchangeError,
     ExchangeFailed,
-    ExchangeProcess,
-    ExchangeSettings,
     ExchangeStarted,
     Leaving,
     OverrideRefused,
-    RealTimeSettings,
-    RingReader,
-    WithdrawnError,
-    process,
 )
-from drivers.transports import TransportError, UdpSpec, UdpTransport
+from drivers.exchange.process import (
+    ExchangeError,
+    ExchangeProcess,
+    ExchangeSettings,
+    WithdrawnError,
+)
+from drivers.exchange.realtime import RealTimeSettings
+from drivers.record import RingReader
+from drivers.transports.base import TransportError
+from drivers.transports.udp import UdpSpec, UdpTransport
 from hil.demo_link import free_port
 from tests.drivers.rig import PERIOD, START, Cruise, N, drive_train, limits, smooth_move, still
 from tests.drivers.udp_controller import HOST, UdpController

@@ -11,22 +11,13 @@ import pytest
 from drivers import CyclicPacket, Mode, State
 from drivers.errors import RequestError
 from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
-from drivers.exchange import (
-    NO_SUPERVISOR,
-    ControlBlock,
-    CycleRing,
-    Ended,
-    EventReader,
-    EventWriter,
-    HoldRefused,
-    Leaving,
-    control,
-    event_log,
-)
+from drivers.exchange import control, event_log
 from drivers.exchange.__main__ import Rehearsal, rehearse
-from drivers.exchange.control import PATIENCE, STALE
+from drivers.exchange.control import PATIENCE, STALE, ControlBlock, Ended
+from drivers.exchange.event_log import NO_SUPERVISOR, EventReader, EventWriter, HoldRefused, Leaving
 from drivers.exchange.loop import POLL
 from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
+from drivers.record import CycleRing
 from tests.drivers.rig import PERIOD, N, drive_train, limits
 
 STEP = 0.01

@@ -10,7 +10,8 @@ import sys
 
 import pytest
 
-from drivers.exchange import RealTimeReport, RealTimeSettings, realtime
+from drivers.exchange import realtime
+from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 
 ENTER = """
 import dataclasses, gc, json, mmap, os, resource, sys

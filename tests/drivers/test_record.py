@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import cycle_dtype
-from drivers.exchange import PacketReader, RingReader
-from drivers.record import COMMANDED, MEASURED, CycleRing, PacketRing
+from drivers.record import COMMANDED, MEASURED, CycleRing, PacketReader, PacketRing, RingReader
 from drivers.transports.tapped import MOST_WAITING, TappedTransport
 
 

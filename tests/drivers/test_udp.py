@@ -22,8 +22,8 @@ from drivers import (
     exchange,
 )
 from drivers.exchange import loop
-from drivers.transports import TransportError, UdpSpec, UdpTransport
-from drivers.transports.udp import MOST_PASSED_OVER
+from drivers.transports.base import TransportError
+from drivers.transports.udp import MOST_PASSED_OVER, UdpSpec, UdpTransport
 from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
 from tests.drivers.transport_contract import TransportContract
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.exchange import RingReader
+from drivers.record import RingReader
 from drivers.transports.udp import UdpSpec
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.live_link import LiveLink

@@ -11,7 +11,8 @@ import pytest
 from drivers import CyclicPacket
 from drivers.packets import INIT_LENGTH, is_init, next_number
 from drivers.record import LONGEST_PACKET, PacketRing
-from drivers.transports import Lose, SimulatedTransport
+from drivers.transports.faults import Lose
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import repair

@@ -27,20 +27,11 @@ import pytest
 
 from drivers.drive_train import DriveTrain
 from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketRejected
-from drivers.exchange import (
-    ArchiveState,
-    ControlBlock,
-    CycleRing,
-    Ended,
-    EventReader,
-    EventWriter,
-    PacketReader,
-    PacketRing,
-    RingReader,
-    event_log,
-)
 from drivers.exchange import control as control_memory
-from drivers.record import _READ, cycle_dtype
+from drivers.exchange import event_log
+from drivers.exchange.control import ArchiveState, ControlBlock, Ended
+from drivers.exchange.event_log import EventReader, EventWriter
+from drivers.record import _READ, CycleRing, PacketReader, PacketRing, RingReader, cycle_dtype
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.archive.check import check_archive
 from hil.archive.process import ArchiveProcess

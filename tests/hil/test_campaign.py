@@ -15,7 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.states import State
-from drivers.transports import Lose, SimulatedTransport
+from drivers.transports.faults import Lose
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveName, ArchiveWriter, open_archive
 from hil.campaign import (
     Campaign,

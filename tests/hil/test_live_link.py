@@ -16,7 +16,8 @@ import pytest
 from drivers.motion_source import MotionSource
 from drivers.packets import INIT_LENGTH
 from drivers.states import State
-from drivers.transports import TransportSpec, UdpSpec
+from drivers.transports.base import TransportSpec
+from drivers.transports.udp import UdpSpec
 from hil.archive import ArchiveSpec, open_archive
 from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import (

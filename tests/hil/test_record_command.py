@@ -19,7 +19,8 @@ import pytest
 from drivers import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
-from drivers.transports import Corrupt, Lose, SimulatedTransport
+from drivers.transports.faults import Corrupt, Lose
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Link, Progress, Stop
 from hil.cell import Cell

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import hil.files
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from drivers.events import MotionStarted
-from drivers.exchange import NO_SUPERVISOR, EventsLost
 from drivers.exchange import control as control_memory
+from drivers.exchange.event_log import NO_SUPERVISOR, EventsLost
 from drivers.states import State
 from hil.campaign import exchange_view
 from hil.campaign.exchange_view import ExchangeView

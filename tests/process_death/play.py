@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from drivers.transports import SimulatedTransport
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, Link, Stop
 from hil.campaign.quick_design import design

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import record
-from drivers.exchange import ControlBlock, RingReader
+from drivers.exchange.control import ControlBlock
+from drivers.record import RingReader
 
 EXCHANGE: Final = "drivers.exchange"
 ARCHIVE: Final = "hil.archive.process"

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers import State
-from drivers.exchange import exchange
-from drivers.transports import SimulatedTransport
+from drivers.exchange.loop import exchange
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import Link
 from hil.campaign import link as link_module

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.transports import SimulatedTransport
 from drivers.transports.faults import Fault as LinkFault
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Link
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import ControllerFault

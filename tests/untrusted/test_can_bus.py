@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from drivers import MotionEnded, PacketRejected, TransportClosed
-from drivers.transports.can import BusRates, CanTransport
+from drivers.transports.can.bus_load import BusRates
+from drivers.transports.can.transport import CanTransport
 from sim_fixtures import Phase
 from sim_fixtures.can_end import CanFarEnd
 from tests.drivers.can_bench import HOME, PROFILES, Cycles, UnstampedBus
