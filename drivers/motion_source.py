@@ -34,12 +34,10 @@ class MotionSource(Protocol):
     @property
     def start(self) -> Array:
         """Where the motion wants to begin."""
-        ...
 
     @property
     def finished(self) -> bool:
         """Whether the last set-point given was the end of the motion (or of a stop), at rest."""
-        ...
 
     @property
     def bounds(self) -> BoundsName:
@@ -48,22 +46,18 @@ class MotionSource(Protocol):
         "override" is granted from the first change of override on (`OverridableSource`), "stop"
         from `stop`, or the first `hold` (`HoldableSource`), on.
         """
-        ...
 
     def begin(self, position: Array) -> None:
         """Take `position` as the first set-point; raise if the motion cannot begin there."""
-        ...
 
     def advance(self) -> tuple[Array, Array]:
         """The next set-point, one period on: position and velocity."""
-        ...
 
     def stop(self) -> None:
         """Come to rest on the path; `finished` tells when. Calling it again changes nothing.
 
         The session asks for drive-off if that takes longer than `session.STOP_TIMEOUT`.
         """
-        ...
 
 
 class FeedForwardSource(MotionSource, Protocol):
@@ -76,7 +70,6 @@ class FeedForwardSource(MotionSource, Protocol):
         to be back at zero when the motion says that it is finished. Without this method the
         velocity fed forward is that of the set-points, and the current zero.
         """
-        ...
 
 
 class CorrectionSource(Protocol):
@@ -91,11 +84,9 @@ class CorrectionSource(Protocol):
     @property
     def finished(self) -> bool:
         """Whether the corrections given last were the end, zero."""
-        ...
 
     def begin(self) -> None:
         """The first packet with every axis open is answered by zeros; raise to refuse."""
-        ...
 
     def advance(self) -> tuple[Array, Array]:
         """The next correction: motion and motor current, A.
@@ -109,11 +100,9 @@ class CorrectionSource(Protocol):
         9     none: zeros                                  added to the servo's own
         ====  ===========================================  ======================================
         """
-        ...
 
     def stop(self) -> None:
         """Take the correction back to zero; `finished` tells when."""
-        ...
 
 
 class OverridableSource(Protocol):
@@ -121,7 +110,6 @@ class OverridableSource(Protocol):
 
     def override(self, fraction: float) -> None:
         """Go on at this fraction (0..1) of the planned speed, within the bounds "override"."""
-        ...
 
 
 class HoldableSource(Protocol):
@@ -133,11 +121,9 @@ class HoldableSource(Protocol):
         A hold may last for ever; `stop` may follow it. A source that goes on instead is stopped
         after `session.STOP_TIMEOUT`.
         """
-        ...
 
     def resume(self) -> None:
         """Go on, within the bounds of a stop until the speed is what it was."""
-        ...
 
 
 class CarriedSource(Protocol):
@@ -148,7 +134,6 @@ class CarriedSource(Protocol):
 
         A velocity across the path dies away in so many cycles. Raises if it is not on the path.
         """
-        ...
 
 
 _OF_MOTIONS: Final = ("begin", "advance", "finished", "bounds", "stop")

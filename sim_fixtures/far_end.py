@@ -26,15 +26,12 @@ class FarEnd(Protocol):
 
     def send(self, packet: bytes) -> None:
         """Send towards the PC. What the network refuses to carry is lost, not an error."""
-        ...
 
     def receive(self, timeout: float) -> bytes | None:
         """The next packet of the PC; None if none came within `timeout` seconds (0: look)."""
-        ...
 
     def close(self) -> None:
         """Give the link up."""
-        ...
 
 
 class FarEndError(SimulationError):

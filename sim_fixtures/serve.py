@@ -32,6 +32,7 @@ from drivers.packets import (
     packet_number,
 )
 from drivers.transports.faults import FaultyLink
+from drivers.transports.simulated import Peer
 from sim_fixtures.far_end import FarEnd
 
 REMEMBERED: Final = 1000
@@ -138,27 +139,13 @@ Delayed = tuple[float, int, bytes]
 
 
 class Clock(Protocol):
-    """What time it is, and waiting; a test's clock need not be the real one."""
+    """What time it is, and waiting; the module `time` is one."""
 
-    def now(self) -> float:
+    def monotonic(self) -> float:
         """Seconds since whenever, never falling."""
-        ...
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, /) -> None:
         """Let that much time pass."""
-        ...
-
-
-class MonotonicClock:
-    """The machine's own clock."""
-
-    def now(self) -> float:
-        """Seconds."""
-        return time.monotonic()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
 
 
 class Wire:
@@ -191,7 +178,7 @@ class Wire:
         arrived while this program was not running.
         """
         if self._faults is None:
-            return self._far_end.receive(max(0.0, until - self._clock.now()))
+            return self._far_end.receive(max(0.0, until - self._clock.monotonic()))
         while True:
             now = self._release()
             if self._arriving and self._arriving[0][0] <= now:
@@ -218,14 +205,14 @@ class Wire:
             self._clock.sleep(min(moment, _due(self._leaving)) - now)
 
     def _hold(self, queue: list[Delayed], deliveries: Sequence[tuple[float, bytes]]) -> None:
-        now = self._clock.now()
+        now = self._clock.monotonic()
         for delay, packet in deliveries:
             heappush(queue, (now + delay, self._order, packet))
             self._order += 1
 
     def _release(self) -> float:
         """Send what is due; the time."""
-        now = self._clock.now()
+        now = self._clock.monotonic()
         while self._leaving and self._leaving[0][0] <= now:
             self._far_end.send(heappop(self._leaving)[2])
         return now
@@ -253,31 +240,16 @@ class Request(IntEnum):
     GIVE_UP = auto()
 
 
-class ServedPeer(Protocol):
+class ServedPeer(Peer, Protocol):
     """A controller that can be served: `SimulatedController` is one."""
 
     rejected_replies: int
 
-    @property
-    def period(self) -> float:
-        """Cycle in s."""
-        ...
-
-    def next_packet(self) -> bytes | None:
-        """The packet of the next cycle; empty if it sends none in it, None once it has ended."""
-        ...
-
-    def accept(self, reply: bytes | None) -> None:
-        """The answer to it; None if none arrived within the cycle."""
-        ...
-
     def finish(self) -> None:
         """End the session when the arm stands."""
-        ...
 
     def lose_drive(self, reason: str) -> None:
         """Switch the drive off, for this reason."""
-        ...
 
 
 def serve(
@@ -287,7 +259,7 @@ def serve(
     faults: FaultyLink | None = None,
     request: Callable[[], Request] = lambda: Request.GO_ON,
     watch: Callable[[Tally], None] = lambda _: None,
-    clock: Clock | None = None,
+    clock: Clock = time,
     patience: float = PATIENCE,
     stretch: float = 0.0,
 ) -> Tally:
@@ -304,13 +276,12 @@ def serve(
             switched off under a moving arm if it does not stand within `patience` s; at `GIVE_UP`
             it falls silent at once.
         watch: called once a cycle, in the time that is left over, with the counts so far.
-        clock: time; the machine's own if left out.
+        clock: of the machine, if left out.
         patience: see `request`, s.
         stretch: a cycle without an answer is made longer by up to so many s until one comes. No
             real controller does that; it is for PCs that are held up now and then. Once the end is
             requested, a PC that let such a wait pass counts as gone until it answers again.
     """
-    clock = clock if clock is not None else MonotonicClock()
     server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
     if server.knock(request):
         server.run(request, patience)
@@ -347,13 +318,13 @@ class _Server:
             self.tally.ended = True
             return False
         while request() is Request.GO_ON:
-            sent = self._clock.now()
+            sent = self._clock.monotonic()
             self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
             self.tally.knocks += 1
             reply = self._patient_reply(packet, sent + KNOCK_INTERVAL, request)
             if reply is not None:
                 self.tally.cycles += 1
-                self._due = max(sent + self._period, self._clock.now())
+                self._due = max(sent + self._period, self._clock.monotonic())
                 self._hand_over(packet, reply)
                 return True
         return False
@@ -362,7 +333,7 @@ class _Server:
         self, packet: bytes, until: float, request: Callable[[], Request]
     ) -> bytes | None:
         """An answer to the first packet, in steps short enough to notice a request to end."""
-        while request() is Request.GO_ON and (now := self._clock.now()) < until:
+        while request() is Request.GO_ON and (now := self._clock.monotonic()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self._watch(self.tally)
             if reply is not None:
@@ -389,18 +360,18 @@ class _Server:
 
     def _exchange(self, packet: bytes) -> bool:
         """One cycle: packet, reply, computation. Whether it was answered."""
-        sent = self._clock.now()
+        sent = self._clock.monotonic()
         self.tally.cycles += 1
         self._wire.send(self.tally.cycles - 1, packet)
         reply = self._reply(packet, sent + self._period)
         if reply is None and self._stretch and not (self._deserted and self._finish_by is not None):
             until = sent + self._period
             reply = self._reply(packet, until + self._stretch)
-            self.tally.stretch(self._clock.now() - until)
+            self.tally.stretch(self._clock.monotonic() - until)
         self._deserted = reply is None
         if reply is not None:
             # By the kernel's time: that this program looked late is not the PC's doing.
-            self.tally.answer.add(max(0.0, self._clock.now() - sent - self._wire.waited))
+            self.tally.answer.add(max(0.0, self._clock.monotonic() - sent - self._wire.waited))
         self._hand_over(packet, reply)
         return reply is not None
 
@@ -413,7 +384,7 @@ class _Server:
     def _heed(self, request: Request, patience: float) -> bool:
         """Ask the controller to end; take its drive away if the arm does not come to rest."""
         if request is Request.END:
-            now = self._clock.now()
+            now = self._clock.monotonic()
             if self._finish_by is None:
                 self._finish_by = now + patience
                 self._patience = patience
@@ -427,7 +398,7 @@ class _Server:
 
     def _note_lateness(self, *, excused: bool) -> None:
         """Count a cycle that begins late; go on from here if a whole period is gone."""
-        late = self._clock.now() - self._due
+        late = self._clock.monotonic() - self._due
         if late >= 0.1 * self._period and not excused:
             self.tally.own_late += 1
         if late >= self._period:
@@ -446,16 +417,16 @@ class _Server:
             if number == wanted:
                 return answer
             self.tally.discard(number)
-            if self._clock.now() > until:
+            if self._clock.monotonic() > until:
                 looks -= 1
         return None
 
     def _hand_over(self, packet: bytes, reply: bytes | None) -> None:
         """Let controller and arm compute their cycle."""
-        begun = self._clock.now()
+        begun = self._clock.monotonic()
         rejected = self._peer.rejected_replies
         self._peer.accept(reply)
-        self.tally.cost.add(self._clock.now() - begun)
+        self.tally.cost.add(self._clock.monotonic() - begun)
         number = next_number(packet_number(packet))
         if reply is None:
             if not _ends_the_session(packet):

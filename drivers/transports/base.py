@@ -40,7 +40,6 @@ class Transport(Protocol):
     @property
     def now(self) -> float:
         """Monotonic time in s, on the link's own clock."""
-        ...
 
     @property
     def ages(self) -> NDArray[np.uint16] | None:
@@ -49,7 +48,6 @@ class Transport(Protocol):
         (n_axes, 8) for D1..D5, extra1..3 of each axis; None where a packet carries all of them
         at once, so that all are fresh.
         """
-        ...
 
     def receive(self, timeout: float) -> bytes | None:
         """The next packet, or None after `timeout` s without one.
@@ -57,7 +55,6 @@ class Transport(Protocol):
         Raises:
             TransportClosed: the link was closed, or its far end is gone for good.
         """
-        ...
 
     def send(self, packet: bytes) -> None:
         """Send one packet to where the last one received came from.
@@ -65,14 +62,12 @@ class Transport(Protocol):
         Raises:
             TransportClosed: the link was closed.
         """
-        ...
 
     def rejected(self) -> dict[str, int]:
         """Packets discarded below the session since the last call, by kind.
 
         Kinds are words such as "foreign", "malformed", "torn", "corrupt", "overrun", "unsent".
         """
-        ...
 
     def forget_peer(self) -> None:
         """There is no session: its next packet may come from elsewhere at the same address.
@@ -80,11 +75,9 @@ class Transport(Protocol):
         Called, for as long as that is so, after each packet that got no answer, and when there
         was none with an answer for a while.
         """
-        ...
 
     def close(self) -> None:
         """Give the link up. Closing twice changes nothing."""
-        ...
 
 
 class TransportSpec(Protocol):
@@ -96,4 +89,3 @@ class TransportSpec(Protocol):
         Raises:
             TransportError: it cannot be opened.
         """
-        ...

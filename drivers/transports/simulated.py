@@ -20,15 +20,12 @@ class Peer(Protocol):
     @property
     def period(self) -> float:
         """Cycle in s."""
-        ...
 
     def next_packet(self) -> bytes | None:
         """The packet of the next cycle, empty for none; None when there will be no more."""
-        ...
 
     def accept(self, reply: bytes | None) -> None:
         """The answer to it; None if none arrived within the cycle."""
-        ...
 
 
 class _Delayed(NamedTuple):

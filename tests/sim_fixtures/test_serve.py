@@ -28,7 +28,7 @@ class VirtualClock:
         self.time = 100.0
         self.stalls: list[tuple[float, float]] = []
 
-    def now(self) -> float:
+    def monotonic(self) -> float:
         return self.time
 
     def sleep(self, seconds: float) -> None:
