@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -86,29 +86,18 @@ class Tally:
         self._untold: dict[str, int] = {}
         self._why: dict[str, str] = {}
 
-    def malformed(self, packet: bytes, error: PacketError) -> None:
-        """One was not the packet it should be."""
-        self.counters.malformed += 1
-        self._tell("malformed", 1)
-        self._why["malformed"] = f"{len(packet)} bytes: {error}"
-
-    def stale(self, number: int, last: int) -> None:
-        """One cannot be a later packet of this session."""
-        self.counters.stale += 1
-        self._tell("stale", 1)
-        self._why["stale"] = f"number {number} does not follow {last}"
-
-    def ended(self) -> None:
-        """One came after the end of the session."""
-        self.counters.ended += 1
-        self._tell("ended", 1)
+    def rejected(self, kind: Literal["malformed", "stale", "ended"], why: str = "") -> None:
+        """One got no answer: it was no packet, no later one, or came after the end."""
+        setattr(self.counters, kind, getattr(self.counters, kind) + 1)
+        self._untold[kind] = self._untold.get(kind, 0) + 1
+        self._why[kind] = why
 
     def discarded(self, kind: str, count: int) -> None:
         """The link dropped `count` packets of this kind before the session saw them."""
         if count <= 0:
             return
         self.counters.discarded[kind] = self.counters.discarded.get(kind, 0) + count
-        self._tell(kind, count)
+        self._untold[kind] = self._untold.get(kind, 0) + count
 
     def drain(self) -> list[PacketRejected]:
         """One event per kind since the last call."""
@@ -116,9 +105,6 @@ class Tally:
         events = [PacketRejected(kind, n, why.get(kind, "")) for kind, n in self._untold.items()]
         self._untold.clear()
         return events
-
-    def _tell(self, kind: str, count: int) -> None:
-        self._untold[kind] = self._untold.get(kind, 0) + count
 
 
 class Sequence:
@@ -390,7 +376,7 @@ class Session:
         if self._heard_at is None or now >= self.deadline:
             self.tick(now)
         if self.state is State.ENDED:
-            self._tally.ended()
+            self._tally.rejected("ended")
             return None
         try:
             # Bytes may hold any number; what is not finite is for the guard, not for numpy.
@@ -403,7 +389,7 @@ class Session:
                     return self._sync(packet, number, now, powered)
                 return self._cyclic(packet, number, now, ages)
         except PacketError as error:
-            self._tally.malformed(packet, error)
+            self._tally.rejected("malformed", f"{len(packet)} bytes: {error}")
             return None
 
     def _start_over(self, packet: bytes, now: float) -> bytes:
@@ -459,7 +445,7 @@ class Session:
             return self._last_reply
         if self._sequence.is_stale(number):
             self._unanswered += 1
-            self._tally.stale(number, self._sequence.last)
+            self._tally.rejected("stale", f"number {number} does not follow {self._sequence.last}")
             return None
         missed = self._sequence.accept(number)
         machine.cycle = self._sequence.cycle

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drivers import InitReceived, Mode, RequestError, State
-from drivers.init_check import narrower, shown
+from drivers import DriveTrain, InitPacket, InitReceived, Mode, RequestError, State
+from drivers.init_check import AnnouncedLimits, InitCheck, compare, narrower, shown
 from drivers.packets import NO_SLOT
-from tests.drivers.rig import START, N, Rig, drive_train, init_packet, smooth_move, still
+from tests.drivers.rig import PERIOD, START, N, Rig, drive_train, init_packet, smooth_move, still
 
 
 class TestInitOfAnotherArm:
@@ -218,43 +220,6 @@ class TestAcceptedInit:
         with pytest.raises(RequestError, match="cannot be accepted"):
             rig.session.request(still(3))
 
-    @pytest.mark.parametrize(
-        ("field", "axis", "value", "text"),
-        [
-            ("gear_ratio", 2, 111.5, "gear ratio of axis 3 is -1.014 times the cell's"),
-            ("gear_ratio", 2, -220.1, "gear ratio of axis 3 is 2.001 times the cell's"),
-            ("gear_ratio", 2, -54.9, "gear ratio of axis 3 is 0.4991 times the cell's"),
-            ("gear_ratio", 2, -1e38, "gear ratio of axis 3 is 9.091e+35 times the cell's"),
-            ("kinematic_influence", 3, 1.01, "k54 is 1.01, and 1 is the most"),
-            ("kinematic_influence", 4, -1.01, "k64 is -1.01, and 1 is the most"),
-            ("kinematic_influence", 5, 1e9, "k65 is 1e+09, and 1 is the most"),
-            ("calibration", 2, 112.1, "calibration of axis 3 is 110.1 motor revolutions from"),
-            ("calibration", 2, -108.1, "calibration of axis 3 is 110.1 motor revolutions from"),
-        ],
-    )
-    def test_what_is_far_off_cannot_be_accepted(self, field, axis, value, text):
-        """By how much it is, and how much may be accepted, stands in the refusal."""
-        rig = self.other(**{field: (axis, value)})
-        rig.start()
-        event = rig.seen(InitReceived)[0]
-        assert event.unusable.startswith(text)
-        assert event.unusable.endswith("most: too far off to be accepted; correct the cell file")
-        assert ("a factor of 2" in event.unusable) is (field == "gear_ratio")
-        assert not event.adopted
-        assert rig.session.drive_train is rig.train
-
-    @pytest.mark.parametrize("value", [-219.9, -55.1])
-    def test_what_is_within_a_factor_of_two_can(self, value):
-        rig = self.other(gear_ratio=(2, value))
-        rig.start()
-        assert rig.seen(InitReceived)[0].adopted
-
-    @pytest.mark.parametrize("value", [111.9, -107.9])
-    def test_a_calibration_within_one_turn_of_the_joint_can(self, value):
-        rig = self.other(calibration=(2, value))
-        rig.start()
-        assert rig.seen(InitReceived)[0].adopted
-
     def test_another_cycle_and_an_axis_that_is_closed_are_not_accepted(self):
         init = init_packet(sample_time=1)
         init.record["gear_ratio"][0, 0, 2] = -111.5
@@ -348,3 +313,104 @@ def test_a_limit_is_narrower_only_by_more_than_six_digits_round(theirs, ours, be
 def test_a_limit_is_shown_in_digits_that_are_that_limit_again():
     for value in np.random.default_rng(1).uniform(0.1, 50.0, 200).astype(np.float32):
         assert np.float32(shown(value)) == value
+
+
+COUPLING = (0.02, 0.003, 0.04)
+
+
+def arm(n: int) -> DriveTrain:
+    """The first joints of the rig's arm, without a wrist where it ends before it."""
+    whole = drive_train()
+    names = ("gear_ratio", "calibration", "joint_sign", "joint_offset")
+    names += ("torque_constant", "current_limit")
+    coupling = COUPLING if n == 6 else (0.0, 0.0, 0.0)
+    return replace(
+        whole,
+        **{name: getattr(whole, name)[:n] for name in names},
+        **dict(zip(("k54", "k64", "k65"), coupling, strict=True)),
+    )
+
+
+def adopted(ours: DriveTrain, **changes) -> InitCheck:
+    """The controller's values, accepted."""
+    n = ours.n_joints
+    told = {
+        "gear_ratio": ours.gear_ratio,
+        "calibration": ours.calibration,
+        "kinematic_influence": [0.0, 0.0, 0.0, *COUPLING],
+    }
+    init = InitPacket.build(n, round(1000 * PERIOD), told | changes)
+    return compare(ours, PERIOD, init, 1, True)
+
+
+@pytest.mark.parametrize("n", [3, 4, 6])
+def test_a_coupling_is_taken_only_of_axes_that_the_arm_has(n):
+    ours = arm(n)
+    theirs = adopted(ours, calibration=ours.calibration + 0.5)
+    assert theirs.adopted
+    train = theirs.drive_train
+    assert train.n_joints == n
+    expected = COUPLING if n == 6 else (0.0, 0.0, 0.0)
+    assert (train.k54, train.k64, train.k65) == pytest.approx(expected, rel=1e-6)
+    np.testing.assert_allclose(train.calibration, ours.calibration + 0.5)
+    np.testing.assert_array_equal(train.torque_constant, ours.torque_constant)
+    assert train.gear_ratio.dtype == train.calibration.dtype == np.float64
+
+
+@pytest.mark.parametrize(("k54", "fits"), [(0.0, True), (0.02, False)])
+def test_an_arm_of_five_joints_has_no_wrist_to_couple(k54, fits):
+    ours = arm(5)
+    told = [0.0, 0.0, 0.0, k54, 0.003, 0.04]
+    theirs = adopted(ours, calibration=ours.calibration + 0.5, kinematic_influence=told)
+    assert theirs.adopted == fits
+    assert fits or "values cannot be accepted: drive train k54" in theirs.unusable
+
+
+class TestTooFarOff:
+    """Twice or half the gear ratio, a turn of the joint, a coupling of 1: so far and no further."""
+
+    ONE = np.arange(6) == 2
+
+    @pytest.mark.parametrize(
+        ("factor", "fits"), [(0.5, True), (0.49, False), (2.0, True), (2.01, False)]
+    )
+    def test_a_gear_ratio(self, factor, fits):
+        ours = arm(6)
+        theirs = adopted(ours, gear_ratio=np.where(self.ONE, factor, 1.0) * ours.gear_ratio)
+        assert theirs.adopted == fits
+        assert fits or f"gear ratio of axis 3 is {factor:g} times the cell's" in theirs.unusable
+
+    @pytest.mark.parametrize(("turns", "fits"), [(1.0, True), (-1.0, True), (1.01, False)])
+    def test_a_calibration(self, turns, fits):
+        ours = arm(6)
+        turned = ours.calibration + np.where(self.ONE, turns * ours.gear_ratio, 0.0)
+        theirs = adopted(ours, calibration=turned)
+        assert theirs.adopted == fits
+        assert fits or "calibration of axis 3 is" in theirs.unusable
+
+    @pytest.mark.parametrize(("value", "fits"), [(1.0, True), (-1.0, True), (1.01, False)])
+    @pytest.mark.parametrize(("entry", "name"), [(0, "k54"), (1, "k64"), (2, "k65")])
+    def test_a_coupling(self, entry, name, value, fits):
+        told = [0.0, 0.0, 0.0, *COUPLING]
+        told[3 + entry] = value
+        theirs = adopted(arm(6), kinematic_influence=told)
+        assert theirs.adopted == fits
+        assert fits or f"{name} is {value:g}, and 1 is the most" in theirs.unusable
+
+
+def test_limits_are_those_of_the_arm_and_of_its_joints():
+    tell = {"current_limit": np.arange(1.0, 7.0), "following_error": np.arange(11.0, 17.0)}
+    init = InitPacket.build(6, 2, tell)
+    found = AnnouncedLimits.of(init, 1, 4)
+    np.testing.assert_array_equal(found.current, [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(found.following_error, [11.0, 12.0, 13.0, 14.0])
+    assert found.current.dtype == found.following_error.dtype == np.float64
+    other = AnnouncedLimits.of(init, 2, 4)
+    assert not np.array_equal(other.current, found.current)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(5.0, "5"), (-120.0, "-120"), (0.1, "0.1"), (2.5, "2.5")]
+)
+def test_a_figure_of_the_wire_is_shown_in_as_few_digits_as_are_that_figure(value, text):
+    assert shown(np.float32(value)) == text
