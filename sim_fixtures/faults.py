@@ -242,7 +242,8 @@ def _of_link(line: _Line) -> link.Fault:
             return link.Duplicate(at, to, count)
         case "reorder":
             return link.Reorder(at, to)
-    return link.Corrupt(at, line.number("offset"), line.number("mask", 0xFF), to, count)
+    offset, mask = line.number("offset"), line.number("mask", 0xFF)
+    return link.Corrupt(at, to, count, offset=offset, mask=mask)
 
 
 def split_faults(

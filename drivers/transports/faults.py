@@ -7,7 +7,7 @@ what arrives and when, for a link in virtual time and for a real one alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final, Literal
 
@@ -30,26 +30,37 @@ class _Packets:
     count: int = 1
 
     def __post_init__(self) -> None:
-        _require_cycles(self, self.cycle, self.count)
+        name = type(self).__name__
+        if self.cycle < 0:
+            raise ValueError(f"{name}: cycle {self.cycle} is negative")
+        if self.count < 1:
+            raise ValueError(f"{name}: count {self.count} is not positive")
+        for what, value in (("cycle", self.cycle), ("count", self.count)):
+            if value > MOST_CYCLES:
+                raise ValueError(f"{name}: {what} is more than {MOST_CYCLES}")
 
 
-@dataclass(frozen=True)
 class Lose(_Packets):
     """The packets of `count` cycles from `cycle` on never arrive."""
 
 
+class Duplicate(_Packets):
+    """The packets of `count` cycles from `cycle` on arrive twice."""
+
+
+class Reorder(_Packets):
+    """The packet of each of these cycles is overtaken by that of the next."""
+
+
 @dataclass(frozen=True)
-class Delay:
+class Delay(_Packets):
     """The packets of `count` cycles from `cycle` on arrive later, by `seconds` plus `cycles`."""
 
-    cycle: int
-    seconds: float = 0.0
-    cycles: float = 0.0
-    direction: Direction = "to_pc"
-    count: int = 1
+    seconds: float = field(default=0.0, kw_only=True)
+    cycles: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        _require_cycles(self, self.cycle, self.count)
+        super().__post_init__()
         for value in (self.seconds, self.cycles):
             if not (isfinite(value) and value >= 0.0):
                 raise ValueError(f"Delay: {value} is not a time of 0 or more")
@@ -58,33 +69,14 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Duplicate(_Packets):
-    """The packets of `count` cycles from `cycle` on arrive twice."""
-
-
-@dataclass(frozen=True)
-class Reorder:
-    """The packet of this cycle is overtaken by that of the next."""
-
-    cycle: int
-    direction: Direction = "to_pc"
-
-    def __post_init__(self) -> None:
-        _require_cycles(self, self.cycle, 1)
-
-
-@dataclass(frozen=True)
-class Corrupt:
+class Corrupt(_Packets):
     """One byte of the packets of some cycles is changed: exclusive-or of `mask` at `offset`."""
 
-    cycle: int
-    offset: int
-    mask: int = 0xFF
-    direction: Direction = "to_pc"
-    count: int = 1
+    offset: int = field(kw_only=True)
+    mask: int = field(default=0xFF, kw_only=True)
 
     def __post_init__(self) -> None:
-        _require_cycles(self, self.cycle, self.count)
+        super().__post_init__()
         if not 1 <= self.mask <= 0xFF:
             raise ValueError(f"Corrupt: mask {self.mask} is not one of 1..255")
         if self.offset < 0:
@@ -102,17 +94,6 @@ class Corrupt:
 Fault = Lose | Delay | Duplicate | Reorder | Corrupt
 
 
-def _require_cycles(fault: object, cycle: int, count: int) -> None:
-    name = type(fault).__name__
-    if cycle < 0:
-        raise ValueError(f"{name}: cycle {cycle} is negative")
-    if count < 1:
-        raise ValueError(f"{name}: count {count} is not positive")
-    for what, value in (("cycle", cycle), ("count", count)):
-        if value > MOST_CYCLES:
-            raise ValueError(f"{name}: {what} is more than {MOST_CYCLES}")
-
-
 class FaultyLink:
     """What arrives of each packet, and when. Pure: the same question has the same answer.
 
@@ -128,7 +109,7 @@ class FaultyLink:
             "to_controller": [],
         }
         for fault in faults:
-            cycles = range(fault.cycle, fault.cycle + getattr(fault, "count", 1))
+            cycles = range(fault.cycle, fault.cycle + fault.count)
             self._planned[fault.direction].append((cycles, fault))
 
     def carry(self, cycle: int, direction: Direction, packet: bytes) -> list[tuple[float, bytes]]:

@@ -108,7 +108,7 @@ def test_a_session_from_cold_start_to_its_end():
 
 def test_two_runs_are_the_same_bytes():
     def replies():
-        return run([Lose(60), Lose(80, "to_controller"), Duplicate(90), Corrupt(100, 60)])[
+        return run([Lose(60), Lose(80, "to_controller"), Duplicate(90), Corrupt(100, offset=60)])[
             1
         ].replies
 
@@ -122,8 +122,8 @@ def test_two_runs_are_the_same_bytes():
         [Lose(cycle, "to_controller") for cycle in range(50, 300, 50)],
         [Lose(cycle, count=2) for cycle in range(50, 300, 11)],
         [Duplicate(cycle) for cycle in range(13, 300)],
-        [Corrupt(cycle, 3, 0xFF) for cycle in range(50, 300, 7)],
-        [Corrupt(cycle, 2, 0x01) for cycle in range(50, 300, 7)],
+        [Corrupt(cycle, offset=3, mask=0xFF) for cycle in range(50, 300, 7)],
+        [Corrupt(cycle, offset=2, mask=0x01) for cycle in range(50, 300, 7)],
     ],
     ids=["lost", "answers lost", "lost in pairs", "doubled", "number negative", "number far off"],
 )

@@ -171,14 +171,16 @@ class TestFaults:
 
     def test_corrupted_either_way(self):
         peer = Script(packets(3))
-        faults = [Corrupt(1, 2, 0x80), Corrupt(2, 0, 0x01, "to_controller")]
+        faults = [Corrupt(1, offset=2, mask=0x80), Corrupt(2, "to_controller", offset=0, mask=0x01)]
         received = answer_all(SimulatedTransport(peer, faults))
         assert received[1] == bytes([1, 1, 0x81, 1])
         assert peer.accepted[2] == bytes([ord("r") ^ 1]) + b"e:" + bytes([2]) * 4
         assert received[0] == bytes(4)
 
     def test_corruption_beyond_the_end_changes_nothing(self):
-        assert answer_all(SimulatedTransport(Script(packets(1)), [Corrupt(0, 99)])) == packets(1)
+        assert answer_all(
+            SimulatedTransport(Script(packets(1)), [Corrupt(0, offset=99)])
+        ) == packets(1)
 
     def test_answers_doubled_reach_the_controller_once(self):
         peer = Script(packets(3))
@@ -200,8 +202,8 @@ class TestFaults:
             (lambda: Lose(-1), "Lose"),
             (lambda: Duplicate(0, count=0), "Duplicate"),
             (lambda: Reorder(-1), "Reorder"),
-            (lambda: Corrupt(0, 0, 0), "Corrupt"),
-            (lambda: Corrupt(0, -1), "Corrupt"),
+            (lambda: Corrupt(0, offset=0, mask=0), "Corrupt"),
+            (lambda: Corrupt(0, offset=-1), "Corrupt"),
             (lambda: Lose(1_000_000_001), "Lose: cycle is more than"),
             (lambda: Duplicate(0, count=10**20), "Duplicate: count is more than"),
             (lambda: Delay(0), "Delay"),

@@ -30,8 +30,10 @@ LINES = {
     "duplicate@1200x2:to_controller": Duplicate(1200, "to_controller", 2),
     "reorder@1200": Reorder(1200),
     "reorder@1200:to_controller": Reorder(1200, "to_controller"),
-    "corrupt@1200:offset=8": Corrupt(1200, 8),
-    "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(1200, 8, 0x80, "to_controller"),
+    "corrupt@1200:offset=8": Corrupt(1200, offset=8),
+    "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(
+        1200, "to_controller", offset=8, mask=0x80
+    ),
     "restart@5000:cold": ControllerFault("restart", 5000, word="cold"),
     "restart@5000": ControllerFault("restart", 5000, word="cold"),
     "restart@5000:warm": ControllerFault("restart", 5000, word="warm"),
