@@ -11,7 +11,6 @@ import struct
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
-from types import FrameType
 from typing import Final
 
 import numpy as np
@@ -124,8 +123,9 @@ def main(arguments: Sequence[str]) -> int:
     # Whoever started this may be interrupted or hung up on while an arm moves.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    terminated = _Flag()
-    signal.signal(signal.SIGTERM, terminated.set)
+    # Between two instructions of the loop, and maybe of itself: no lock is safe in there.
+    terminated: list[bool] = []
+    signal.signal(signal.SIGTERM, lambda *_: terminated.append(True))
     channel = socket.socket(fileno=channel_fd)
     try:
         with os.fdopen(settings_fd, "rb") as file:
@@ -147,7 +147,7 @@ def main(arguments: Sequence[str]) -> int:
             EventWriter(event_fd),
             control,
             channel,
-            terminated=terminated,
+            terminated=lambda: bool(terminated),
             needs_archive=settings.needs_archive,
         )
         report = realtime.enter(settings.realtime)
@@ -162,19 +162,6 @@ def main(arguments: Sequence[str]) -> int:
     status = _serve(transport, session, serving, max_late)
     control.finished = int(status == 0)
     return status
-
-
-class _Flag:
-    """Set by a signal, which comes between two instructions of the loop."""
-
-    def __init__(self) -> None:
-        self._set = False
-
-    def set(self, _number: int, _frame: FrameType | None) -> None:
-        self._set = True
-
-    def __bool__(self) -> bool:
-        return self._set
 
 
 def _serve(transport: Transport, session: Session, serving: Serving, max_late: int) -> int:

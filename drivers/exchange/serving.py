@@ -7,8 +7,8 @@ import os
 import pickle
 import socket
 import time
-from collections.abc import Iterable
-from typing import Final, Protocol
+from collections.abc import Callable, Iterable
+from typing import Final
 
 import numpy as np
 
@@ -122,14 +122,11 @@ _MAY_BE_OPEN: Final = frozenset(
 )
 
 
-class Terminated(Protocol):
-    """True once the process was asked to end: stop on the path, leave open mode, end."""
-
-    def __bool__(self) -> bool: ...
-
-
 class Serving:
     """The `until` of `exchange` in a process of its own; called after each answer.
+
+    Args:
+        terminated: whether the process was asked to end: stop on the path, leave open mode, end.
 
     Attributes:
         reason: why it ended or is about to, in words.
@@ -144,7 +141,7 @@ class Serving:
         control: ControlBlock,
         channel: socket.socket,
         *,
-        terminated: Terminated,
+        terminated: Callable[[], bool],
         needs_archive: bool,
     ) -> None:
         self._terminated = terminated
@@ -236,7 +233,7 @@ class Serving:
     def _reasons_to_leave(self) -> None:
         # Read after `program_id`, which the supervisor writes after a beat: this is never older.
         silent = self._supervisor.quiet()
-        if self._terminated:
+        if self._terminated():
             self._leave("the exchange process was asked to terminate", ORPHAN_LINGER)
         elif silent > (STALE if self._session.requested else PATIENCE):
             self._orphan(NO_SUPERVISOR)

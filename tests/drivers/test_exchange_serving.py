@@ -77,7 +77,7 @@ class Bench:
             EventWriter(event_fd),
             self.control,
             theirs,
-            terminated=self.terminated,
+            terminated=lambda: bool(self.terminated),
             needs_archive=False,
         )
 
