@@ -19,9 +19,16 @@ from hil.errors import ControllerFault, InputError
 from hil.reading import port_number
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.errors import PlantDiverged
-from sim_fixtures.far_end import FarEnd, UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import KNOCK_INTERVAL, PATIENCE, Request, Tally, serve
+from sim_fixtures.serve import (
+    KNOCK_INTERVAL,
+    PATIENCE,
+    FarEnd,
+    Request,
+    Tally,
+    UdpFarEnd,
+    serve,
+)
 
 _PR_SET_TIMERSLACK: Final = 29
 

@@ -17,14 +17,14 @@ from drivers.transports.base import TransportError
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
 from drivers.transports.can.transport import CanSpec, Port, open_bus
-from sim_fixtures.far_end import FarEndError
+from sim_fixtures.serve import FarEndError
 
 START_PATIENCE: Final = 0.25
 """s that the answer to a packet sent as segments is waited for."""
 
 
 class CanFarEnd:
-    """Carries the controller's packets over a bus; fulfils `sim_fixtures.far_end.FarEnd`.
+    """Carries the controller's packets over a bus; fulfils `sim_fixtures.serve.FarEnd`.
 
     Args:
         bus: python-can's; closed with this.

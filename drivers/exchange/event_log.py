@@ -2,7 +2,7 @@
 
 Each frame is length, checksum and index, then one pickled event. The writer first says which
 frames it is about to overwrite, then writes, then says how far it got; a reader copies, then
-looks which of the frames it copied were given up meanwhile. Order of stores as in `shared_ring`.
+looks which of the frames it copied were given up meanwhile. Order of stores as in `drivers.record`.
 """
 
 from __future__ import annotations

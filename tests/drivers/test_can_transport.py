@@ -24,7 +24,7 @@ from drivers.transports.can.bus_load import (
 )
 from drivers.transports.can.transport import BusLock, CanSpec, CanTransport
 from sim_fixtures.can_end import CanFarEnd, open_far_end
-from sim_fixtures.far_end import FarEndError
+from sim_fixtures.serve import FarEndError
 from tests.drivers.can_bench import (
     PROFILES,
     init_packet,

@@ -24,9 +24,8 @@ from hil.cell import Cell
 from hil.serving import Buttons, serve_session, undisturbed
 from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
-from sim_fixtures.far_end import UdpFarEnd
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Request, Tally
+from sim_fixtures.serve import Request, Tally, UdpFarEnd
 from tests.process_death.product import ArchivedSoFar, listening
 from tests.process_death.rounds import Round
 

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from drivers.packets import CyclicPacket, echo, next_number, packet_number
 from drivers.transports.faults import Corrupt, Delay, Duplicate, FaultyLink, Lose
-from sim_fixtures.far_end import UdpFarEnd
-from sim_fixtures.serve import Histogram, Request, Tally, serve
+from sim_fixtures.serve import Histogram, Request, Tally, UdpFarEnd, serve
 
 T = 0.001
 
