@@ -520,7 +520,7 @@ import sys, threading, time
 sys.path.insert(0, {root!r})
 from tests.drivers.rig import Cruise
 from tests.drivers.test_exchange_process import settings
-from drivers.exchange import ExchangeProcess
+from drivers.exchange.process import ExchangeProcess
 exchange = ExchangeProcess.start(settings({port}))
 print(exchange.pid, flush=True)
 def beat():
