@@ -30,10 +30,9 @@ from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.serving import Buttons, open_far_end
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
-from sim_fixtures.far_end import FarEndError
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Request
+from sim_fixtures.serve import FarEndError, Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
