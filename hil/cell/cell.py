@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
@@ -25,17 +25,15 @@ from planner import JointLimits
 from .errors import CellError, first_error, require_known
 from .robot import robot_model
 from .schema import (
-    BoundsTable,
     CampaignTable,
     CanTable,
-    CellTable,
+    CellFile,
     ControllerTable,
     DriveTrainTable,
+    JointFrictionTable,
     LimitsTable,
     NominalTable,
-    RobotTable,
     SimulationTable,
-    WorkspaceTable,
 )
 from .text import urdf_limits, with_values
 
@@ -47,23 +45,6 @@ T = TypeVar("T")
 
 _WITHIN_THIS_COMPUTER: Final = frozenset(("virtual", "udp_multicast"))
 """Interfaces of python-can that need no adapter."""
-
-
-class CellFile(BaseModel):
-    """The whole file. Tables that a use does not need may be left out."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    cell: CellTable
-    robot: RobotTable = RobotTable()
-    nominal: NominalTable | None = None
-    limits: LimitsTable | None = None
-    bounds: BoundsTable = BoundsTable()
-    drive_train: DriveTrainTable | None = None
-    controller: ControllerTable | None = None
-    workspace: WorkspaceTable = WorkspaceTable()
-    campaign: CampaignTable | None = None
-    simulation: SimulationTable | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,21 +68,10 @@ class Cell:
             CellError: names file, field, value and remedy.
         """
         path = Path(path)
-        try:
-            text = text_of(path)
-        except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            raise CellError(
-                path, "", None, f"cannot be read ({why})", "name a TOML file"
-            ) from error
-        file = _parse(path, text)
-        urdf_path = path.parent / file.cell.urdf
-        try:
-            urdf = text_of(urdf_path)
-        except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            problem, remedy = f"cannot be read ({why})", f"put a URDF at {urdf_path}"
-            raise CellError(path, "cell.urdf", file.cell.urdf, problem, remedy) from error
+        text = _read(path, path, "", None, "name a TOML file")
+        name = _parse(path, text).cell.urdf
+        urdf_path = path.parent / name
+        urdf = _read(urdf_path, path, "cell.urdf", name, f"put a URDF at {urdf_path}")
         return cls.from_texts(text, urdf, path)
 
     @classmethod
@@ -109,11 +79,7 @@ class Cell:
         """The cell from its texts (an archive carries both); `path` only names it in errors."""
         cell = cls(path, text, urdf, _parse(path, text))
         _ = cell.model
-        check_assumed(cell)
-        check_locked(cell)
-        check_turning(cell)
-        check_lengths(cell)
-        check_built(cell)
+        _check(cell)
         return cell
 
     def __repr__(self) -> str:
@@ -148,7 +114,7 @@ class Cell:
         """
         table = self.file.robot.friction
         joints = {
-            name: one.model_copy(update=dict.fromkeys(changes.keys() & type(one).model_fields))
+            name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))
             for name, one in table.joints.items()
         }
         friction = table.model_copy(update={**changes, "joints": joints})
@@ -191,13 +157,10 @@ class Cell:
     def joint_limits(self) -> JointLimits:
         """Limits of the plan in URDF angles (rad, rad/s, rad/s², rad/s³)."""
         limits = _required(self, self.file.limits, "limits")
-        lower, upper = np.radians(limits.lower_deg), np.radians(limits.upper_deg)
-        if limits.frame == "controller":
-            a, b = self.urdf_angles(lower), self.urdf_angles(upper)
-            lower, upper = np.minimum(a, b), np.maximum(a, b)
+        ends = AngleFrame.of(self).urdf(np.array([limits.lower_deg, limits.upper_deg]))
         return JointLimits(
-            lower=lower,
-            upper=upper,
+            lower=ends.min(axis=0),
+            upper=ends.max(axis=0),
             velocity=np.radians(limits.velocity_deg),
             acceleration=np.radians(limits.acceleration_deg),
             jerk=np.radians(limits.jerk_deg),
@@ -320,12 +283,12 @@ class Cell:
     @property
     def home(self) -> Array:
         """Start posture of every excitation (n,), URDF angles, rad."""
-        return self._posture(self.campaign.home_deg)
+        return AngleFrame.of(self).urdf(np.array(self.campaign.home_deg))
 
     @property
     def initial(self) -> Array:
         """Where the simulated arm stands at first (n,), URDF angles, rad."""
-        return self._posture(self.simulation.initial_deg)
+        return AngleFrame.of(self).urdf(np.array(self.simulation.initial_deg))
 
     def with_values(self, values: Mapping[str, Any]) -> Cell:
         """This cell with other values in its file, by dotted name, such as "campaign.n_via".
@@ -421,24 +384,17 @@ class Cell:
 
     def urdf_angles(self, controller_angles: Array) -> Array:
         """URDF angles (n,) from the teach pendant's, rad."""
-        table = self.drive_table
-        result: Array = (controller_angles - np.radians(table.joint_offset_deg)) * np.array(
-            table.joint_sign
-        )
-        return result
+        frame = AngleFrame.pendant(self)
+        return np.asarray((controller_angles - frame.offset) * frame.sign, dtype=np.float64)
 
     def controller_angles(self, urdf_angles: Array) -> Array:
         """The teach pendant's angles (n,) from those of the URDF, rad."""
-        table = self.drive_table
-        result: Array = urdf_angles * np.array(table.joint_sign) + np.radians(
-            table.joint_offset_deg
-        )
-        return result
+        frame = AngleFrame.pendant(self)
+        return np.asarray(urdf_angles * frame.sign + frame.offset, dtype=np.float64)
 
-    def _posture(self, degrees: list[float]) -> Array:
-        angles: Array = np.radians(degrees)
-        limits = _required(self, self.file.limits, "limits")
-        return self.urdf_angles(angles) if limits.frame == "controller" else angles
+    def error(self, field: str, value: object, problem: str, remedy: str) -> CellError:
+        """What is wrong with a field of this cell's file."""
+        return CellError(self.path, field, value, problem, remedy)
 
 
 def _parse(path: Path, text: str) -> CellFile:
@@ -451,6 +407,15 @@ def _parse(path: Path, text: str) -> CellFile:
         return CellFile.model_validate(raw)
     except ValidationError as error:
         raise first_error(path, error, CellFile) from error
+
+
+def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str:
+    """The text of a file that the cell file `path` names in a field, or of the cell file itself."""
+    try:
+        return text_of(file)
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise CellError(path, field, value, f"cannot be read ({why})", remedy) from error
 
 
 def _required(cell: Cell, table: T | None, name: str) -> T:
@@ -493,15 +458,18 @@ class AngleFrame:
     @classmethod
     def of(cls, cell: Cell) -> AngleFrame:
         """The frame in which the cell's own limits and postures are written."""
-        n = cell.joint_limits.n_joints
-        if cell.file.limits is None or cell.file.limits.frame == "urdf":
-            return cls("urdf", np.ones(n), np.zeros(n))
+        limits = _required(cell, cell.file.limits, "limits")
+        if limits.frame == "controller":
+            return cls.pendant(cell)
+        n = len(limits.lower_deg)
+        return cls("urdf", np.ones(n), np.zeros(n))
+
+    @classmethod
+    def pendant(cls, cell: Cell) -> AngleFrame:
+        """The frame of the controller's angles, as the teach pendant shows them."""
         table = cell.drive_table
-        return cls(
-            "controller",
-            np.array(table.joint_sign, dtype=np.float64),
-            np.radians(table.joint_offset_deg),
-        )
+        sign = np.array(table.joint_sign, dtype=np.float64)
+        return cls("controller", sign, np.radians(table.joint_offset_deg))
 
     def shown(self, q: Array) -> Array:
         """Angles to show (..., n) [deg] from URDF angles [rad]."""
@@ -544,88 +512,32 @@ _PER_JOINT = ("nominal", "limits", "drive_train", "campaign", "simulation")
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
-def check_lengths(cell: Cell) -> None:
-    """Every list that has one entry per joint has as many as the URDF has joints."""
-    n_joints = cell.model.n_joints
-    for table_name in (*_PER_JOINT, "simulation.drive_train"):
-        for name, value in _table(cell, table_name) or ():
-            field = f"{table_name}.{name}"
-            if not isinstance(value, list) or len(value) == n_joints:
-                continue
-            if value or field not in _MAY_BE_EMPTY:
-                or_none = " or none" if field in _MAY_BE_EMPTY else ""
-                raise CellError(
-                    cell.path,
-                    field,
-                    value,
-                    f"has {len(value)} entries but the URDF has {n_joints} joints",
-                    f"give one entry for each of {', '.join(cell.joint_names)}{or_none}",
-                )
+def _check(cell: Cell) -> None:
+    """Whatever pydantic cannot see: fields against each other and against the URDF.
 
-
-def _table(cell: Cell, dotted: str) -> Any:
-    """A table, or one within it, by its name; None where there is none."""
-    found: Any = cell.file
-    for name in dotted.split("."):
-        found = None if found is None else getattr(found, name)
-    return found
-
-
-def check_assumed(cell: Cell) -> None:
-    """What is called assumed stands in the file."""
-    for name in cell.file.cell.assumed:
-        table, _, field = name.partition(".")
-        known = table in type(cell.file).model_fields
-        if known and getattr(cell.file, table) is None:
-            raise CellError(
-                cell.path,
-                table,
-                None,
-                f"is missing, though cell.assumed names {name}",
-                f"add a table [{table}], or take that name out",
-            )
-        if not known or field not in type(getattr(cell.file, table)).model_fields:
-            raise CellError(
-                cell.path,
-                "cell.assumed",
-                name,
-                "names no field of this file",
-                'name fields as "table.field"',
-            )
-
-
-def check_turning(cell: Cell) -> None:
-    """What is given in degrees and revolutions is given for joints that turn."""
-    tables = [name for name in _TURNING_ONLY if getattr(cell.file, name) is not None]
-    revolute = cell.model.chain.revolute
-    for name, turns in zip(cell.joint_names, revolute, strict=True):
+    Raises:
+        CellError: what does not fit.
+    """
+    file = cell.file
+    _check_assumed(cell)
+    tables = [name for name in _TURNING_ONLY if getattr(file, name) is not None]
+    if tables and file.robot.locked:  # a motion is checked with the whole URDF
+        raise cell.error(
+            "robot.locked",
+            ", ".join(file.robot.locked),
+            f"is for arms that are identified from recordings, but there is a table [{tables[0]}]",
+            'fix these joints in the URDF (type = "fixed")',
+        )
+    for name, turns in zip(cell.joint_names, cell.model.chain.revolute, strict=True):
         if tables and not turns:
-            raise CellError(
-                cell.path,
+            raise cell.error(
                 tables[0],
                 None,
                 f"is in degrees and revolutions, but joint {name} slides",
                 'fix it in the URDF (type = "fixed"); an arm with sliding joints can be '
                 "identified from recordings, but not moved",
             )
-
-
-def check_locked(cell: Cell) -> None:
-    """Joints are locked for identification only: a motion is checked with the whole URDF."""
-    tables = [name for name in _TURNING_ONLY if getattr(cell.file, name) is not None]
-    if tables and cell.file.robot.locked:
-        raise CellError(
-            cell.path,
-            "robot.locked",
-            ", ".join(cell.file.robot.locked),
-            f"is for arms that are identified from recordings, but there is a table [{tables[0]}]",
-            'fix these joints in the URDF (type = "fixed")',
-        )
-
-
-def check_built(cell: Cell) -> None:
-    """What is built from the file later can be built: whatever that refuses is a bad field."""
-    file = cell.file
+    _check_lengths(cell)
     _build(cell, "workspace", "workspace")
     if file.drive_train is not None:
         _build(cell, "drive_train", "drive_train")
@@ -633,33 +545,67 @@ def check_built(cell: Cell) -> None:
         return
     if file.drive_train is not None or file.limits.frame == "urdf":
         _build(cell, "limits", "joint_limits")
-        _check_degrees(cell)
-        _check_against_urdf(cell)
-        _check_postures(cell)
+        _check_limits(cell, file.limits)
+        _check_postures(cell, file.limits)
     if file.drive_train is not None:
         _build(cell, "bounds", "guard_limits")
 
 
 def _build(cell: Cell, table: str, attribute: str) -> None:
+    """What is built from a table later can be built."""
     try:
         getattr(cell, attribute)
     except CellError:
         raise
     except (ValueError, DriverError) as error:
-        raise CellError(cell.path, table, None, str(error), "correct that table") from error
+        raise cell.error(table, None, str(error), "correct that table") from error
 
 
-def _check_postures(cell: Cell) -> None:
+def _check_assumed(cell: Cell) -> None:
+    """What is called assumed stands in the file."""
+    for name in cell.file.cell.assumed:
+        table, _, field = name.partition(".")
+        known = table in CellFile.model_fields
+        if known and getattr(cell.file, table) is None:
+            raise cell.error(
+                table,
+                None,
+                f"is missing, though cell.assumed names {name}",
+                f"add a table [{table}], or take that name out",
+            )
+        if not known or field not in type(getattr(cell.file, table)).model_fields:
+            remedy = 'name fields as "table.field"'
+            raise cell.error("cell.assumed", name, "names no field of this file", remedy)
+
+
+def _check_lengths(cell: Cell) -> None:
+    """Every list that has one entry per joint has as many as the URDF has joints."""
+    n_joints, names = cell.model.n_joints, ", ".join(cell.joint_names)
+    tables = {name: getattr(cell.file, name) for name in _PER_JOINT}
+    if cell.file.simulation is not None:
+        tables["simulation.drive_train"] = cell.file.simulation.drive_train
+    for table, entries in tables.items():
+        for name, value in entries or ():
+            field = f"{table}.{name}"
+            may_be_empty = field in _MAY_BE_EMPTY
+            if isinstance(value, list) and len(value) not in {n_joints, 0 if may_be_empty else -1}:
+                raise cell.error(
+                    field,
+                    value,
+                    f"has {len(value)} entries but the URDF has {n_joints} joints",
+                    f"give one entry for each of {names}{' or none' if may_be_empty else ''}",
+                )
+
+
+def _check_postures(cell: Cell, table: LimitsTable) -> None:
     """Postures named in the file lie inside its limits."""
     limits, file = cell.joint_limits, cell.file
-    table = file.limits
-    assert table is not None
     remedy = "name a posture that the arm can take"
-    if np.abs([table.lower_deg, table.upper_deg]).max() < _FULL_TURN:
+    furthest = np.abs([table.lower_deg, table.upper_deg]).max()
+    if furthest < _FULL_TURN:
         remedy += (
-            ", or correct the limits: no joint may go further than "
-            f"{np.abs([table.lower_deg, table.upper_deg]).max():.4g}°; are they in rad? "
-            "1 rad is 57.2958°"
+            f", or correct the limits: no joint may go further than {furthest:.4g}°; are they in "
+            "rad? 1 rad is 57.2958°"
         )
     postures = {}
     if file.campaign is not None:
@@ -667,21 +613,15 @@ def _check_postures(cell: Cell) -> None:
     if file.simulation is not None:
         postures["simulation.initial_deg"] = cell.initial
     for field, posture in postures.items():
-        for joint, name in enumerate(cell.joint_names):
-            if not limits.lower[joint] <= posture[joint] <= limits.upper[joint]:
-                raise CellError(
-                    cell.path,
-                    field,
-                    None,
-                    f"{name} stands outside [limits]",
-                    remedy,
-                )
+        outside = ~((posture >= limits.lower) & (posture <= limits.upper))
+        if outside.any():
+            name = cell.joint_names[int(outside.argmax())]
+            raise cell.error(field, None, f"{name} stands outside [limits]", remedy)
 
 
-def _check_degrees(cell: Cell) -> None:
-    """No list in degrees holds what the URDF states in radians."""
-    table, allowed = cell.file.limits, urdf_limits(cell.urdf, cell.joint_names)
-    assert table is not None
+def _check_limits(cell: Cell, table: LimitsTable) -> None:
+    """No list in degrees holds the URDF's radians, and none is wider than the URDF allows."""
+    limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
     ranges = np.subtract(table.upper_deg, table.lower_deg)
     for field, given, radians, unit in (
         ("lower_deg", ranges, allowed.upper - allowed.lower, "rad"),
@@ -689,31 +629,24 @@ def _check_degrees(cell: Cell) -> None:
     ):
         stated = np.isfinite(radians)
         if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
-            raise CellError(
-                cell.path,
+            too = " (those of upper_deg too)" if field == "lower_deg" else ""
+            raise cell.error(
                 f"limits.{field}",
                 getattr(table, field),
                 f"is in degrees, and the URDF has these numbers in {unit}",
-                "multiply them by 57.2958"
-                + (" (those of upper_deg too)" if field == "lower_deg" else ""),
+                f"multiply them by 57.2958{too}",
             )
-
-
-def _check_against_urdf(cell: Cell) -> None:
-    """The cell may narrow what the URDF allows, never widen it."""
-    limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
-    for joint, name in enumerate(cell.joint_names):
-        for field, value, bound, beyond in (
-            ("lower_deg", limits.lower[joint], allowed.lower[joint], -1.0),
-            ("upper_deg", limits.upper[joint], allowed.upper[joint], 1.0),
-            ("velocity_deg", limits.velocity[joint], allowed.velocity[joint], 1.0),
-        ):
-            if beyond * (value - bound) > URDF_ROUNDING * max(1.0, abs(bound)):
-                raise CellError(
-                    cell.path,
-                    f"limits.{field}",
-                    None,
-                    f"{name} may go to {np.degrees(value):.6g}° (URDF angle or speed), beyond the "
-                    f"URDF's {np.degrees(bound):.6g}°",
-                    "narrow it, or correct the URDF",
-                )
+    for field, values, bounds, beyond in (
+        ("lower_deg", limits.lower, allowed.lower, -1.0),
+        ("upper_deg", limits.upper, allowed.upper, 1.0),
+        ("velocity_deg", limits.velocity, allowed.velocity, 1.0),
+    ):
+        wider = beyond * (values - bounds) > URDF_ROUNDING * np.maximum(1.0, np.abs(bounds))
+        for joint in np.flatnonzero(wider):
+            raise cell.error(
+                f"limits.{field}",
+                None,
+                f"{cell.joint_names[joint]} may go to {np.degrees(values[joint]):.6g}° (URDF angle "
+                f"or speed), beyond the URDF's {np.degrees(bounds[joint]):.6g}°",
+                "narrow it, or correct the URDF",
+            )

@@ -110,7 +110,7 @@ def _all_names(urdf: str) -> tuple[str, ...]:
 
 
 def _override(friction: FrictionTable, name: str) -> FrictionTable:
-    different = friction.joints[name].model_dump(exclude_none=True)
+    different = friction.joints[name].model_dump(exclude_unset=True)
     return friction.model_copy(update=different)
 
 

@@ -2,14 +2,14 @@
 
 One TOML table per class. The description of a field is also the remedy that an error prints,
 so it says what the value must be, not what the code does with it. Units other than SI stand in
-the field's name. `[simulation]` is in `simulation_schema`.
+the field's name.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 # Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
 Number = Annotated[FiniteFloat, Field(strict=True)]
@@ -20,6 +20,19 @@ NonNegative = Annotated[Number, Field(ge=0)]
 Vector = list[Number]
 PositiveVector = list[Positive]
 Point = tuple[Number, Number, Number]
+
+
+def _turning(ratios: list[float]) -> list[float]:
+    for joint, ratio in enumerate(ratios, 1):
+        if ratio == 0:
+            raise ValueError(
+                f"gear_ratio of joint {joint} is 0; "
+                "give signed motor revolutions per joint revolution"
+            )
+    return ratios
+
+
+GearRatios = Annotated[Vector, AfterValidator(_turning)]
 
 
 class Table(BaseModel):
@@ -34,7 +47,7 @@ class SimulatedDriveTable(Table):
     What is left out is as in `[drive_train]`, which a mistake there then goes for as well.
     """
 
-    gear_ratio: Vector | None = Field(
+    gear_ratio: GearRatios | None = Field(
         default=None, description="signed motor revolutions per joint revolution, none of them 0"
     )
     joint_sign: list[Literal[-1, 1]] | None = Field(
@@ -46,16 +59,6 @@ class SimulatedDriveTable(Table):
     k54: Number | None = Field(default=None, description="wrist coupling of axis 4 into motor 5")
     k64: Number | None = Field(default=None, description="wrist coupling of axis 4 into motor 6")
     k65: Number | None = Field(default=None, description="wrist coupling of axis 5 into motor 6")
-
-    @model_validator(mode="after")
-    def _nonzero(self) -> SimulatedDriveTable:
-        for joint, value in enumerate(self.gear_ratio or (), 1):
-            if value == 0:
-                raise ValueError(
-                    f"gear_ratio of joint {joint} is 0; "
-                    "give signed motor revolutions per joint revolution"
-                )
-        return self
 
 
 class PayloadTable(Table):
@@ -140,36 +143,10 @@ class CellTable(Table):
 
 
 class JointFrictionTable(Table):
-    """`[robot.friction.joints.NAME]`: what of the friction is different for one joint."""
+    """`[robot.friction.joints.NAME]`: entries of `[robot.friction]` that differ for one joint.
 
-    coulomb: Choice | None = Field(default=None, description="true or false: f0 sgn(qd)")
-    viscous: Choice | None = Field(default=None, description="true or false: f1 qd")
-    third: Literal["quadratic", "cubic", "none"] | None = Field(
-        default=None, description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
-    )
-    offset: Choice | None = Field(default=None, description="true or false: a constant torque")
-    stribeck: Annotated[Number, Field(ge=0)] | None = Field(
-        default=None, description="speed in rad/s of a Stribeck term, 0 for none"
-    )
-    tanh: Annotated[Number, Field(ge=0)] | None = Field(
-        default=None, description="speed vt in rad/s of f0 tanh(qd / vt), 0 for f0 sgn(qd)"
-    )
-    asymmetric: Choice | None = Field(
-        default=None, description="true or false: Coulomb and viscous friction by direction"
-    )
-    standstill: NonNegative | None = Field(
-        default=None, description="speed in rad/s (m/s) below which the joint counts as at rest"
-    )
-    zone: Literal["exclude", "linear"] | None = Field(
-        default=None, description='"exclude" or "linear"'
-    )
-    presliding: NonNegative | None = Field(
-        default=None, description="displacement in rad (m) over which dry friction turns round"
-    )
-
-
-class FrictionTable(Table):
-    """`[robot] friction`: which friction columns each joint gets."""
+    Only those that were written count (`model_fields_set`).
+    """
 
     coulomb: Choice = Field(default=True, description="true or false: f0 sgn(qd)")
     viscous: Choice = Field(default=True, description="true or false: f1 qd")
@@ -177,10 +154,10 @@ class FrictionTable(Table):
         default="quadratic", description='"quadratic" (sgn(qd) qd²), "cubic" (qd³) or "none"'
     )
     offset: Choice = Field(default=False, description="true or false: a constant torque per joint")
-    stribeck: Annotated[Number, Field(ge=0)] = Field(
+    stribeck: NonNegative = Field(
         default=0.0, description="speed in rad/s of a Stribeck term, 0 for none"
     )
-    tanh: Annotated[Number, Field(ge=0)] = Field(
+    tanh: NonNegative = Field(
         default=0.0, description="speed vt in rad/s of f0 tanh(qd / vt), 0 for f0 sgn(qd)"
     )
     asymmetric: Choice = Field(
@@ -199,6 +176,11 @@ class FrictionTable(Table):
         description="displacement in rad (m) over which dry friction turns round at a reversal "
         "(Dahl), 0 for a jump; identification chooses its own unless one is given",
     )
+
+
+class FrictionTable(JointFrictionTable):
+    """`[robot] friction`: which friction columns each joint gets."""
+
     ripple: list[Annotated[Whole, Field(ge=1, le=24)]] = Field(
         default_factory=list,
         description="periods per motor turn of a torque ripple that is identified, such as [1, 2]; "
@@ -395,7 +377,7 @@ class BoundsTable(Table):
 class DriveTrainTable(Table):
     """`[drive_train]`: motors, gears and wrist coupling (see `drivers.DriveTrain`)."""
 
-    gear_ratio: Vector = Field(
+    gear_ratio: GearRatios = Field(
         description="signed motor revolutions per joint revolution, none of them 0"
     )
     calibration: Vector = Field(description="motor revolutions at controller angle 0")
@@ -412,16 +394,6 @@ class DriveTrainTable(Table):
     current_limit: PositiveVector = Field(description="A at the motor, one per joint")
     following_error: PositiveVector = Field(description="threshold in motor revolutions")
     encoder_counts_per_revolution: Whole = Field(gt=0, description="encoder counts per motor turn")
-
-    @model_validator(mode="after")
-    def _nonzero(self) -> DriveTrainTable:
-        for joint, value in enumerate(self.gear_ratio, 1):
-            if value == 0:
-                raise ValueError(
-                    f"gear_ratio of joint {joint} is 0; "
-                    "give signed motor revolutions per joint revolution"
-                )
-        return self
 
 
 class CanTable(Table):
@@ -551,3 +523,18 @@ class CampaignTable(Table):
     seed: Whole = Field(
         default=1, ge=0, description="seed of the search and of the validation motions"
     )
+
+
+class CellFile(Table):
+    """The whole file. Tables that a use does not need may be left out."""
+
+    cell: CellTable
+    robot: RobotTable = RobotTable()
+    nominal: NominalTable | None = None
+    limits: LimitsTable | None = None
+    bounds: BoundsTable = BoundsTable()
+    drive_train: DriveTrainTable | None = None
+    controller: ControllerTable | None = None
+    workspace: WorkspaceTable = WorkspaceTable()
+    campaign: CampaignTable | None = None
+    simulation: SimulationTable | None = None
