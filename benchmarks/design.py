@@ -51,7 +51,7 @@ from identification.excitation import Objective, Population, Problem, search
 from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
 from planner import FourierSeries, JointLimits, PiecewiseCubic, PlannerError
 from planner.arrays import Array
-from planner.batch import plan_chunk
+from planner.moves import plan_chunk
 from sim_fixtures.ns16 import CELL_PATH
 
 N_VIA = 6

@@ -8,7 +8,7 @@ limits of the NS 16 (6 joints).
 - ``ratio_to_at_time``: the same number of samples from the solver's own trajectories through the
   same via points, asked time by time, as its interface has it, into the same arrays, over ours.
   ``at_time_calls_only_ms`` is what its bare calls take when all that they return is thrown away.
-- ``batch_ms``: one motion of a population planned together (``planner.batch``, in this process).
+- ``batch_ms``: one motion of a population planned together (``plan_chunk``, in this process).
 - ``player_step_us``, ``interpolator_step_us``: one cycle of a motion whose override changes.
 - ``worst_limit_ratio``: how far any quantity of ``--plans`` random motions goes, 1 being its limit
   (`benchmarks.planner_statistics`).
@@ -46,8 +46,8 @@ from benchmarks.planner_statistics import (
 from hil import Cell
 from planner import JointLimits, PiecewiseCubic, TrajectoryPlayer, plan
 from planner.arrays import Array
-from planner.batch import plan_chunk
 from planner.interpolator import Interpolator
+from planner.moves import plan_chunk
 from sim_fixtures.ns16 import CELL_PATH
 
 POINTS = 6

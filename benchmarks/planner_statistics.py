@@ -11,9 +11,8 @@ import numpy as np
 
 from planner import JointLimits
 from planner.arrays import Array
-from planner.commands import FlyPercent, Move
-from planner.moves import MotionPlan, plan_moves
-from planner.verify import position_rounding
+from planner.limits import position_rounding
+from planner.moves import FlyPercent, MotionPlan, Move, plan_moves
 
 FLYS = (0.1, 0.25, 0.5, 0.75, 1.0)
 # Of the method's first trial: T / T with stops, and mean passing distance [deg].

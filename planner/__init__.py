@@ -1,14 +1,10 @@
-"""Via points to motion, as an industrial controller's joint interpolator runs it.
+"""Via points to motion, as an industrial controller's joint interpolator runs them.
 
 `plan` turns via points into a `PiecewiseCubic`, `plan_moves` does it move by move with overrides,
 `Interpolator` step by step while targets arrive. `TrajectoryPlayer` gives a motion out one
 set-point per controller cycle, at an override that may change, and stops it on its path.
 """
 
-from __future__ import annotations
-
-from planner.batch import plan_chunk
-from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
 from planner.errors import (
     InvalidLimits,
     InvalidPlanFile,
@@ -16,7 +12,6 @@ from planner.errors import (
     InvalidTrajectory,
     InvalidViaPoints,
     LimitExceeded,
-    NonFiniteViaPoint,
     NotBegun,
     NotSmooth,
     PlannerCrashed,
@@ -26,30 +21,28 @@ from planner.errors import (
     PlanningError,
     PlanningTimedOut,
     StartMismatch,
-    TooFewViaPoints,
     UnsupportedSolver,
-    ViaPointOutOfLimits,
-    WrongShape,
 )
 from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import Interpolator
 from planner.limits import JointLimits
-from planner.moves import MotionPlan, TargetPassage, plan, plan_moves
+from planner.moves import (
+    FlyDistance,
+    FlyPercent,
+    MotionPlan,
+    Move,
+    Overrides,
+    Stop,
+    TargetPassage,
+    plan,
+    plan_chunk,
+    plan_moves,
+)
 from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 from planner.plan_file import PlanFile, to_csv
 from planner.player import TrajectoryPlayer
 from planner.verify import check_limits, check_rest
-from planner.worker import (
-    WorkerProcess,
-    chunks_of,
-    close_child,
-    in_child,
-    load,
-    map_in_children,
-    pack,
-    plan_in_child,
-    stream_in_children,
-)
+from planner.worker import WorkerProcess, in_child, map_in_children, plan_in_child
 
 __all__ = [
     "plan",
@@ -64,13 +57,8 @@ __all__ = [
     "plan_chunk",
     "plan_in_child",
     "in_child",
-    "close_child",
     "WorkerProcess",
     "map_in_children",
-    "stream_in_children",
-    "chunks_of",
-    "pack",
-    "load",
     "check_limits",
     "check_rest",
     "JointLimits",
@@ -89,10 +77,6 @@ __all__ = [
     "InvalidTrajectory",
     "InvalidPlanFile",
     "InvalidViaPoints",
-    "WrongShape",
-    "TooFewViaPoints",
-    "NonFiniteViaPoint",
-    "ViaPointOutOfLimits",
     "PlanningError",
     "LimitExceeded",
     "NotSmooth",

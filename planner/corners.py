@@ -1,4 +1,4 @@
-"""Flying by a via point: leave one segment early, enter the next late, join the two states.
+"""Flying by a via point: leave one move early, enter the next late, join the two states.
 
 How far a corner is rounded. A join saves the time that it replaces minus its own. Joins found by
 a perfect solver save the more the more of both ramps they replace, because to follow the ramps and
@@ -22,43 +22,43 @@ import ruckig
 from numpy.typing import NDArray
 
 from planner.arrays import Array
-from planner.blocks import Block, Mask, Rows
 from planner.errors import UnsupportedSolver
-from planner.limits import Allowance, Bounds
-from planner.piecewise_cubic import PiecewiseCubic
-from planner.segments import StraightMoves, StraightSegment
-from planner.verify import jump_rounding
+from planner.limits import Allowance, jump_rounding
+from planner.piecewise_cubic import Block, Mask, PiecewiseCubic, Rows
+from planner.straight import StraightMoves
 
-_SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
-_STEPS = 60  # of Newton's method, four or five as a rule; halving alone would need about fifty
-_RESOLUTION = 1e-15  # share of the duration: two times closer than this are one
-
-
-# Which versions of the corner solver (community ruckig) this package was measured with.
-#
-# Its margins against crashes are measurements of one series of versions, not properties of the
-# algorithm. So another version is not merely warned of: no corner is planned with it. Whatever
-# does not fly by (stops, playing, reading of plans) works with any version.
+# The margins against crashes of the corner solver (community ruckig) are measurements of one series
+# of versions, not properties of the algorithm. So another version is not merely warned of: no
+# corner is planned with it. Stops, playing and reading of plans work with any version.
 SERIES: Final = "0.19"
+_VERSION = str(getattr(ruckig, "__version__", "unknown"))
 
-
-def is_supported(version: str) -> bool:
-    """Whether a version is of the series measured."""
-    return version.split(".")[:2] == SERIES.split(".")
-
-
-_VERSION: Final = str(getattr(ruckig, "__version__", "unknown"))
-_SUPPORTED: Final = is_supported(_VERSION)
-
-
-def require_solver() -> None:
-    """Return if the installed solver is of the series measured.
-
-    Raises:
-        UnsupportedSolver: it is of another one.
-    """
-    if not _SUPPORTED:
-        raise UnsupportedSolver(_VERSION, SERIES)
+# Shares of the fly asked for that are compared, and those tried one by one if none of them will do.
+FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
+LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
+# A corner that takes less of its ramps than this cannot be distinguished from a stop: its path
+# passes at some 1e-12 of the distance of a full one.
+LEAST_SHARE: Final = 1e-4
+# A join is preferred to that at the share asked for if it saves this much more [s].
+BETTER: Final = 1e-9
+# ruckig is never shown a state closer than this to its limits: it can crash the process there.
+NEAREST_STATE: Final = 0.995
+# Joins use the full limits but for a little room in which the last digits are closed.
+FULL: Final = 0.999
+# What ruckig raises where it finds no motion: now and then (1 in 200 000) it ends with an error
+# number that its own Python face does not know, which is then a ValueError.
+REFUSALS: Final = (ruckig.RuckigError, ValueError)
+# Jerk limit in the units in which the solver is asked.
+SOLVER_JERK: Final = 64.0
+# Shares of a distance: what is aimed at, and from where on it is near enough; and how many corners
+# a search for it may try.
+_AIM: Final = 0.95
+_NEAR_ENOUGH: Final = 0.9
+_SEARCH: Final = 12
+# A join may miss its end by this share of what counts as rounding between two pieces.
+_MISS: Final = 0.1
+# Of a solution: two to brake into the limits (of no length here), seven to move.
+_PIECES: Final = 9
 
 
 class Passing(NamedTuple):
@@ -71,6 +71,11 @@ class Passing(NamedTuple):
 
     time: float
     distance: float
+
+
+_SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
+_STEPS = 60  # of Newton's method, four or five as a rule; halving alone would need about fifty
+_RESOLUTION = 1e-15  # share of the duration: two times closer than this are one
 
 
 def passing(motion: PiecewiseCubic, point: Array) -> Passing:
@@ -106,36 +111,13 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
 
 How = Literal["stopped", "flown", "reduced"]
 
-# Shares of the fly asked for that are compared, and those tried one by one if none of them will do.
-FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
-LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
-# A corner that takes less of its ramps than this cannot be distinguished from a stop: its path
-# passes at some 1e-12 of the distance of a full one.
-LEAST_SHARE: Final = 1e-4
-# A join is preferred to that at the share asked for if it saves this much more [s].
-BETTER: Final = 1e-9
-# ruckig is never shown a state closer than this to its limits: it can crash the process there.
-NEAREST_STATE: Final = 0.995
-# Joins use the full limits but for a little room in which the last digits are closed.
-FULL: Final = 0.999
-# What ruckig raises where it finds no motion: now and then (1 in 200 000) it ends with an error
-# number that its own Python face does not know, which is then a ValueError.
-REFUSALS: Final = (ruckig.RuckigError, ValueError)
-# Jerk limit in the units in which the solver is asked.
-SOLVER_JERK: Final = 64.0
-# Shares of a distance: what is aimed at, and from where on it is near enough; and how many corners
-# a search for it may try.
-_AIM: Final = 0.95
-_NEAR_ENOUGH: Final = 0.9
-_SEARCH: Final = 12
-
 
 class Corner(NamedTuple):
     """How a via point is passed.
 
     Attributes:
-        leave: Time cut from the end of the segment before [s].
-        enter: Time cut from the beginning of the segment after [s].
+        leave: Time cut from the end of the move before [s].
+        enter: Time cut from the beginning of the move after [s].
         join: What replaces them; None where the arm stops.
         share: Share of the ramps that the corner takes.
         how: "flown" as asked; "reduced": rounded less than asked; or "stopped".
@@ -151,59 +133,20 @@ class Corner(NamedTuple):
 STOP: Final = Corner(0.0, 0.0, None)
 
 
-def fly_by(before: StraightSegment, after: StraightSegment, bounds: Bounds, share: float) -> Corner:
-    """Round the corner between two segments as far as `share` asks and the bounds allow.
-
-    The cut takes the share of the ramp before and of the ramp after the corner, so that no part
-    of a segment goes to both of its corners. It never takes longer than to stop.
-    """
-    return fly_by_all([(before, after)], [bounds], [share])[0]
-
-
-def fly_by_all(
-    segments: Sequence[tuple[StraightSegment, StraightSegment]],
-    bounds: Sequence[Bounds],
-    shares: Sequence[float],
-) -> list[Corner]:
-    """Round each corner between two segments as `fly_by` does."""
-    corners = [STOP] * len(segments)
-    flown = [
-        index
-        for index, ((before, after), share) in enumerate(zip(segments, shares, strict=True))
-        if share >= LEAST_SHARE and before.slowing_down > 0.0 and after.speeding_up > 0.0
-    ]
-    if not flown:
-        return corners
-    rows = np.arange(2 * len(flown))
-    rounded = round_corners(
-        StraightMoves.of([segment for index in flown for segment in segments[index]]),
-        rows[::2],
-        rows[1::2],
-        Allowance.of_many([bounds[index] for index in flown]),
-        np.array([shares[index] for index in flown]),
-    )
-    for index, leave, enter, share, join in zip(flown, *rounded, strict=True):
-        if join is not None:
-            how: How = "flown" if share == shares[index] else "reduced"
-            corners[index] = Corner(float(leave), float(enter), join, float(share), how)
-    return corners
-
-
-def fly_within(
-    before: StraightSegment, after: StraightSegment, bounds: Bounds, distance: float
-) -> Corner:
-    """Round a corner as far as the path stays within `distance` [rad] of it, or stop.
+def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Corner:
+    """Round the corner between two moves as far as the path stays within `distance` [rad] of it.
 
     The path passes between 0.9 and 1 times the distance from the corner, or nearer where even
-    the whole ramps lead it nearer or the bounds forbid to go farther.
+    the whole ramps lead it nearer or the bounds (1, n) forbid to go farther; else it stops.
     """
     best, saving = STOP, 0.0
     low, share, high = 0.0, 1.0, 1.0
+    first, second = np.arange(2)[:, None]
     for _ in range(_SEARCH if distance > 0.0 else 0):
-        corner = fly_by(before, after, bounds, share)
+        (corner,) = round_corners(moves, first, second, bounds, np.array([share]))
         if corner.join is None:
             break
-        passed = passing(corner.join, after.start).distance
+        passed = passing(corner.join, moves.start[1]).distance
         if passed <= distance:
             if corner.leave + corner.enter - corner.join.duration >= saving:
                 best = corner._replace(how="flown")
@@ -220,6 +163,74 @@ def fly_within(
     return best
 
 
+def round_corners(
+    moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
+) -> list[Corner]:
+    """Round corners between two of the moves each as far as asked and the bounds allow.
+
+    The cut takes the share of the ramp before and of the ramp after the corner, so that no part
+    of a move goes to both of its corners. It never takes longer than to stop.
+
+    Args:
+        moves: The straight moves.
+        before: Which of them lead to the corners (c,).
+        after: Which lead on (c,).
+        bounds: What each join may use (c, n).
+        fly: Share of the ramps that each is asked to take (c,).
+
+    Raises:
+        UnsupportedSolver: a corner is to be rounded, and nothing is known about the solver.
+    """
+    corners = [STOP] * len(before)
+    slowing, speeding = moves.slowing_down[before], moves.speeding_up[after]
+    asked = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
+    if len(asked) == 0:  # the solver is not even asked whether it is there
+        return corners
+
+    def cuts(rows: Rows, shares: Array) -> tuple[Array, Array]:
+        return shares * slowing[rows], shares * speeding[rows]
+
+    def solved(rows: Rows, shares: Array) -> Solutions:
+        leave, enter = cuts(rows, shares)
+        first, second = moves.take(before[rows]), moves.take(after[rows])
+        starts, ends = first.states(first.durations - leave), second.states(enter)
+        full = fly[rows] * (slowing[rows] + speeding[rows])
+        return solve_many(starts, ends, full, bounds.take(rows))
+
+    def finish(rows: Rows, shares: Array, solutions: Solutions) -> None:
+        joins = finish_many(solutions, bounds.take(rows))
+        leave, enter = (cut.tolist() for cut in cuts(rows, shares))
+        for k, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
+            join = joins[k]
+            if join is not None and join.duration <= leave[k] + enter[k]:
+                how: How = "flown" if share == fly[row] else "reduced"
+                corners[row] = Corner(leave[k], enter[k], join, share, how)
+
+    def stopped(rows: Rows) -> Mask:
+        return np.array([corners[row].join is None for row in rows.tolist()], dtype=np.bool_)
+
+    shares = np.multiply.outer(FIRST_SHARES, fly[asked]).ravel()
+    rows = np.tile(asked, len(FIRST_SHARES))
+    candidates = solved(rows, shares)
+    saving = sum(cuts(rows, shares)) - candidates.durations
+    saving = saving.reshape(len(FIRST_SHARES), -1)
+    for place in ranked(saving):
+        picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
+        picked = picked[stopped(asked[picked])]
+        if len(picked) > 0:
+            chosen = place[picked] * len(asked) + picked
+            finish(rows[chosen], shares[chosen], candidates.take(chosen))
+    for part in LAST_SHARES:
+        rows = asked[stopped(asked)]
+        if len(rows) == 0:
+            break
+        shares = fly[rows] * part
+        solutions = solved(rows, shares)
+        found = np.flatnonzero(sum(cuts(rows, shares)) >= solutions.durations)
+        finish(rows[found], shares[found], solutions.take(found))
+    return corners
+
+
 def ranked(savings: Array) -> NDArray[np.intp]:
     """Return the rows of savings (s, ...) [s] in the order in which to try corners, best first.
 
@@ -229,12 +240,6 @@ def ranked(savings: Array) -> NDArray[np.intp]:
     preferred = savings.copy()
     preferred[0] += BETTER
     return np.argsort(-preferred, axis=0, kind="stable")
-
-
-# A join may miss its end by this share of what counts as rounding between two pieces.
-_MISS = 0.1
-# Of a solution: two to brake into the limits (of no length here), seven to move.
-_PIECES = 9
 
 
 class Solutions(NamedTuple):
@@ -256,13 +261,8 @@ class Solutions(NamedTuple):
 
     def take(self, rows: Rows) -> Solutions:
         """Return some of the solutions, by index."""
-        return Solutions(
-            self.starts[rows],
-            self.ends[rows],
-            self.times[rows],
-            self.durations[rows],
-            self.found[rows],
-        )
+        fields: list[Any] = [field[rows] for field in self]
+        return Solutions(*fields)
 
 
 def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Solutions:
@@ -277,7 +277,11 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
     Raises:
         UnsupportedSolver: the solver is of a version that nothing is known about.
     """
-    require_solver()
+    if _VERSION.split(".")[:2] != SERIES.split("."):
+        raise UnsupportedSolver(
+            f"ruckig {_VERSION} is installed; corners are planned with {SERIES}.x only, whose "
+            "behaviour near its limits is known"
+        )
     n_joints = starts.shape[1]
     problem = ruckig.InputParameter(n_joints)
     problem.synchronization = ruckig.Synchronization.Time
@@ -296,18 +300,24 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
         problem.current_position, problem.current_velocity, problem.current_acceleration = here
         problem.target_position, problem.target_velocity, problem.target_acceleration = there
         problem.max_velocity, problem.max_acceleration = largest
-        answer = ruckig.Trajectory(n_joints)
+        result = ruckig.Trajectory(n_joints)
         try:
-            solver.calculate(problem, answer)
+            solver.calculate(problem, result)
         except REFUSALS:
             continue
-        durations[row], found[row] = answer.duration * time, answer
+        durations[row], found[row] = result.duration * time, result
     return Solutions(starts, ends, times, durations, found)
 
 
-def _in_units(
-    starts: Array, ends: Array, times: Array, bounds: Allowance
-) -> tuple[list[Any], list[Any], list[Any]]:
+def _askable(states: Array, bounds: Allowance) -> Mask:
+    """Return which states (c, n, 3) the solver may be shown, (c,)."""
+    slow = np.abs(states[..., 1]) < NEAREST_STATE * bounds.velocity
+    gentle = np.abs(states[..., 2]) < NEAREST_STATE * bounds.acceleration
+    askable: Mask = np.all(slow & gentle, axis=-1)
+    return askable
+
+
+def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Sequence[list[Any]]:
     """Return starts, ends (c, 3, n) and limits (c, 2, n) in the solver's units, as lists.
 
     Setting lists costs the solver's face a third of setting arrays.
@@ -319,12 +329,8 @@ def _in_units(
     here, there = starts / units, ends / units
     there[..., 0] = (ends[..., 0] - starts[..., 0]) / way
     here[..., 0] = 0.0
-    largest = np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:]
-    return (
-        here.swapaxes(1, 2).tolist(),
-        there.swapaxes(1, 2).tolist(),
-        (FULL * largest).swapaxes(1, 2).tolist(),
-    )
+    largest = FULL * (np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:])
+    return [each.swapaxes(1, 2).tolist() for each in (here, there, largest)]
 
 
 def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic | None]:
@@ -348,20 +354,12 @@ def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic 
     return joined
 
 
-def _askable(states: Array, bounds: Allowance) -> Mask:
-    """Return which states (c, n, 3) the solver may be shown, (c,)."""
-    slow = np.abs(states[..., 1]) < NEAREST_STATE * bounds.velocity
-    gentle = np.abs(states[..., 2]) < NEAREST_STATE * bounds.acceleration
-    askable: Mask = np.all(slow & gentle, axis=-1)
-    return askable
-
-
 def _tables(solutions: Solutions, bounds: Allowance) -> Block:
     """Turn solutions into cubic pieces."""
     profiles = np.array(
         [
-            [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in answer.profiles[0]]
-            for answer in solutions.found
+            [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in result.profiles[0]]
+            for result in solutions.found
         ]
     )
     lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]
@@ -403,95 +401,3 @@ def _meets(block: Block, end: Array, bounds: Allowance) -> Mask:
     rounding = _MISS * jump_rounding(bounds, block.durations)
     met: Mask = np.all(np.abs(end - block.end) <= rounding, axis=(1, 2))
     return met
-
-
-class Corners(NamedTuple):
-    """How c corners are rounded.
-
-    Attributes:
-        leave: Time cut from the end of the move before (c,) [s].
-        enter: Time cut from the beginning of the move after (c,) [s].
-        share: Share of the ramps that each takes (c,).
-        joins: What replaces them; None where the arm stops.
-    """
-
-    leave: Array
-    enter: Array
-    share: Array
-    joins: list[PiecewiseCubic | None]
-
-
-def round_corners(
-    moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
-) -> Corners:
-    """Choose the join of each corner between two of the moves, which is part of the way.
-
-    Args:
-        moves: The straight moves.
-        before: Which of them lead to the corners (c,).
-        after: Which lead on (c,).
-        bounds: What each join may use (c, n).
-        fly: Share of the ramps that each is asked to take (c,).
-    """
-    count = len(before)
-    nothing = np.zeros((3, count))
-    corners = Corners(nothing[0], nothing[1], nothing[2], [None] * count)
-    task = _Task(moves, before, after, bounds, fly)
-    flown = (moves.slowing_down[before] > 0.0) & (moves.speeding_up[after] > 0.0)
-    asked = np.flatnonzero(flown & (fly >= LEAST_SHARE))
-    if len(asked) == 0:  # the solver is not even asked whether it is there
-        return corners
-    shares = np.multiply.outer(FIRST_SHARES, fly[asked]).ravel()
-    rows = np.tile(asked, len(FIRST_SHARES))
-    candidates = task.solve(rows, shares)
-    leave, enter = task.cuts(rows, shares)
-    saving = leave + enter - candidates.durations
-    saving = saving.reshape(len(FIRST_SHARES), -1)
-    for place in ranked(saving):
-        picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
-        picked = picked[[corners.joins[row] is None for row in asked[picked].tolist()]]
-        if len(picked) > 0:
-            chosen = place[picked] * len(asked) + picked
-            task.finish(corners, rows[chosen], shares[chosen], candidates.take(chosen))
-    for share in LAST_SHARES:
-        rows = asked[[corners.joins[row] is None for row in asked.tolist()]]
-        if len(rows) == 0:
-            break
-        shares = fly[rows] * share
-        solutions = task.solve(rows, shares)
-        leave, enter = task.cuts(rows, shares)
-        found = np.flatnonzero(leave + enter >= solutions.durations)
-        task.finish(corners, rows[found], shares[found], solutions.take(found))
-    return corners
-
-
-class _Task(NamedTuple):
-    """Corners (c,) between moves, their limits (c, n), and the fly asked of each (c,)."""
-
-    moves: StraightMoves
-    before: Rows
-    after: Rows
-    bounds: Allowance
-    fly: Array
-
-    def cuts(self, rows: Rows, shares: Array) -> tuple[Array, Array]:
-        """Return the times cut before and after some corners for a share of each ramp."""
-        slowing, speeding = self.moves.slowing_down, self.moves.speeding_up
-        return shares * slowing[self.before[rows]], shares * speeding[self.after[rows]]
-
-    def solve(self, rows: Rows, shares: Array) -> Solutions:
-        """Ask the solver to join what is cut."""
-        leave, enter = self.cuts(rows, shares)
-        before, after = self.moves.take(self.before[rows]), self.moves.take(self.after[rows])
-        starts, ends = before.states(before.durations - leave), after.states(enter)
-        full = self.fly[rows] * (before.slowing_down + after.speeding_up)
-        return solve_many(starts, ends, full, self.bounds.take(rows))
-
-    def finish(self, corners: Corners, rows: Rows, shares: Array, solutions: Solutions) -> None:
-        """Enter the joins that keep their limits and are no slower than to stop."""
-        leave, enter = self.cuts(rows, shares)
-        joins = finish_many(solutions, self.bounds.take(rows))
-        for k, (row, join) in enumerate(zip(rows.tolist(), joins, strict=True)):
-            if join is not None and join.duration <= leave[k] + enter[k]:
-                corners.leave[row], corners.enter[row] = leave[k], enter[k]
-                corners.share[row], corners.joins[row] = shares[k], join

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from planner.arrays import Array, read_only
-from planner.checked_data import DAMAGED, number, numbers
+from planner.checked_data import DAMAGED, numbers, strict
 from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema
@@ -251,13 +251,13 @@ class FourierSeries:
                 offset=numbers(data["offset"], 1),
                 amplitude=numbers(data["amplitude"], 2),
                 frequency=numbers(data["frequency"], 2),
-                length=number(data["length"]),
-                ramp=number(data["ramp"]),
+                length=strict(float, data["length"]),
+                ramp=strict(float, data["ramp"]),
             )
         except InvalidTrajectory:
             raise
         except DAMAGED as error:
-            raise InvalidTrajectory(f"not a series of sines: {error!r}") from error
+            raise InvalidTrajectory(f"not a series of sines: {error!r:.200}") from error
 
     def _of(self, joint: int) -> FourierSeries:
         only = slice(joint, joint + 1)

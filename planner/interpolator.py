@@ -5,27 +5,31 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from enum import IntEnum
+from functools import wraps
+from math import inf, nan
+from numbers import Integral, Real
+from typing import Any, Concatenate, Final, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
-from planner.commands import (
-    STOP,
+from planner.corners import STOP, Corner
+from planner.errors import InvalidSetting, PlannerError
+from planner.limits import JointLimits, position_rounding
+from planner.moves import (
     Fly,
     FlyDistance,
     FlyPercent,
+    Legs,
     Move,
     Overrides,
-    Termination,
+    Stop,
+    legs_through,
+    passage,
 )
-from planner.corners import STOP as NO_CORNER
-from planner.corners import Corner
-from planner.errors import InvalidSetting, PlannerError
-from planner.limits import JointLimits
-from planner.moves import Leg, assembled, between, check, corner, leg, passage
 from planner.piecewise_cubic import PiecewiseCubic
 from planner.player import PathReader
 from planner.rrs import (
@@ -39,13 +43,26 @@ from planner.rrs import (
     SpeedCorrection,
     Status,
     Step,
-    member,
-    real,
-    reals,
-    whole,
 )
 from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 from planner.worker import in_child, in_child_now
+
+# A motion time [s], and a share of a period, shorter than this is rounding.
+_ROUNDING: Final = 1e-9
+# No joint space is wider than this [rad].
+_WIDEST: Final = 1e9
+# COMAU's default is 100 %; its distance of 5 mm says nothing of joints, so here it is 5 mrad.
+_FLYBY = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: 5e-3}
+
+
+def corner(legs: Legs, fly: Fly) -> Corner:
+    """Plan how the target of the first of two legs is passed on the way to that of the second."""
+    first, second = np.arange(2)[:, None]
+    return legs.corners(first, second, [fly])[0]
+
+
+def _isolated_corner(legs: Legs, fly: Fly) -> Corner:
+    return in_child_now(corner, legs, fly)  # the arm may move
 
 
 class _Stretch(NamedTuple):
@@ -56,59 +73,7 @@ class _Stretch(NamedTuple):
     path: PathReader
 
 
-class Timeline:
-    """Parts of a motion in a row, of which the last may still be cut short.
-
-    Args:
-        position: Where the motion begins (n,) [rad]; the arm rests there until a part is added.
-    """
-
-    def __init__(self, position: Array) -> None:
-        self._stretches: list[_Stretch] = []
-        self._reading = 0
-        self._rest = read_only(position)
-
-    @property
-    def end(self) -> float:
-        """Motion time at which the last part ends [s]."""
-        return self._stretches[-1].end if self._stretches else 0.0
-
-    def append(self, part: PiecewiseCubic, rest: Array) -> None:
-        """Add a part at the end; `rest` (n,) [rad] is where the arm then comes to rest."""
-        if part.duration > 0.0:
-            begin = self.end
-            self._stretches.append(_Stretch(begin, begin + part.duration, PathReader(part)))
-        self._rest = read_only(rest)
-
-    def cut(self, time: float) -> None:
-        """End the last part at a motion time [s] within it that was not read past yet.
-
-        The arm does not rest there; whatever is appended next goes on from its state.
-        """
-        last = self._stretches[-1]
-        self._stretches[-1] = last._replace(end=time)
-
-    def forget_read(self) -> None:
-        """Drop the parts before the one read last."""
-        del self._stretches[: self._reading]
-        self._reading = 0
-
-    def position(self, time: float) -> Array:
-        """Return the position (n,) [rad] at a motion time [s], not before the one read last."""
-        stretches = self._stretches
-        if not stretches or time >= stretches[-1].end:
-            return self._rest
-        while time >= stretches[self._reading].end:
-            self._reading += 1
-        begin, _, path = stretches[self._reading]
-        return path.read(time - begin)[0]
-
-
-CornerPlanner = Callable[[Leg, Leg, Fly], Corner]
-"""What plans a corner, `planner.moves.corner` or the same in another process."""
-
-
-class Passage(NamedTuple):
+class _Passage(NamedTuple):
     """A target that is still ahead, and the motion time at which it is passed or reached [s]."""
 
     target_id: int
@@ -126,36 +91,45 @@ class MotionQueue:
     Args:
         start: Where the arm is at rest (n,) [rad].
         limits: Limits that the motion keeps.
-        corner: What plans a corner.
+        corner: What plans a corner, `corner` or the same in another process.
 
     Attributes:
         ahead: Targets not passed yet, the next one first.
     """
 
-    def __init__(self, start: Array, limits: JointLimits, corner: CornerPlanner) -> None:
-        self._limits = limits
-        self._corner = corner
-        self._timeline = Timeline(start)
+    def __init__(
+        self, start: Array, limits: JointLimits, corner: Callable[[Legs, Fly], Corner]
+    ) -> None:
+        self._limits, self._corner = limits, corner
+        self._stretches: list[_Stretch] = []
+        self._reading = 0
         self._point = start
-        self._last: tuple[Leg, Move] | None = None
-        self.ahead: deque[Passage] = deque()
+        self._last: tuple[Legs, Fly] | None = None
+        self.ahead: deque[_Passage] = deque()
 
     @property
     def end(self) -> float:
         """Motion time at which the arm rests at the last target [s]."""
-        return self._timeline.end
+        return self._stretches[-1].end if self._stretches else 0.0
 
     def position(self, time: float) -> Array:
         """Return the position (n,) [rad] at a motion time [s], not before the one read last."""
-        return self._timeline.position(time)
+        stretches = self._stretches
+        if not stretches or time >= stretches[-1].end:
+            return self._point
+        while time >= stretches[self._reading].end:
+            self._reading += 1
+        begin, _, path = stretches[self._reading]
+        return path.read(time - begin)[0]
 
-    def leg_to(self, move: Move, overrides: Overrides) -> Leg:
+    def leg_to(self, move: Move, overrides: Overrides) -> Legs:
         """Return the leg to a further target, as it would be from rest to rest.
 
         Raises:
             InvalidSetting: the move does not fit the arm.
         """
-        return leg(self._point, move, self._limits, overrides)
+        points = np.stack((self._point, move.target))
+        return legs_through(points, [move], self._limits, overrides)
 
     def append(self, target_id: int, move: Move, overrides: Overrides, now: float) -> None:
         """Go on to a further target; `now` is the motion time [s] read last.
@@ -163,54 +137,34 @@ class MotionQueue:
         Raises:
             PlannerError: no motion to it was found; what was planned before stays.
         """
-        new = self.leg_to(move, overrides)
-        turn = self._turn(new, now)
-        self._timeline.forget_read()
-        if turn.join is not None:
-            self._round(turn, turn.join)
-        self._timeline.append(between(new.segment, turn, NO_CORNER), move.target)
-        self._point, self._last = move.target, (new, move)
-        self.ahead.append(Passage(target_id, self.end))
-
-    def _turn(self, new: Leg, now: float) -> Corner:
-        """Return the corner between the last leg and a new one, a stop if it comes too late.
-
-        Raises:
-            PlanningError: what was planned breaks a limit or jumps.
-        """
-        turn, legs = NO_CORNER, [new]
+        new = legs = self.leg_to(move, overrides)
+        turn, turns = STOP, list[Corner]()
         if self._last is not None:
-            before, move = self._last
-            turn = self._corner(before, new, move.fly)
-            if turn.join is None or self.end - turn.leave < now:
-                turn = NO_CORNER
-            else:
-                legs = [before, new]
+            both = self._last[0].followed_by(new)
+            found = self._corner(both, self._last[1])
+            if found.join is not None and self.end - found.leave >= now:
+                turn, turns, legs = found, [found], both
         # From rest to rest: what is new, and of what was there the leg that it joins.
-        check(assembled(legs, [turn][: len(legs) - 1]), legs)
-        return turn
+        legs.motions(turns, 1)
+        del self._stretches[: self._reading]
+        self._reading = 0
+        if turn.join is not None:
+            begin = self.end - turn.leave
+            passed = passage(0, self._point, turn, begin)
+            # The last part ends where the corner begins, which was not read past yet.
+            self._stretches[-1] = self._stretches[-1]._replace(end=begin)
+            self._extend(turn.join)
+            self.ahead[-1] = self.ahead[-1]._replace(time=passed.time)
+        enter = np.array([turn.enter])
+        (part,) = new.moves.tables(enter, np.maximum(enter, new.moves.durations))
+        self._extend(part)
+        self._point, self._last = move.target, (new, move.fly)
+        self.ahead.append(_Passage(target_id, self.end))
 
-    def _round(self, turn: Corner, join: PiecewiseCubic) -> None:
-        """Replace the stop at the present end by a corner."""
-        begin = self.end - turn.leave
-        passed = passage(0, self._point, turn, begin)
-        self._timeline.cut(begin)
-        self._timeline.append(join, self._point)
-        self.ahead[-1] = self.ahead[-1]._replace(time=passed.time)
-
-
-# The joint kinds differ from the others only for Cartesian motion.
-_TERMINATIONS: dict[PointAccuracy, Termination] = {
-    PointAccuracy.FINE: "fine",
-    PointAccuracy.COARSE: "coarse",
-    PointAccuracy.NOSETTLE: "nosettle",
-    PointAccuracy.JNT_FINE: "fine",
-    PointAccuracy.JNT_COARSE: "coarse",
-}
-# No joint space is wider than this [rad].
-_WIDEST = 1e9
-# COMAU's default is 100 %; its distance of 5 mm says nothing of joints, so here it is 5 mrad.
-_FLYBY = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: 5e-3}
+    def _extend(self, part: PiecewiseCubic) -> None:
+        if part.duration > 0.0:
+            stretch = _Stretch(self.end, self.end + part.duration, PathReader(part))
+            self._stretches.append(stretch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +172,11 @@ class MoveSettings:
     """What holds for every target until it is set again; shares in (0, 1].
 
     Attributes:
-        speed: Share of each joint's velocity limit (n,).
-        acceleration: Share of each joint's acceleration limit (n,).
-        jerk: Share of each joint's jerk limit (n,).
+        speed, acceleration, jerk: Shares of each joint's limits (n,).
         flying: Whether via points are flown by.
         criterion: What rules the size of a corner.
         flyby: Its value by each criterion: a percentage, a distance [rad].
-        accuracy: Termination kind.
+        accuracy: Termination kind; those of joints differ from the others for Cartesian motion.
         overrides: Of the program, own quantity only.
         motion_time: What the next move has to take [s]; 0 for as short as possible.
         advance: How many targets should be known beyond the one that the arm moves to.
@@ -241,182 +193,53 @@ class MoveSettings:
     motion_time: float = 0.0
     advance: int = 1
 
-    @classmethod
-    def default(cls, n_joints: int) -> MoveSettings:
-        """Return what holds after initialisation: full rates, no fly-by."""
-        full = read_only(np.ones(n_joints))
-        return cls(full, full, full)
-
-    def move_to(self, target: Array) -> Move:
+    def move_to(self, target: Array, speed: float = 1.0) -> Move:
         """Return a move to a target (n,) [rad] as set; `motion_time` is not in it."""
+        value = self.flyby[self.criterion]
+        percent = self.criterion is FlybyCriterion.PERCENT
+        fly = FlyPercent(value) if percent else FlyDistance(value)
         return Move(
             target,
+            speed=speed,
             joint_speed=self.speed,
             joint_acceleration=self.acceleration,
-            fly=self._fly(),
-            termination=_TERMINATIONS[self.accuracy],
+            fly=fly if self.flying and value > 0.0 else Stop(),
+            termination=self.accuracy.name.lower().removeprefix("jnt_"),  # type: ignore[arg-type]
             joint_jerk=self.jerk,
         )
 
-    def _fly(self) -> Fly:
-        value = self.flyby[self.criterion]
-        if not self.flying or value == 0.0:
-            return STOP
-        return FlyPercent(value) if self.criterion is FlybyCriterion.PERCENT else FlyDistance(value)
+
+class _RefusedError(Exception):
+    def __init__(self, reason: str, status: Status = Status.INCONSISTENT) -> None:
+        self.status = status
+        super().__init__(reason)
 
 
-class MoveServices:
-    """RRS-1 services that describe moves. Each returns a `Status`; a refusal changes nothing.
+P = ParamSpec("P")
+E = TypeVar("E", bound=IntEnum)
 
-    Attributes:
-        refusal: Why the last refused service was refused, in words.
-    """
 
-    def __init__(self, limits: JointLimits) -> None:
-        self._limits = limits
-        self._settings = MoveSettings.default(limits.n_joints)
-        self._initialized = False
-        self.refusal = ""
+def _service(
+    method: Callable[Concatenate[Interpolator, P], Status | None],
+) -> Callable[Concatenate[Interpolator, P], Status]:
+    """Make a service of what raises where it refuses, before it has changed anything."""
 
-    def select_motion_type(self, motion_type: int) -> Status:
-        """Select how the arm gets to targets: `MotionType.JOINT`, nothing else is offered."""
-        if member(MotionType, motion_type) is not MotionType.JOINT:
-            return self._refuse(Status.INCONSISTENT, f"motion type {motion_type} is not JOINT (1)")
-        return self._set()
-
-    def set_advance_motion(self, count: int) -> Status:
-        """Set how many targets beyond the present one are asked for (NEED_MORE_DATA), from 0."""
-        targets = whole(count)
-        if targets is None or targets < 0:
-            return self._refuse(Status.INCONSISTENT, f"advance of {count} targets")
-        return self._set(advance=targets)
-
-    def set_joint_speeds(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> Status:
-        """Set the share of the velocity limit, in (0, 100] %, of all or of some joints."""
-        return self._set_shares("speed", percent, joints)
-
-    def set_joint_accelerations(
-        self, percent: ArrayLike, joints: Sequence[int] | None = None
-    ) -> Status:
-        """Set the share of the acceleration limit, in (0, 100] %, of all or of some joints."""
-        return self._set_shares("acceleration", percent, joints)
-
-    def set_joint_jerks(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> Status:
-        """Set the share of the jerk limit, in (0, 100] %, of all or of some joints."""
-        return self._set_shares("jerk", percent, joints)
-
-    def set_override_acceleration(
-        self, percent: float, kind: AccelerationKind = AccelerationKind.BOTH
-    ) -> Status:
-        """Scale the ramps of targets set from now on (PROG_ACC_OVR, PROG_DEC_OVR), (0, 100] %.
-
-        Nothing but the ramps is scaled, so the path at fly-by corners can change.
-        """
-        share, overrides = real(percent) / 100.0, self._settings.overrides
-        scaled = member(AccelerationKind, kind)
-        if not 0.0 < share <= 1.0 or scaled is None:
-            reason = f"acceleration override of {percent} %, kind {kind}"
-            return self._refuse(Status.INCONSISTENT, reason)
-        if scaled is not AccelerationKind.DECELERATION:
-            overrides = replace(overrides, acceleration=share)
-        if scaled is not AccelerationKind.ACCELERATION:
-            overrides = replace(overrides, deceleration=share)
-        return self._set(overrides=overrides)
-
-    def select_flyby_mode(self, on: bool) -> Status:
-        """Select whether the arm flies by the targets set from now on or stops there."""
-        if not isinstance(on, bool | np.bool_) and whole(on) not in (0, 1):
-            return self._refuse(Status.INCONSISTENT, f"fly-by {on!r} is neither on nor off")
-        return self._set(flying=bool(on))
-
-    def select_flyby_criteria(self, criterion: int) -> Status:
-        """Select what rules the size of a corner, a `FlybyCriterion`."""
-        selected = member(FlybyCriterion, criterion)
-        if selected is None:
-            return self._refuse(Status.INCONSISTENT, f"there is no fly-by criterion {criterion}")
-        return self._set(criterion=selected)
-
-    def set_flyby_criteria_parameter(self, criterion: int, value: float) -> Status:
-        """Set the size of a corner: FLY_PER in 0..100 %, or the distance from the via point.
-
-        The distance is the Euclidean one in joint space [rad], and is not exceeded.
-        """
-        most = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: _WIDEST}
-        named, size = member(FlybyCriterion, criterion), real(value)
-        if named is None or not 0.0 <= size <= most[named]:
-            return self._refuse(Status.INCONSISTENT, f"fly-by criterion {criterion} of {value}")
-        return self._set(flyby={**self._settings.flyby, named: size})
-
-    def cancel_flyby_criteria(self, criterion: int) -> Status:
-        """Forget the value of a criterion; if it is selected, the percentage is from now on."""
-        cancelled = member(FlybyCriterion, criterion)
-        if cancelled is None:
-            return self._refuse(Status.INCONSISTENT, f"there is no fly-by criterion {criterion}")
-        previous = self._settings.criterion
-        return self._set(
-            flyby={**self._settings.flyby, cancelled: _FLYBY[cancelled]},
-            criterion=FlybyCriterion.PERCENT if previous is cancelled else previous,
-        )
-
-    def select_point_accuracy(self, accuracy: int) -> Status:
-        """Select the termination kind of the targets set from now on, a `PointAccuracy`.
-
-        Set-points are exact whatever it is; it says what a servo has to do behind them.
-        """
-        selected = member(PointAccuracy, accuracy)
-        if selected is None:
-            return self._refuse(Status.INCONSISTENT, f"there is no point accuracy {accuracy}")
-        return self._set(accuracy=selected)
-
-    def set_point_accuracy_parameter(self, criterion: int, value: float) -> Status:
-        """Set the size of a corner and select its criterion in one, as COMAU maps this service."""
-        status = self.set_flyby_criteria_parameter(criterion, value)
-        return status if status < 0 else self.select_flyby_criteria(criterion)
-
-    def set_motion_time(self, seconds: float) -> Status:
-        """Set what the move to the next target takes from rest to rest [s]; 0 takes that back.
-
-        Its speed is lowered accordingly; `set_next_target` answers TIME_TOO_SHORT where the time
-        is too short. Flying by either end of the move shortens it.
-        """
-        if not 0.0 <= real(seconds) < np.inf:
-            return self._refuse(Status.INCONSISTENT, f"motion time of {seconds} s")
-        return self._set(motion_time=real(seconds))
-
-    def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> Status:
-        shares = np.array(getattr(self._settings, name))
+    @wraps(method)
+    def service(self: Interpolator, /, *args: P.args, **kwargs: P.kwargs) -> Status:
         try:
-            named = range(len(shares)) if joints is None else list(joints)
-            chosen = [joint for joint in map(whole, named) if joint is not None]
-            if len(chosen) < len(named) or not all(0 <= joint < len(shares) for joint in chosen):
-                raise ValueError(f"joints {joints!r} are not of the arm's 0 to {len(shares) - 1}")
-            each = reals(percent)
-            if each.shape not in ((), (len(chosen),)):
-                raise ValueError(f"{each.shape} values for {len(chosen)} joints")
-            shares[chosen] = each / 100.0
-        except (TypeError, ValueError) as error:
-            return self._refuse(Status.INCONSISTENT, f"joint {name}: {error}")
-        if not np.all((shares > 0.0) & (shares <= 1.0)):
-            return self._refuse(Status.INCONSISTENT, f"joint {name} of {percent!r} %")
-        return self._set(**{name: read_only(shares)})
-
-    def _set(self, **changes: object) -> Status:
-        if not self._initialized:
-            return self._refuse(Status.INCONSISTENT, "the interpolator is not initialized")
-        self._settings = replace(self._settings, **changes)  # type: ignore[arg-type]
-        return Status.OK
-
-    def _refuse(self, status: Status, reason: str) -> Status:
-        self.refusal = reason
+            self._require(self._initialized, "the interpolator is not initialized")
+            return method(self, *args, **kwargs) or Status.OK
+        except _RefusedError as refused:
+            status, self.refusal = refused.status, str(refused)
+        except PlannerError as error:
+            wrong = isinstance(error, InvalidSetting)
+            status, self.refusal = Status.INCONSISTENT if wrong else Status.FATAL, str(error)
         return status
 
-
-# A motion time [s], and a share of a period, shorter than this is rounding.
-_MOTION_TIME_ROUNDING = 1e-9
-_LAST_PERIOD = 1e-9
+    return service
 
 
-class Interpolator(MoveServices):
+class Interpolator:
     """Plan and interpolate joint moves while they run, by the services of RRS-1.
 
     Targets are planned as they are set, never in a step: `set_next_target` may be called before
@@ -427,8 +250,7 @@ class Interpolator(MoveServices):
     bit.
 
     Every service returns a `Status` (but `get_next_step`, which returns a `Step`, and
-    `get_current_target_id`); `refusal` says in words why one was refused, and a refused service
-    changed nothing. The order of calls is
+    `get_current_target_id`); a refused service changed nothing. The order of calls is
 
         initialize, set_initial_position, {set_next_target | get_next_step}..., terminate
 
@@ -444,6 +266,9 @@ class Interpolator(MoveServices):
         isolated: Plan corners in a child process, whose crash is a FATAL status here and no more;
             False saves half a millisecond per corner.
 
+    Attributes:
+        refusal: Why the last refused service was refused, in words.
+
     Raises:
         InvalidSetting: a period or a bound outside its range.
     """
@@ -457,20 +282,22 @@ class Interpolator(MoveServices):
         stop_bounds: tuple[float, float] = (2.0, 3.0),
         isolated: bool = True,
     ) -> None:
-        super().__init__(limits)
-        if not 0.0 < period < np.inf:
+        if not 0.0 < period < inf:
             raise InvalidSetting("period", period, "a time above 0 s")
         if not (min(override_bounds) > 1.0 and np.all(np.less_equal(override_bounds, stop_bounds))):
             raise InvalidSetting("override_bounds", override_bounds, f"in (1, {stop_bounds}]")
-        self._law = TimeLaw(period)
-        self._elapsed = 0.0
+        self.refusal = ""
+        self._limits = limits
         self._isolated = isolated
-        self._corner: CornerPlanner = _isolated_corner if isolated else corner
-        self._period = self._first_period = period
+        self._initialized = False
+        self._elapsed = 0.0
+        self._law = TimeLaw(period)
+        self._corner = _isolated_corner if isolated else corner
+        self._first_period = period
         self._stopping: RateBounds = slowing_bounds(limits, *stop_bounds)
         self._overriding = within(slowing_bounds(limits, *override_bounds), self._stopping)
         # A joint closer than rounding to an end of its range stands on it.
-        rounding = 1e-12 * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
+        rounding = position_rounding(limits)
         self._inside = (limits.lower + rounding, limits.upper - rounding)
         self._forget()
 
@@ -483,62 +310,154 @@ class Interpolator(MoveServices):
         mid-motion. `stop_motion` or `cancel_motion` bring it to rest first. FATAL if the process
         that plans corners does not start.
         """
-        if self._moving:
-            return self._refuse(Status.INCONSISTENT, "the arm moves")
+        before, self._initialized = self._initialized, True
+        status = self.reset()
+        if status < 0:
+            self._initialized = before
+        return status
+
+    @_service
+    def reset(self) -> None:
+        """Set everything back as `initialize` does; refused while the arm moves."""
+        self._require_rest()
         if self._isolated:
             try:
                 in_child(float)  # to start it takes a third of a second, which no motion has
             except PlannerError as error:
-                return self._refuse(Status.FATAL, str(error))
+                raise _RefusedError(str(error), Status.FATAL) from error
         self._forget()
         self._initialized = True
-        return Status.OK
 
-    def reset(self) -> Status:
-        """Set everything back as `initialize` does; refused while the arm moves."""
-        if self._moving:
-            return self._refuse(Status.INCONSISTENT, "the arm moves")
-        return self.initialize() if self._initialized else self._set()
+    @_service
+    def terminate(self) -> None:
+        """End; only `initialize` is accepted from then on. Refused while the arm moves."""
+        self._require_rest()
+        self._forget()
 
-    def terminate(self) -> Status:
-        """End; only `initialize` is answered from then on. Refused while the arm moves."""
-        if self._moving:
-            return self._refuse(Status.INCONSISTENT, "the arm moves")
-        status = self._set()
-        if status >= 0:
-            self._forget()
-        return status
-
-    def set_initial_position(self, position: ArrayLike) -> Status:
-        """Tell where the arm is at rest (n,) [rad]; refused while targets are queued."""
-        status = self._set()
-        if status < 0:
-            return status
-        if self._queue is not None and self._queue.ahead:
-            return self._refuse(Status.INCONSISTENT, "targets are queued; cancel the motion first")
+    @_service
+    def set_initial_position(self, position: ArrayLike) -> None:
+        """Set where the arm is at rest (n,) [rad]; refused while targets are queued."""
+        queued = self._queue is not None and self._queue.ahead
+        self._require(not queued, "targets are queued; cancel the motion first")
         point = self._position_of(position)
-        if point is None:
-            return Status.INCONSISTENT
         self._held = False
         self._rest_at(point)
-        return Status.OK
 
-    def set_interpolation_time(self, period: float) -> Status:
+    @_service
+    def set_interpolation_time(self, period: float) -> None:
         """Set the time from step to step [s]; refused while the arm moves."""
-        if self._moving:
-            return self._refuse(Status.INCONSISTENT, "the arm moves")
-        if not 0.0 < real(period) < np.inf:
-            return self._refuse(Status.INCONSISTENT, f"interpolation time of {period} s")
-        status = self._set()
-        if status >= 0:
-            self._period = real(period)
-            rate, time = self._law.rate, self._law.motion_time
-            self._law = TimeLaw(self._period)
-            self._law.restart(time, rate)
-        return status
+        self._require_rest()
+        seconds = _real(period)
+        self._require(0.0 < seconds < inf, f"interpolation time of {period} s")
+        self._period = seconds
+        time, rate = self._law.motion_time, self._law.rate
+        self._law = TimeLaw(seconds)
+        self._law.restart(time, rate)
+
+    # -- settings --------------------------------------------------------------------------
+
+    @_service
+    def select_motion_type(self, motion_type: int) -> None:
+        """Select how the arm gets to targets: `MotionType.JOINT`, nothing else is offered."""
+        joint = _member(MotionType, motion_type) is MotionType.JOINT
+        self._require(joint, f"motion type {motion_type} is not JOINT (1)")
+
+    @_service
+    def set_advance_motion(self, count: int) -> None:
+        """Set how many targets beyond the present one are asked for (NEED_MORE_DATA), from 0."""
+        targets = _whole(count)
+        self._require(targets is not None and targets >= 0, f"advance of {count} targets")
+        self._set(advance=targets)
+
+    @_service
+    def set_joint_speeds(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> None:
+        """Set the share of the velocity limit, in (0, 100] %, of all or of some joints."""
+        self._set_shares("speed", percent, joints)
+
+    @_service
+    def set_joint_accelerations(
+        self, percent: ArrayLike, joints: Sequence[int] | None = None
+    ) -> None:
+        """Set the share of the acceleration limit, in (0, 100] %, of all or of some joints."""
+        self._set_shares("acceleration", percent, joints)
+
+    @_service
+    def set_joint_jerks(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> None:
+        """Set the share of the jerk limit, in (0, 100] %, of all or of some joints."""
+        self._set_shares("jerk", percent, joints)
+
+    @_service
+    def set_override_acceleration(
+        self, percent: float, kind: AccelerationKind = AccelerationKind.BOTH
+    ) -> None:
+        """Scale the ramps of targets set from now on (PROG_ACC_OVR, PROG_DEC_OVR), (0, 100] %.
+
+        Nothing but the ramps is scaled, so the path at fly-by corners can change.
+        """
+        share, overrides = _real(percent) / 100.0, self._settings.overrides
+        scaled = _member(AccelerationKind, kind)
+        self._require(0.0 < share <= 1.0, f"acceleration override of {percent} %")
+        if scaled is not AccelerationKind.DECELERATION:
+            overrides = replace(overrides, acceleration=share)
+        if scaled is not AccelerationKind.ACCELERATION:
+            overrides = replace(overrides, deceleration=share)
+        self._set(overrides=overrides)
+
+    @_service
+    def select_flyby_mode(self, on: bool) -> None:
+        """Select whether the arm flies by the targets set from now on or stops there."""
+        known = isinstance(on, bool | np.bool_) or _whole(on) in (0, 1)
+        self._require(known, f"fly-by {on!r} is neither on nor off")
+        self._set(flying=bool(on))
+
+    @_service
+    def select_flyby_criteria(self, criterion: int) -> None:
+        """Select what rules the size of a corner, a `FlybyCriterion`."""
+        self._set(criterion=_member(FlybyCriterion, criterion))
+
+    @_service
+    def set_flyby_criteria_parameter(self, criterion: int, value: float) -> None:
+        """Set the size of a corner: FLY_PER in 0..100 %, or the distance from the via point.
+
+        The distance is the Euclidean one in joint space [rad], and is not exceeded.
+        """
+        self._set_flyby(_member(FlybyCriterion, criterion), value)
+
+    @_service
+    def set_point_accuracy_parameter(self, criterion: int, value: float) -> None:
+        """Set the size of a corner and select its criterion in one, as COMAU maps this service."""
+        named = _member(FlybyCriterion, criterion)
+        self._set_flyby(named, value)
+        self._set(criterion=named)
+
+    @_service
+    def cancel_flyby_criteria(self, criterion: int) -> None:
+        """Forget the value of a criterion; if it is selected, the percentage is from now on."""
+        cancelled, selected = _member(FlybyCriterion, criterion), self._settings.criterion
+        self._set_flyby(cancelled, _FLYBY[cancelled])
+        self._set(criterion=FlybyCriterion.PERCENT if selected is cancelled else selected)
+
+    @_service
+    def select_point_accuracy(self, accuracy: int) -> None:
+        """Select the termination kind of the targets set from now on, a `PointAccuracy`.
+
+        Set-points are exact whatever it is; it says what a servo has to do behind them.
+        """
+        self._set(accuracy=_member(PointAccuracy, accuracy))
+
+    @_service
+    def set_motion_time(self, seconds: float) -> None:
+        """Set what the move to the next target takes from rest to rest [s]; 0 takes that back.
+
+        Its speed is lowered accordingly; `set_next_target` returns TIME_TOO_SHORT where the time
+        is too short. Flying by either end of the move shortens it.
+        """
+        self._require(0.0 <= _real(seconds) < inf, f"motion time of {seconds} s")
+        self._set(motion_time=_real(seconds))
 
     # -- targets ---------------------------------------------------------------------------
 
+    @_service
     def set_next_target(self, target_id: int, position: ArrayLike) -> Status:
         """Queue a target (n,) [rad], to be reached as the settings say now.
 
@@ -546,30 +465,16 @@ class Interpolator(MoveServices):
         asks for. Refusals: INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where
         no motion was found; the motion to the targets before goes on and stops at the last.
         """
-        if self._queue is None:
-            return self._refuse(Status.INCONSISTENT, "no initial position is set")
-        if self._cancelling:
-            return self._refuse(Status.INCONSISTENT, "the cancelled motion still comes to rest")
-        number, point = whole(target_id), self._position_of(position)
+        queue, number = self._queue, _whole(target_id)
+        if queue is None:
+            raise _RefusedError("no initial position is set")
+        self._require(not self._cancelling, "the cancelled motion still comes to rest")
         if number is None:
-            return self._refuse(Status.INCONSISTENT, f"target id {target_id!r} is no whole number")
-        if point is None:
-            return Status.INCONSISTENT
-        settings = self._settings
-        try:
-            move = _timed(self._queue, settings, point)
-            if move is None:
-                return self._refuse(
-                    Status.TIME_TOO_SHORT,
-                    f"the move takes longer than its motion time of {settings.motion_time} s",
-                )
-            self._queue.append(number, move, settings.overrides, self._law.motion_time)
-        except InvalidSetting as error:
-            return self._refuse(Status.INCONSISTENT, str(error))
-        except PlannerError as error:
-            return self._refuse(Status.FATAL, str(error))
-        self._settings = replace(settings, motion_time=0.0)
-        return self._wanted()
+            raise _RefusedError(f"target id {target_id!r} is no whole number")
+        move = _timed(queue, self._settings, self._position_of(position))
+        queue.append(number, move, self._settings.overrides, self._law.motion_time)
+        self._set(motion_time=0.0)
+        return self._wanted(queue)
 
     def get_current_target_id(self) -> int | None:
         """Return the identifier of the target that the arm moves to; None where there is none."""
@@ -587,19 +492,20 @@ class Interpolator(MoveServices):
         OUTPUT_FORMAT for any format but joint positions.
         """
         queue, law = self._queue, self._law
-        if member(OutputFormat, output_format) is not OutputFormat.JOINT:
+        if _whole(output_format) != OutputFormat.JOINT:
             return self._no_step(Status.OUTPUT_FORMAT, "only joint positions are offered")
         if queue is None:
             return self._no_step(Status.INCONSISTENT, "no initial position is set")
-        if not queue.ahead:
-            return self._no_step(Status.NO_TARGET, Status.NO_TARGET.meaning)
+        ahead = queue.ahead
+        if not ahead:
+            return self._no_step(Status.NO_TARGET, "no target is set; the arm stands")
         braking = self._held or self._cancelling
         if braking and law.settled:
             return self._stand(())
         before = law.motion_time
         law.advance()
-        now, ahead = law.motion_time, queue.ahead
-        if now >= queue.end - _LAST_PERIOD * self._period:
+        now = law.motion_time
+        if now >= queue.end - _ROUNDING * self._period:
             return self._finish(queue, before, now)
         self._position = queue.position(now)
         self._position.setflags(write=False)
@@ -609,63 +515,58 @@ class Interpolator(MoveServices):
             events += (Event(EventKind.VIA_POINT_PASSED, ahead.popleft().target_id),)
         if braking and law.settled:
             return self._stand(events)
-        return self._step(self._wanted(), events)
+        return self._step(self._wanted(queue), events)
 
+    @_service
     def set_override_speed(
         self, percent: float, correction: SpeedCorrection = SpeedCorrection.GENERAL
-    ) -> Status:
+    ) -> None:
         """Set GEN_OVR, in 0..100 %, at once and on the path; or PROG_SPD_OVR, in (0, 100] %."""
-        which, share = member(SpeedCorrection, correction), real(percent) / 100.0
-        general = which is SpeedCorrection.GENERAL
-        if which is None or not (0.0 if general else np.nextafter(0.0, 1.0)) <= share <= 1.0:
-            reason = f"speed override of {percent} %, correction {correction}"
-            return self._refuse(Status.INCONSISTENT, reason)
-        if not general:
-            return self._set(overrides=replace(self._settings.overrides, speed=share))
-        status = self._set()
-        if status >= 0:
+        general = _member(SpeedCorrection, correction) is SpeedCorrection.GENERAL
+        share = _real(percent) / 100.0
+        valid = 0.0 <= share <= 1.0 and (general or share > 0.0)
+        self._require(valid, f"speed override of {percent} %")
+        if general:
             self._override = share
             self._run(self._overriding)
-        return status
+        else:
+            self._set(overrides=replace(self._settings.overrides, speed=share))
 
-    def stop_motion(self) -> Status:
+    @_service
+    def stop_motion(self) -> None:
         """Come to rest on the path, and stay, with unchanged targets, until asked otherwise."""
-        status = self._set()
-        if status >= 0 and not self._held:
+        if not self._held:
             self._held = True
-            self._stop_reported = self._queue is None or not self._queue.ahead
+            self._stop_reported = self.get_current_target_id() is None
             self._run(self._stopping)
-        return status
 
-    def continue_motion(self) -> Status:
+    @_service
+    def continue_motion(self) -> None:
         """Go on along the path after `stop_motion`, also while the arm still comes to rest."""
-        status = self._set()
-        if status >= 0 and self._held:
+        if self._held:
             self._held = False
             self._run(self._stopping)
-        return status
 
-    def cancel_motion(self) -> Status:
+    @_service
+    def cancel_motion(self) -> None:
         """Come to rest on the path and drop all targets; the arm waits for a new one there."""
-        status = self._set()
-        if status < 0:
-            return status
-        if self._queue is None or not self._queue.ahead:
+        if self.get_current_target_id() is None:
             self._held = False
         elif self._moving:
             self._cancelling, self._stop_reported = True, False
             self._run(self._stopping)
         else:
             self._drop()
-        return status
 
     # -- within ----------------------------------------------------------------------------
 
     def _forget(self) -> None:
-        self._settings = MoveSettings.default(self._limits.n_joints)
+        n = self._limits.n_joints
+        full = read_only(np.ones(n))
+        self._settings = MoveSettings(full, full, full)
         self._initialized = False
         self._queue: MotionQueue | None = None
-        self._position = read_only(np.full(self._limits.n_joints, np.nan))
+        self._position = read_only(np.full(n, nan))
         self._period = self._first_period
         self._law = TimeLaw(self._period)
         self._override = 1.0
@@ -689,7 +590,7 @@ class Interpolator(MoveServices):
     def _moving(self) -> bool:
         law = self._law
         at_rest = law.motion_time == 0.0 or (law.settled and law.rate == 0.0)
-        return self._queue is not None and bool(self._queue.ahead) and not at_rest
+        return self.get_current_target_id() is not None and not at_rest
 
     def _run(self, bounds: RateBounds) -> None:
         """Bring motion time to the rate it should have, within bounds if they suffice."""
@@ -701,9 +602,47 @@ class Interpolator(MoveServices):
             admitted = admits(bounds, law.rate, law.slope)
             law.aim(rate, bounds if admitted else self._stopping)
 
-    def _wanted(self) -> Status:
-        known = len(self._queue.ahead) if self._queue is not None else 0
-        return Status.NEED_MORE_DATA if known <= self._settings.advance else Status.OK
+    def _require(self, condition: bool, reason: str) -> None:
+        if not condition:
+            raise _RefusedError(reason)
+
+    def _require_rest(self) -> None:
+        self._require(not self._moving, "the arm moves")
+
+    def _set(self, **changes: Any) -> None:
+        self._settings = replace(self._settings, **changes)
+
+    def _set_flyby(self, criterion: FlybyCriterion, value: float) -> None:
+        largest = 100.0 if criterion is FlybyCriterion.PERCENT else _WIDEST
+        size = _real(value)
+        self._require(0.0 <= size <= largest, f"fly-by criterion {criterion} of {value}")
+        self._set(flyby={**self._settings.flyby, criterion: size})
+
+    def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> None:
+        shares = np.array(getattr(self._settings, name))
+        named = range(len(shares)) if joints is None else joints
+        try:
+            chosen = [joint if (joint := _whole(each)) is not None else -1 for each in named]
+        except TypeError:
+            chosen = [-1]
+        known = all(0 <= joint < len(shares) for joint in chosen)
+        self._require(known, f"joints {joints!r} are not of the arm's 0 to {len(shares) - 1}")
+        each = _reals(percent) / 100.0
+        valid = each.shape in ((), (len(chosen),)) and np.all((each > 0.0) & (each <= 1.0))
+        self._require(bool(valid), f"joint {name} of {percent!r:.80} % for {len(chosen)} joints")
+        shares[chosen] = each
+        self._set(**{name: read_only(shares)})
+
+    def _position_of(self, position: ArrayLike) -> Array:
+        """Return a position (n,) that the arm can be at."""
+        point, lower, upper = _reals(position), self._limits.lower, self._limits.upper
+        inside = point.shape == lower.shape and np.all((point >= lower) & (point <= upper))
+        self._require(bool(inside), f"position {position!r:.200} is not in the limits")
+        return point
+
+    def _wanted(self, queue: MotionQueue) -> Status:
+        more = len(queue.ahead) <= self._settings.advance
+        return Status.NEED_MORE_DATA if more else Status.OK
 
     def _step(self, status: Status, events: tuple[Event, ...]) -> Step:
         low, high = self._inside
@@ -713,14 +652,14 @@ class Interpolator(MoveServices):
         return Step(status, position, self._elapsed, flags, events)
 
     def _no_step(self, status: Status, reason: str) -> Step:
-        return self._step(self._refuse(status, reason), ())
+        self.refusal = reason
+        return self._step(status, ())
 
     def _stand(self, events: tuple[Event, ...]) -> Step:
         """Return the step of an arm that was asked to stop and is at rest."""
-        if not self._stop_reported:
+        target = self.get_current_target_id()
+        if not self._stop_reported and target is not None:
             self._stop_reported = True
-            target = self.get_current_target_id()
-            assert target is not None
             events += (Event(EventKind.MOTION_STOPPED, target),)
         step = self._step(Status.FINAL_STEP, events)
         if self._cancelling:
@@ -734,7 +673,7 @@ class Interpolator(MoveServices):
         *passed, last = queue.ahead
         self._position = queue.position(queue.end)
         events = (
-            *(Event(EventKind.VIA_POINT_PASSED, passage.target_id) for passage in passed),
+            *(Event(EventKind.VIA_POINT_PASSED, target.target_id) for target in passed),
             Event(EventKind.MOTION_ENDED, last.target_id),
         )
         self._stop_reported = True
@@ -742,46 +681,57 @@ class Interpolator(MoveServices):
         self._rest_at(self._position)
         return step
 
-    def _position_of(self, position: ArrayLike) -> Array | None:
-        """Return a position (n,) the arm can be at, or None and why not in `refusal`."""
-        try:
-            point = reals(position)
-        except (TypeError, ValueError) as error:
-            self._refuse(Status.INCONSISTENT, f"a position is no row of numbers: {error}")
-            return None
-        lower, upper = self._limits.lower, self._limits.upper
-        if point.shape != lower.shape or not np.all((point >= lower) & (point <= upper)):
-            self._refuse(Status.INCONSISTENT, f"position {point.tolist()} is not in the limits")
-            return None
-        return point
 
-
-def _isolated_corner(before: Leg, after: Leg, fly: Fly) -> Corner:
-    return in_child_now(corner, before, after, fly)  # the arm may move
-
-
-def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move | None:
-    """Return the move to a target, slow enough for its motion time; None where that is too short.
+def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move:
+    """Return the move to a target, slow enough for its motion time.
 
     Raises:
         InvalidSetting: a move that goes nowhere was given a time.
     """
-    move, seconds = settings.move_to(target), settings.motion_time
+    seconds = settings.motion_time
     if seconds == 0.0:
-        return move
+        return settings.move_to(target)
 
     def excess(speed: float) -> float:
-        slowed = queue.leg_to(replace(move, speed=speed), settings.overrides)
-        return slowed.segment.duration - seconds
+        leg = queue.leg_to(settings.move_to(target, speed), settings.overrides)
+        return float(leg.moves.durations[0]) - seconds
 
     least = excess(1.0)
     if least == -seconds:
         raise InvalidSetting("motion time", seconds, "0 s where the target is the point before")
-    if least > _MOTION_TIME_ROUNDING:
-        return None
+    if least > _ROUNDING:
+        reason = f"the move takes longer than its motion time of {seconds} s"
+        raise _RefusedError(reason, Status.TIME_TOO_SHORT)
     slow = 1.0
     while excess(slow) < 0.0:
         slow /= 2.0
     if slow < 1.0:
         slow = float(scipy.optimize.brentq(excess, slow, 1.0, xtol=1e-300, rtol=1e-15))
-    return replace(move, speed=slow)
+    return settings.move_to(target, slow)
+
+
+def _real(value: Any) -> float:
+    """Return a number as a float; NaN, which no range holds, for what is none, as True or "1"."""
+    try:
+        return float(value) if isinstance(value, Real) and not isinstance(value, bool) else nan
+    except OverflowError:
+        return nan
+
+
+def _reals(values: Any) -> Array:
+    """Return numbers, one or rows of them, as a read-only array, NaN for what are none."""
+    raw = np.asarray(values, dtype=object)
+    return read_only(np.array([_real(value) for value in raw.flat]).reshape(raw.shape))
+
+
+def _whole(value: Any) -> int | None:
+    """Return a whole number, of Python's or numpy's types; None for what is none."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
+
+
+def _member(kind: type[E], value: Any) -> E:
+    """Return the member of an enumeration with this number."""
+    number = _whole(value)
+    if number is None or number not in kind._value2member_map_:
+        raise _RefusedError(f"{value!r:.80} is no {kind.__name__}")
+    return kind(number)

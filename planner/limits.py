@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,38 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
 
-
-class Bounds(Protocol):
-    """Range and largest rates of every joint, each (n,)."""
-
-    @property
-    def lower(self) -> Array:
-        """Smallest position [rad]."""
-        ...
-
-    @property
-    def upper(self) -> Array:
-        """Largest position [rad]."""
-        ...
-
-    @property
-    def velocity(self) -> Array:
-        """Largest |velocity| [rad/s]."""
-        ...
-
-    @property
-    def acceleration(self) -> Array:
-        """Largest |acceleration| [rad/s²]."""
-        ...
-
-    @property
-    def jerk(self) -> Array:
-        """Largest |jerk| [rad/s³]."""
-        ...
+# No arm comes near; far beyond, the corners' solver has been seen to take its process with it.
+SMALLEST_RATE: Final = 1e-10
+LARGEST_RATE: Final = 1e10
+# Rounding, not licence: a position may leave its range by this share of the range's size, and
+# neighbouring pieces may differ by this share of the limit of the quantity.
+POSITION_ROUNDING: Final = 1e-12
+RATE_ROUNDING: Final = 1e-9
 
 
 class Allowance(NamedTuple):
-    """`Bounds` made of others that were checked before, of one motion (n,) or of many (c, n)."""
+    """Limits made of others that were checked before, of one motion (n,) or of many (c, n)."""
 
     lower: Array
     upper: Array
@@ -51,19 +29,9 @@ class Allowance(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    @classmethod
-    def of_many(cls, bounds: Sequence[Bounds]) -> Allowance:
-        """Return bounds (n,) each as rows."""
-        return cls(*(np.array([getattr(one, name) for one in bounds]) for name in cls._fields))
-
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Allowance:
         """Return some of the rows, by index or mask."""
         return Allowance(*(bound[rows] for bound in self))
-
-
-# No arm comes near; far beyond, the corners' solver has been seen to take its process with it.
-SMALLEST_RATE: Final = 1e-10
-LARGEST_RATE: Final = 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,25 +61,19 @@ class JointLimits:
             values = read_only(getattr(self, field.name))
             object.__setattr__(self, field.name, values)
             if values.ndim != 1 or values.size == 0 or values.shape != self.lower.shape:
-                raise InvalidLimits(
-                    field.name, f"has shape {values.shape}; all five must share one (n_joints,)"
-                )
+                reason = f"has shape {values.shape}; all five must share one (n_joints,)"
+                raise InvalidLimits(field.name, reason)
             if not np.all(np.isfinite(values)):
                 raise InvalidLimits(field.name, f"must be finite, got {values.tolist()}")
         if np.any(self.lower >= self.upper):
             joint = int(np.argmax(self.lower >= self.upper))
-            raise InvalidLimits(
-                "lower", f"must be below upper; joint {joint}: {self.lower[joint]} >= "
-                f"{self.upper[joint]} rad",
-            )  # fmt: skip
+            ends = f"{self.lower[joint]} >= {self.upper[joint]} rad"
+            raise InvalidLimits("lower", f"must be below upper; joint {joint}: {ends}")
         for name in ("velocity", "acceleration", "jerk"):
             rates = getattr(self, name)
-            if np.any(rates <= 0.0):
-                raise InvalidLimits(name, f"must be positive, got {rates.tolist()}")
             if np.any((rates < SMALLEST_RATE) | (rates > LARGEST_RATE)):
-                raise InvalidLimits(
-                    name, f"must lie in {SMALLEST_RATE:g}..{LARGEST_RATE:g}, got {rates.tolist()}"
-                )
+                reason = f"must lie in {SMALLEST_RATE:g}..{LARGEST_RATE:g}, got {rates.tolist()}"
+                raise InvalidLimits(name, reason)
 
     @property
     def n_joints(self) -> int:
@@ -119,11 +81,7 @@ class JointLimits:
         return int(self.lower.size)
 
     def scaled(
-        self,
-        *,
-        velocity: ArrayLike = 1.0,
-        acceleration: ArrayLike = 1.0,
-        jerk: ArrayLike = 1.0,
+        self, *, velocity: ArrayLike = 1.0, acceleration: ArrayLike = 1.0, jerk: ArrayLike = 1.0
     ) -> JointLimits:
         """Return the same range with rates multiplied by the factors, each a number or (n,)."""
         return replace(
@@ -132,3 +90,28 @@ class JointLimits:
             acceleration=self.acceleration * np.asarray(acceleration),
             jerk=self.jerk * np.asarray(jerk),
         )
+
+
+Bounds: TypeAlias = JointLimits | Allowance
+
+
+def position_rounding(limits: Bounds) -> Array:
+    """Return by how much a position may leave its range, which counts as rounding, (..., n)."""
+    return POSITION_ROUNDING * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
+
+
+def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
+    """Return the jumps of position, velocity, acceleration that count as rounding, (..., n, 3).
+
+    Durations (...) [s] and limits (..., n) are of one motion or of many.
+    """
+    # A knot is reported no finer than the clock allows: late in a long motion that shows.
+    tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
+    return np.stack(
+        (
+            position_rounding(limits) + tick * limits.velocity,
+            RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
+            RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
+        ),
+        axis=-1,
+    )

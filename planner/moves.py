@@ -2,59 +2,170 @@
 
 A plan is made of legs, each a move by itself, and of the corners between two. Each looks at two
 neighbours at most, so that a motion can also be planned while it runs, one move after the other,
-and comes out the same.
+and comes out the same; and many motions can be planned together, as a search does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Final, NamedTuple
+from math import isfinite
+from typing import Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
-from planner.commands import (
-    Fly,
-    FlyDistance,
-    FlyPercent,
-    Move,
-    Overrides,
-    Stop,
-    Termination,
-    checked_shares,
-)
-from planner.corners import STOP, Corner, How, fly_by_all, fly_within, passing
-from planner.errors import (
-    InvalidSetting,
-    InvalidViaPoints,
-    NonFiniteViaPoint,
-    TooFewViaPoints,
-    ViaPointOutOfLimits,
-    WrongShape,
-)
-from planner.limits import Allowance, Bounds, JointLimits
-from planner.piecewise_cubic import PiecewiseCubic, concatenate
-from planner.segments import StraightSegment
+from planner.corners import STOP, Corner, How, passing, round_corners, round_within
+from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
+from planner.limits import Allowance, JointLimits
+from planner.piecewise_cubic import Block, PiecewiseCubic, Rows
+from planner.straight import StraightMoves
 from planner.verify import check_limits, check_smooth
 
-__all__ = [
-    "plan",
-    "plan_moves",
-    "checked_via_points",
-    "Move",
-    "Fly",
-    "FlyPercent",
-    "FlyDistance",
-    "Stop",
-    "Termination",
-    "Overrides",
-    "MotionPlan",
-    "TargetPassage",
-]
+Termination = Literal["fine", "coarse", "nosettle"]
+"""How exactly the arm has to have arrived before a stop at the target counts as made.
+
+It changes no set-point: the interpolated motion is at rest on the target in all three cases. It
+is carried along for whoever executes the motion and decides how long to wait for the real arm.
+"""
+
+
+@dataclass(frozen=True)
+class FlyPercent:
+    """Fly by: the next move begins during the last `percent` of the deceleration (0..100).
+
+    0 is a stop; at 100 the corner begins as soon as the deceleration does. The path is rounder
+    at a higher speed.
+    """
+
+    percent: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.percent <= 100.0:
+            raise InvalidSetting("fly percentage", self.percent, "a number from 0 to 100")
+
+
+@dataclass(frozen=True)
+class FlyDistance:
+    """Fly by as widely as the path stays within `distance` [rad] of the target.
+
+    The distance is Euclidean in joint space, between the target and the point of the path that
+    is nearest to it.
+    """
+
+    distance: float
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.distance) and self.distance >= 0.0):
+            raise InvalidSetting("fly distance", self.distance, "a finite number >= 0 rad")
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Come to rest on the target."""
+
+
+Fly: TypeAlias = FlyPercent | FlyDistance | Stop
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """One straight joint-space move to a target, all joints in phase.
+
+    Shares multiply, with each other and with the overrides; what they limit is one joint's
+    velocity, acceleration or jerk, and the joint that needs longest rules the others.
+
+    Attributes:
+        target: Where it leads (n,) [rad].
+        speed: Share of all velocity limits, in (0, 1].
+        acceleration: Share of all acceleration limits, in (0, 1], for both ramps.
+        joint_speed: Share of each velocity limit (n,), or None for all.
+        joint_acceleration: Share of each acceleration limit (n,), or None for all.
+        fly: How the target is passed; the last target of a motion is always a stop.
+        termination: See `Termination`.
+        joint_jerk: Share of each jerk limit (n,), or None for all.
+
+    Raises:
+        InvalidSetting: a value is outside its range or of the wrong shape.
+    """
+
+    target: Array
+    speed: float = 1.0
+    acceleration: float = 1.0
+    joint_speed: Array | None = None
+    joint_acceleration: Array | None = None
+    fly: Fly = Stop()
+    termination: Termination = "nosettle"
+    joint_jerk: Array | None = None
+
+    def __post_init__(self) -> None:
+        target = _array(self.target)
+        if target.ndim != 1 or target.size == 0:
+            raise InvalidSetting("target", self.target, "one position per joint [rad]")
+        object.__setattr__(self, "target", target)
+        for name in ("speed", "acceleration"):
+            object.__setattr__(self, name, float(checked_shares(name, getattr(self, name))))
+        for name in ("joint_speed", "joint_acceleration", "joint_jerk"):
+            if (shares := getattr(self, name)) is not None:
+                object.__setattr__(self, name, checked_shares(name, shares, target.size))
+        if not isinstance(self.fly, FlyPercent | FlyDistance | Stop):
+            raise InvalidSetting("fly", self.fly, "FlyPercent, FlyDistance or Stop")
+        if self.termination not in get_args(Termination):
+            raise InvalidSetting("termination", self.termination, "fine, coarse or nosettle")
+
+
+@dataclass(frozen=True, eq=False)
+class Overrides:
+    """Overrides that change only their own quantity, so that a flown path may change with them.
+
+    (The override that leaves the path unchanged acts while the motion is played.)
+
+    Attributes:
+        speed: Share of all velocity limits, in (0, 1].
+        acceleration: Share of the acceleration limits while speeding up, in (0, 1].
+        deceleration: Share of the acceleration limits while slowing down, in (0, 1].
+        joint: Share of each joint's velocity limit, a number or (n,).
+
+    Raises:
+        InvalidSetting: a value is outside its range.
+    """
+
+    speed: float = 1.0
+    acceleration: float = 1.0
+    deceleration: float = 1.0
+    joint: ArrayLike = field(default=1.0)
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration", "deceleration"):
+            share = checked_shares(f"{name} override", getattr(self, name))
+            object.__setattr__(self, name, float(share))
+        size = np.size(self.joint)
+        object.__setattr__(self, "joint", checked_shares("joint override", self.joint, size))
+
+
+def checked_shares(name: str, values: ArrayLike, n_joints: int | None = None) -> Array:
+    """Return a share in (0, 1], or as many as joints where their number is given, read-only.
+
+    Raises:
+        InvalidSetting: a value is outside its range, or there are not as many as joints.
+    """
+    shares = _array(values)
+    if shares.shape not in ((), (n_joints,)) or not np.all((shares > 0.0) & (shares <= 1.0)):
+        count = "" if n_joints is None else f", one or {n_joints} of them"
+        raise InvalidSetting(name, values, f"a share in (0, 1]{count}")
+    return shares
+
+
+def _array(values: ArrayLike) -> Array:
+    """Return numbers as a read-only array, NaN for what are none."""
+    try:
+        return read_only(values)
+    except (TypeError, ValueError):
+        return read_only(np.nan)
+
 
 # Segments keep this distance from the limits, so that the states at which corners cut them lie
 # clear of where the corner's solver is known to fail; corners then use the full limits.
@@ -63,119 +174,166 @@ SEGMENT_ACCELERATION: Final = 0.98
 SEGMENT_JERK: Final = 0.98
 
 
-class Leg(NamedTuple):
-    """A move planned from rest to rest.
+class Legs(NamedTuple):
+    """Moves planned from rest to rest.
 
     Attributes:
-        segment: The straight motion.
-        bounds: What the move may use, its deceleration apart.
-        deceleration: What it may use while slowing down (n,) [rad/s²].
+        moves: The straight motions.
+        bounds: What each may use (s, n), its deceleration apart.
+        deceleration: What each may use while slowing down (s, n) [rad/s²].
     """
 
-    segment: StraightSegment
-    bounds: Bounds
+    moves: StraightMoves
+    bounds: Allowance
     deceleration: Array
 
+    @classmethod
+    def between(cls, starts: Array, ends: Array, bounds: Allowance, deceleration: Array) -> Legs:
+        """Plan moves between positions (s, n) [rad]."""
+        cautious = bounds._replace(
+            velocity=SEGMENT_VELOCITY * bounds.velocity,
+            acceleration=SEGMENT_ACCELERATION * bounds.acceleration,
+            jerk=SEGMENT_JERK * bounds.jerk,
+        )
+        slowing = SEGMENT_ACCELERATION * deceleration
+        return cls(StraightMoves.between(starts, ends, cautious, slowing), bounds, deceleration)
 
-class Shares(NamedTuple):
-    """Bounds of one or more moves: worked out once, used for all moves alike."""
+    def followed_by(self, other: Legs) -> Legs:
+        """Return these and other legs in one."""
+        moves, bounds = (
+            [np.concatenate(pair) for pair in zip(ours, theirs, strict=True)]
+            for ours, theirs in zip(self[:2], other[:2], strict=True)
+        )
+        deceleration = np.concatenate((self.deceleration, other.deceleration))
+        return Legs(StraightMoves(*moves), Allowance(*bounds), deceleration)
 
-    bounds: Bounds
-    deceleration: Array
-    cautious: Bounds
-    cautious_deceleration: Array
+    def corners(self, before: Rows, after: Rows, flies: Sequence[Fly]) -> list[Corner]:
+        """Plan how the targets of legs `before` (c,) are passed on the way to those of `after`.
+
+        Within a corner each joint may use what the more generous of the two moves grants: the
+        deceleration of the one before or the acceleration of the one after.
+        """
+        first, second = self.bounds.take(before), self.bounds.take(after)
+        bounds = first._replace(
+            velocity=np.maximum(first.velocity, second.velocity),
+            acceleration=np.maximum(self.deceleration[before], second.acceleration),
+            jerk=np.maximum(first.jerk, second.jerk),
+        )
+        shares = [fly.percent / 100.0 if isinstance(fly, FlyPercent) else 0.0 for fly in flies]
+        corners = round_corners(self.moves, before, after, bounds, np.array(shares))
+        for index, fly in enumerate(flies):
+            if isinstance(fly, FlyDistance):
+                pair = self.moves.take(np.array([before[index], after[index]]))
+                own = bounds.take(np.array([index]))
+                corners[index] = round_within(pair, own, fly.distance)
+        return corners
+
+    def motions(self, corners: Sequence[Corner], count: int) -> list[PiecewiseCubic]:
+        """Cut the legs of so many motions where the corners ask for it and put all in a row.
+
+        Raises:
+            PlanningError: a motion breaks what its legs may use, or is not smooth.
+        """
+        found = self.checked_motions(corners, count)
+        for motion in found:
+            if isinstance(motion, PlanningError):
+                raise motion
+        return [motion for motion in found if isinstance(motion, PiecewiseCubic)]
+
+    def checked_motions(
+        self, corners: Sequence[Corner], count: int
+    ) -> list[PiecewiseCubic | PlanningError]:
+        """Return the same, each motion as the table that it is or why there is none."""
+        block = _assembled(self.moves, corners, count)
+        rates = self.bounds._replace(
+            acceleration=np.maximum(self.bounds.acceleration, self.deceleration)
+        )
+        n = self.deceleration.shape[1]
+        widest = Allowance(*(bound.reshape(count, -1, n).max(axis=1) for bound in rates))
+        good = (block.keeps(widest) & block.smooth(widest)).tolist()
+        return [
+            motion if ok else _refused(motion, Allowance(*(bound[row] for bound in widest)))
+            for row, (motion, ok) in enumerate(zip(block.tables(), good, strict=True))
+        ]
 
 
-def shares_of(move: Move, limits: JointLimits, overrides: Overrides) -> Shares:
-    """Return what a move may use of the limits.
+def _refused(motion: PiecewiseCubic, bounds: Allowance) -> PiecewiseCubic | PlanningError:
+    try:
+        check_limits(motion, bounds)
+        check_smooth(motion, bounds)
+    except PlanningError as error:
+        return error
+    return motion
+
+
+def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> Block:
+    """Return motions of as many legs each, corners between them."""
+    legs, n = len(moves.start) // count, moves.start.shape[1]
+    leave, enter = np.zeros((2, count, legs))
+    leave[:, :-1] = np.array([corner.leave for corner in corners]).reshape(count, -1)
+    enter[:, 1:] = np.array([corner.enter for corner in corners]).reshape(count, -1)
+    # Two full fly-bys may use up a move without cruise; nothing is left but rounding.
+    begin, end = enter.ravel(), moves.durations - leave.ravel()
+    times, pieces = moves.cut(begin, np.maximum(begin, end))
+    times = times.reshape(count, legs, 1, -1)
+    pieces = pieces.reshape(count, legs, n, -1, 4)
+
+    width = max([1, *(len(c.join.knots[0]) - 1 for c in corners if c.join is not None)])
+    # Where the arm stops, and behind the last piece of a join, pieces of no length hold the state
+    # in which the next move is entered.
+    rounds = np.repeat(pieces[:, 1:, :, :1], width, axis=3)
+    rounds[..., 3] = 0.0
+    knots = np.zeros((count, legs - 1, n, width + 1))
+    for index, (_, _, join, *_) in enumerate(corners):
+        if join is not None:
+            where, own = divmod(index, legs - 1), len(join.knots[0])
+            rounds[where][:, : own - 1] = join.coefficients
+            knots[where][:, :own] = join.knots
+            knots[where][:, own:] = join.duration
+
+    spans = np.zeros((count, 2 * legs))
+    spans[:, 1::2], spans[:, 2::2] = times[:, :, 0, -1], knots[:, :, 0, -1]
+    offset = np.cumsum(spans, axis=1)[..., None, None]
+    row_knots, row_pieces = [np.zeros((count, n, 1))], []
+    for part in range(2 * legs - 1):
+        leg = part // 2
+        local, table = (knots, rounds) if part % 2 else (times, pieces)
+        shifted = local[:, leg, :, 1:] + offset[:, part]
+        row_knots.append(np.broadcast_to(shifted, (count, n, shifted.shape[-1])))
+        row_pieces.append(table[:, leg])
+    return Block.of_pieces(np.concatenate(row_knots, -1), np.concatenate(row_pieces, -2))
+
+
+def legs_through(
+    points: Array, moves: Sequence[Move], limits: JointLimits, overrides: Overrides
+) -> Legs:
+    """Plan the moves from each of the points (s + 1, n) [rad] to the next by themselves.
 
     Raises:
-        InvalidSetting: the move, or the overrides, are those of another number of joints.
+        InvalidSetting: a move, or the overrides, are those of another number of joints.
     """
     n = limits.n_joints
-    if move.target.size != n:
-        raise InvalidSetting("target", move.target.tolist(), f"one position for each of {n} joints")
-    if overrides.joint_shares.shape not in ((), (n,)):
+    joint = np.asarray(overrides.joint)
+    if joint.shape not in ((), (n,)):
         raise InvalidSetting("joint override", overrides.joint, f"one share, or {n} of them")
-    velocity = limits.velocity * (move.speed * overrides.speed * overrides.joint_shares)
-    rate = limits.acceleration * move.acceleration
-    jerk = limits.jerk
-    if move.joint_speed is not None:
-        velocity = velocity * move.joint_speed
-    if move.joint_acceleration is not None:
-        rate = rate * move.joint_acceleration
-    if move.joint_jerk is not None:
-        jerk = jerk * move.joint_jerk
-    acceleration = rate * overrides.acceleration
-    deceleration = rate * overrides.deceleration
-    return Shares(
-        Allowance(limits.lower, limits.upper, velocity, acceleration, jerk),
-        deceleration,
-        Allowance(
-            limits.lower,
-            limits.upper,
-            SEGMENT_VELOCITY * velocity,
-            SEGMENT_ACCELERATION * acceleration,
-            SEGMENT_JERK * jerk,
-        ),
-        SEGMENT_ACCELERATION * deceleration,
+
+    def share(values: Array | None) -> Any:
+        return 1.0 if values is None else values
+
+    rates = np.array(
+        [
+            (
+                limits.velocity * (move.speed * overrides.speed * joint) * share(move.joint_speed),
+                limits.acceleration * move.acceleration * share(move.joint_acceleration),
+                limits.jerk * share(move.joint_jerk),
+            )
+            for move in moves
+        ]
     )
-
-
-def leg_with(start: Array, target: Array, shares: Shares) -> Leg:
-    """Plan a move between two positions (n,) [rad] from what it may use."""
-    segment = StraightSegment.between(start, target, shares.cautious, shares.cautious_deceleration)
-    return Leg(segment, shares.bounds, shares.deceleration)
-
-
-def leg(start: Array, move: Move, limits: JointLimits, overrides: Overrides) -> Leg:
-    """Plan a move from `start` (n,) [rad] to its target, from rest to rest."""
-    return leg_with(start, move.target, shares_of(move, limits, overrides))
-
-
-def corner(before: Leg, after: Leg, fly: Fly) -> Corner:
-    """Plan how the target of `before` is passed on the way to that of `after`."""
-    return corners_between([before, after], [fly])[0]
-
-
-def corners_between(legs: Sequence[Leg], flies: Sequence[Fly]) -> list[Corner]:
-    """Plan how the target of each leg but the last is passed on the way to that of the next.
-
-    Within a corner each joint may use what the more generous of the two moves grants: the
-    deceleration of the one before or the acceleration of the one after.
-    """
-    pairs = list(pairwise(legs))
-    segments = [(before.segment, after.segment) for before, after in pairs]
-    bounds = [
-        before.bounds
-        if after.bounds is before.bounds and before.deceleration is before.bounds.acceleration
-        else wider(before.bounds, after.bounds, before.deceleration)
-        for before, after in pairs
-    ]
-    shares = [fly.share if isinstance(fly, FlyPercent) else 0.0 for fly in flies]
-    corners = fly_by_all(segments, bounds, shares)
-    for index, fly in enumerate(flies):
-        if isinstance(fly, FlyDistance):
-            corners[index] = fly_within(*segments[index], bounds[index], fly.distance)
-    return corners
-
-
-def wider(before: Bounds, after: Bounds, deceleration: Array) -> Bounds:
-    """Return, joint by joint, the larger rates of a move that ends and one that begins."""
-    return Allowance(
-        before.lower,
-        before.upper,
-        np.maximum(before.velocity, after.velocity),
-        np.maximum(deceleration, after.acceleration),
-        np.maximum(before.jerk, after.jerk),
-    )
-
-
-def between(segment: StraightSegment, before: Corner, after: Corner) -> PiecewiseCubic:
-    """Return what two corners leave of the segment that leads from one to the other."""
-    # Two full fly-bys may use up a segment without cruise; nothing is left but rounding.
-    start, stop = before.enter, segment.duration - after.leave
-    return segment.pieces(start, max(start, stop))
+    velocity, acceleration, jerk = rates.swapaxes(0, 1)
+    lower, upper = (np.broadcast_to(end, velocity.shape) for end in (limits.lower, limits.upper))
+    bounds = Allowance(lower, upper, velocity, acceleration * overrides.acceleration, jerk)
+    return Legs.between(points[:-1], points[1:], bounds, acceleration * overrides.deceleration)
 
 
 @dataclass(frozen=True)
@@ -238,7 +396,9 @@ class MotionPlan:
     def stopped_corners(self) -> int:
         """Number of targets to be flown by between two real moves at which the motion stops."""
         return sum(
-            corner.how == "stopped" and _asked(move) and min(durations) > 0.0
+            corner.how == "stopped"
+            and move.fly not in (Stop(), FlyPercent(0.0), FlyDistance(0.0))
+            and min(durations) > 0.0
             for corner, move, durations in zip(
                 self.corners, self.moves, pairwise(self.durations), strict=False
             )
@@ -247,17 +407,15 @@ class MotionPlan:
     @cached_property
     def targets(self) -> tuple[TargetPassage, ...]:
         """How the target of each move is passed."""
-        return tuple(self._passages())
-
-    def _passages(self) -> Iterator[TargetPassage]:
-        time, entered = 0.0, 0.0
+        time, entered, passages = 0.0, 0.0, []
         for index, (move, duration, corner) in enumerate(
             zip(self.moves, self.durations, (*self.corners, STOP), strict=True)
         ):
             time += max(duration - entered - corner.leave, 0.0)
-            yield passage(index, move.target, corner, time)
+            passages.append(passage(index, move.target, corner, time))
             time += 0.0 if corner.join is None else corner.join.duration
             entered = corner.enter
+        return tuple(passages)
 
 
 def passage(index: int, target: Array, corner: Corner, time: float) -> TargetPassage:
@@ -266,12 +424,6 @@ def passage(index: int, target: Array, corner: Corner, time: float) -> TargetPas
         return TargetPassage(index, time, 0.0, "stopped", 0.0)
     passed = passing(corner.join, target)
     return TargetPassage(index, time + passed.time, passed.distance, corner.how, corner.share)
-
-
-def _asked(move: Move) -> bool:
-    if isinstance(move.fly, FlyPercent):
-        return move.fly.percent > 0.0
-    return isinstance(move.fly, FlyDistance) and move.fly.distance > 0.0
 
 
 def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
@@ -285,18 +437,18 @@ def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
     except (TypeError, ValueError) as error:
         raise InvalidViaPoints(f"via points are not a table of numbers: {error}") from error
     if points.ndim != 2 or points.shape[1] != limits.n_joints:
-        raise WrongShape(points.shape, limits.n_joints)
+        expected = f"expected (n_points, {limits.n_joints})"
+        raise InvalidViaPoints(f"via points have shape {points.shape}; {expected}")
     if len(points) < 2:
-        raise TooFewViaPoints(len(points))
-    for index, joint in np.argwhere(~np.isfinite(points)).tolist():
-        raise NonFiniteViaPoint(index, joint, float(points[index, joint]))
-    for index, joint in np.argwhere((points < limits.lower) | (points > limits.upper)).tolist():
-        raise ViaPointOutOfLimits(
-            index,
-            joint,
-            float(points[index, joint]),
-            float(limits.lower[joint]),
-            float(limits.upper[joint]),
+        raise InvalidViaPoints(f"{len(points)} via point(s) given; a motion needs at least 2")
+    inside = (points >= limits.lower) & (points <= limits.upper)
+    for index, joint in np.argwhere(~inside).tolist():  # NaN is inside of nothing
+        value, lower, upper = points[index, joint], limits.lower[joint], limits.upper[joint]
+        raise InvalidViaPoints(
+            f"via point {index}, joint {joint}: {value:.6g} rad is outside "
+            f"[{lower:.6g}, {upper:.6g}] rad"
+            if np.isfinite(value)
+            else f"via point {index}, joint {joint}: {value} is not a finite position"
         )
     return points
 
@@ -332,86 +484,18 @@ def plan_moves(
         UnsupportedSolver: a corner is to be rounded, and the installed ruckig is not known.
     """
     points = checked_via_points([start, *(move.target for move in moves)], limits)
-    return planned(points, moves, limits, overrides)
-
-
-def planned(
-    points: Array, moves: Sequence[Move], limits: JointLimits, overrides: Overrides = _NO_OVERRIDES
-) -> MotionPlan:
-    """Plan moves through points (n_moves + 1, n) [rad] that were checked; see `plan_moves`."""
-    shares = _shares(moves, limits, overrides)
-    legs = [leg_with(a, b, each) for (a, b), each in zip(pairwise(points), shares, strict=True)]
-    corners = corners_between(legs, [move.fly for move in moves[:-1]])
-    motion = assembled(legs, corners)
-    check(motion, legs)
+    legs = legs_through(points, moves, limits, overrides)
+    rows = np.arange(len(moves))
+    corners = legs.corners(rows[:-1], rows[1:], [move.fly for move in moves[:-1]])
+    (motion,) = legs.motions(corners, 1)
     return MotionPlan(
         start=read_only(points[0]),
         moves=tuple(moves),
         limits=limits,
         overrides=overrides,
         trajectory=motion,
-        durations=tuple(each.segment.duration for each in legs),
+        durations=tuple(legs.moves.durations.tolist()),
         corners=tuple(corners),
-    )
-
-
-def assembled(legs: Sequence[Leg], corners: Sequence[Corner]) -> PiecewiseCubic:
-    """Cut the legs where the corners ask for it and put everything in a row."""
-    parts = []
-    for each, before, after in zip(legs, (STOP, *corners), (*corners, STOP), strict=True):
-        parts.append(between(each.segment, before, after))
-        if after.join is not None:
-            parts.append(after.join)
-    return concatenate([part for part in parts if part.duration > 0.0] or parts[:1])
-
-
-def check(motion: PiecewiseCubic, legs: Sequence[Leg]) -> None:
-    """Refuse a motion that breaks what its legs may use, or is not smooth.
-
-    Raises:
-        PlanningError: naming quantity, joint, value and bound.
-    """
-    bounds = _widest(legs)
-    check_limits(motion, bounds)
-    check_smooth(motion, bounds)
-
-
-def _shares(moves: Sequence[Move], limits: JointLimits, overrides: Overrides) -> list[Shares]:
-    """Return what each move may use; the same object for neighbours that are alike."""
-    shares: list[Shares] = []
-    for index, move in enumerate(moves):
-        alike = index > 0 and _alike(move, moves[index - 1])
-        shares.append(shares[-1] if alike else shares_of(move, limits, overrides))
-    return shares
-
-
-def _alike(move: Move, other: Move) -> bool:
-    return (
-        move.speed == other.speed
-        and move.acceleration == other.acceleration
-        and _same(move.joint_speed, other.joint_speed)
-        and _same(move.joint_acceleration, other.joint_acceleration)
-        and _same(move.joint_jerk, other.joint_jerk)
-    )
-
-
-def _same(shares: Array | None, others: Array | None) -> bool:
-    if shares is None or others is None:
-        return shares is others
-    return np.array_equal(shares, others)
-
-
-def _widest(legs: Sequence[Leg]) -> Bounds:
-    def largest(rates: list[Array]) -> Array:
-        widest: Array = np.max(rates, axis=0)
-        return widest
-
-    return Allowance(
-        legs[0].bounds.lower,
-        legs[0].bounds.upper,
-        largest([each.bounds.velocity for each in legs]),
-        largest([np.maximum(each.bounds.acceleration, each.deceleration) for each in legs]),
-        largest([each.bounds.jerk for each in legs]),
     )
 
 
@@ -430,16 +514,63 @@ def plan(
             every via point) to 1 (the corner begins where the deceleration would).
 
     Raises:
-        InvalidViaPoints: wrong shape, fewer than two, not finite, or out of limits.
         InvalidSetting: speed or fly outside its range.
-        PlanningError: the finished plan breaks a limit or jumps by more than rounding, and is not
-            returned; seen only with limits that lie many powers of ten (1e8) apart.
-        UnsupportedSolver: a corner is to be rounded, and the installed ruckig is not known.
+        InvalidViaPoints, PlanningError, UnsupportedSolver: as `plan_moves`.
     """
-    points = checked_via_points(via_points, limits)
-    shares = checked_shares("speed", speed, limits.n_joints)
+    n = limits.n_joints
+    speeds = np.broadcast_to(checked_shares("speed", speed, n), (1, n))
     if not 0.0 <= fly <= 1.0:
         raise InvalidSetting("fly", fly, "a number from 0 to 1")
-    passing = FlyPercent(100.0 * fly)
-    moves = [Move(point, joint_speed=shares, fly=passing) for point in points[1:]]
-    return planned(points, moves, limits).trajectory
+    (motion,) = plan_chunk([via_points], speeds, limits, fly)
+    if isinstance(motion, PlannerError):
+        raise motion
+    return motion
+
+
+def plan_chunk(
+    individuals: Sequence[ArrayLike], speed: Array, limits: JointLimits, fly: float
+) -> list[PiecewiseCubic | PlannerError]:
+    """Plan a motion through the via points of each individual of a search, all together.
+
+    A corner can crash the solver and this process with it, so that this is a worker's
+    (`planner.worker`).
+
+    Args:
+        individuals: Via points (n_points, n_joints) [rad] of each; their number may differ.
+        speed: Share of each joint's velocity limit, in (0, 1], one row (n,) for each.
+        limits: Limits that every motion keeps.
+        fly: Share of each deceleration that the next acceleration overlaps, 0 to 1.
+
+    Returns:
+        For each individual, in their order, its motion or the error that `plan` would raise for it.
+    """
+    planned: dict[int, PiecewiseCubic | PlannerError] = {}
+    alike: dict[int, list[tuple[int, Array]]] = {}
+    for index, via_points in enumerate(individuals):
+        try:
+            points = checked_via_points(via_points, limits)
+        except InvalidViaPoints as error:
+            planned[index] = error
+        else:
+            alike.setdefault(len(points), []).append((index, points))
+    passing_by = FlyPercent(100.0 * fly)
+    for group in alike.values():
+        rows = [index for index, _ in group]
+        through = np.array([points for _, points in group])
+        count, n_points, n = through.shape
+        velocity = np.repeat(limits.velocity * speed[rows], n_points - 1, axis=0)
+        lower, upper, acceleration, jerk = (
+            np.broadcast_to(bound, velocity.shape)
+            for bound in (limits.lower, limits.upper, limits.acceleration, limits.jerk)
+        )
+        legs = Legs.between(
+            through[:, :-1].reshape(-1, n),
+            through[:, 1:].reshape(-1, n),
+            Allowance(lower, upper, velocity, acceleration, jerk),
+            acceleration,
+        )
+        each = np.arange(len(velocity)).reshape(count, -1)
+        before, after = each[:, :-1].ravel(), each[:, 1:].ravel()
+        corners = legs.corners(before, after, [passing_by] * len(before))
+        planned |= dict(zip(rows, legs.checked_motions(corners, count), strict=True))
+    return [planned[index] for index in range(len(individuals))]

@@ -6,13 +6,18 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planner.arrays import Array
-from planner.checked_data import DAMAGED, numbers, rows
+from planner.checked_data import DAMAGED, numbers
 from planner.errors import InvalidTrajectory
+from planner.limits import Allowance, jump_rounding, position_rounding
+
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 
 class Trajectory(Protocol):
@@ -113,12 +118,10 @@ class PiecewiseCubic:
         q, qd, qdd = np.zeros((3, self.n_joints))
         for joint, (knots, pieces) in enumerate(self._rows):
             piece = min(bisect_right(knots, within), len(pieces)) - 1
-            p, v, a, j = pieces[piece]
-            x = within - knots[piece]
-            q[joint] = p + x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0)))
+            state = after(pieces[piece], within - knots[piece])
+            q[joint] = state[0]
             if within == t:
-                qd[joint] = v + x * (a + x * j * 0.5)
-                qdd[joint] = a + x * j
+                qd[joint], qdd[joint] = state[1:]
         return q, qd, qdd
 
     @cached_property
@@ -132,44 +135,17 @@ class PiecewiseCubic:
     def ends(self) -> tuple[Array, ...]:
         """Return position, velocity and acceleration at the end of each piece, (m_j, 3) each."""
         return tuple(
-            _state_after(coefficients, np.diff(knots))
-            for knots, coefficients in zip(self.knots, self.coefficients, strict=True)
+            np.stack(after(pieces.T, np.diff(knots)), axis=-1)
+            for knots, pieces in zip(self.knots, self.coefficients, strict=True)
         )
 
     def extrema(self) -> Extrema:
         """Return the extremes over all time, from the roots of each piece, not from samples."""
         first = np.cumsum([0, *(len(c) for c in self.coefficients[:-1])])
         pieces = np.concatenate(self.coefficients)
-        length = np.concatenate([np.diff(knots) for knots in self.knots])
-        _, v, a, j = pieces.T
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            fastest = -a / j
-            # Roots of v + a x + j x²/2 in the form that loses no digits when j is small.
-            root = -(a + np.copysign(np.sqrt(a * a - 2.0 * j * v), a))
-            times = np.stack((root / j, 2.0 * v / root, fastest, length, np.zeros_like(length)))
-        # Any time inside its piece is a fair sample, so a root that does not exist may be that.
-        states = _state_after(pieces, np.fmax(np.fmin(times, length), 0.0))
-        low, high = states.min(axis=0), states.max(axis=0)
-        largest = np.maximum.reduceat(np.maximum(-low, high), first)
-        return Extrema(
-            lower=np.minimum.reduceat(low[:, 0], first),
-            upper=np.maximum.reduceat(high[:, 0], first),
-            velocity=largest[:, 1],
-            acceleration=largest[:, 2],
-            jerk=np.maximum.reduceat(np.abs(j), first),
-        )
-
-    def restricted(self, start: float, stop: float) -> PiecewiseCubic:
-        """Return the part between the times `start` <= `stop` [s], beginning at its own time 0."""
-        knots, coefficients = [], []
-        for times, pieces in zip(self.knots, self.coefficients, strict=True):
-            first = int(np.clip(np.searchsorted(times, start, "right") - 1, 0, len(pieces) - 1))
-            last = max(int(np.searchsorted(times, stop, "left")), first + 1)
-            part = pieces[first:last].copy()
-            part[0, :3] = _state_after(part[:1], start - times[first])[0]
-            coefficients.append(part)
-            knots.append(np.concatenate(([start], times[first + 1 : last], [stop])) - start)
-        return PiecewiseCubic(tuple(knots), tuple(coefficients))
+        reach = _reach(pieces, np.concatenate([np.diff(knots) for knots in self.knots]))
+        largest = (np.maximum.reduceat(values, first) for values in reach[1:])
+        return Extrema(np.minimum.reduceat(reach.lower, first), *largest)
 
     def to_dict(self) -> dict[str, Any]:
         """Return lists; `from_dict` restores every bit, through JSON too."""
@@ -190,69 +166,14 @@ class PiecewiseCubic:
             kind = data.get("type")
             if kind != "piecewise_cubic":
                 raise InvalidTrajectory(f"type is {kind!r:.80}; expected 'piecewise_cubic'")
-            knots = tuple(numbers(row, 1) for row in rows(data["knots"]))
-            coefficients = tuple(numbers(row, 2) for row in rows(data["coefficients"]))
+            knots = tuple(numbers(row, 1) for row in data["knots"])
+            coefficients = tuple(numbers(row, 2) for row in data["coefficients"])
+            _check_table(knots, coefficients)
         except InvalidTrajectory:
             raise
         except DAMAGED as error:
-            raise InvalidTrajectory(f"not a table of cubic pieces: {error!r}") from error
-        _check_table(knots, coefficients)
+            raise InvalidTrajectory(f"not a table of cubic pieces: {error!r:.200}") from error
         return cls(knots, coefficients)
-
-    @classmethod
-    def from_jerks(cls, start: Array, knots: Array, jerks: Array) -> PiecewiseCubic:
-        """Integrate constant jerks.
-
-        Args:
-            start: Position, velocity and acceleration at time 0, (n, 3).
-            knots: Times from 0 at which each joint's jerk changes, (n, m + 1) [s].
-            jerks: Constant jerks between them, (n, m) [rad/s³].
-        """
-        coefficients = []
-        for state, times, row in zip(start.tolist(), knots.tolist(), jerks.tolist(), strict=True):
-            p, v, a = state
-            pieces = []
-            for begin, end, j in zip(times, times[1:], row, strict=False):
-                pieces.append((p, v, a, j))
-                x = end - begin
-                p += x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0)))
-                v += x * (a + x * j * 0.5)
-                a += x * j
-            coefficients.append(np.array(pieces))
-        return cls(tuple(np.array(knots)), tuple(coefficients))
-
-
-def concatenate(parts: Sequence[PiecewiseCubic]) -> PiecewiseCubic:
-    """Return the parts, at least one, one after the other."""
-    offsets = np.cumsum([0.0, *(part.duration for part in parts[:-1])])
-    joints = range(parts[0].n_joints)
-    return PiecewiseCubic(
-        knots=tuple(
-            np.concatenate(
-                [
-                    [0.0],
-                    *(part.knots[j][1:] + t for part, t in zip(parts, offsets, strict=True)),
-                ]
-            )
-            for j in joints
-        ),
-        coefficients=tuple(
-            np.concatenate([part.coefficients[j] for part in parts]) for j in joints
-        ),
-    )
-
-
-def _state_after(pieces: Array, x: Array) -> Array:
-    """Return q, qd, qdd (..., m, 3) at times `x` (..., m) since the start of pieces (m, 4)."""
-    p, v, a, j = pieces.T
-    return np.stack(
-        (
-            p + x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0))),
-            v + x * (a + x * j * 0.5),
-            a + x * j,
-        ),
-        axis=-1,
-    )
 
 
 def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
@@ -262,7 +183,7 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
             "expected as many of each, at least one"
         )
     for joint, (times, pieces) in enumerate(zip(knots, coefficients, strict=True)):
-        if times.ndim != 1 or len(times) < 2 or pieces.shape != (len(times) - 1, 4):
+        if len(times) < 2 or pieces.shape != (len(times) - 1, 4):
             raise InvalidTrajectory(
                 f"joint {joint}: knots {times.shape} and coefficients {pieces.shape}; "
                 "expected (m + 1,) and (m, 4) with m >= 1"
@@ -273,3 +194,129 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
             raise InvalidTrajectory(
                 f"joint {joint}: knots must rise from 0 to the duration common to all joints"
             )
+
+
+class Block(NamedTuple):
+    """Cubic pieces of many motions, the same number m for every joint of every one.
+
+    Attributes:
+        knots: Times from 0 to the duration of each motion, (c, n, m + 1) [s].
+        coefficients: Position, velocity, acceleration at the start of each piece, and its jerk,
+            (c, n, m, 4).
+        end: Position, velocity, acceleration at the end, (c, n, 3).
+    """
+
+    knots: Array
+    coefficients: Array
+    end: Array
+
+    @classmethod
+    def from_jerks(cls, start: Array, knots: Array, jerks: Array) -> Self:
+        """Integrate constant jerks (c, n, m) between knots (c, n, m + 1) from states (c, n, 3)."""
+        x = knots[..., 1:] - knots[..., :-1]
+        states = np.empty((*knots.shape, 3))
+        states[..., 0, :] = start
+        # In the order of operations in which a table is evaluated: so pieces meet to the last bit.
+        jx = jerks * x
+        states[..., 1:, 2] = jx
+        p, v, a = (states[..., i] for i in range(3))
+        np.cumsum(a, axis=-1, out=a)
+        v[..., 1:] = x * (a[..., :-1] + jx * 0.5)
+        np.cumsum(v, axis=-1, out=v)
+        p[..., 1:] = x * (v[..., :-1] + x * (a[..., :-1] * 0.5 + jx * (1.0 / 6.0)))
+        np.cumsum(p, axis=-1, out=p)
+        pieces = np.concatenate((states[..., :-1, :], jerks[..., None]), axis=-1)
+        return cls(knots, pieces, states[..., -1, :])
+
+    @classmethod
+    def of_pieces(cls, knots: Array, coefficients: Array) -> Self:
+        """Make a block of its pieces, which tell where it ends."""
+        last = np.moveaxis(coefficients[..., -1, :], -1, 0)
+        end = np.stack(after(last, knots[..., -1] - knots[..., -2]), axis=-1)
+        return cls(knots, coefficients, end)
+
+    @property
+    def durations(self) -> Array:
+        """Length in time of each motion (c,) [s]."""
+        last: Array = self.knots[:, 0, -1]
+        return last
+
+    def take(self, rows: Rows | Mask) -> Block:
+        """Return some of the motions, by index or mask."""
+        return Block(*(field[rows] for field in self))
+
+    def keeps(self, bounds: Allowance) -> Mask:
+        """Whether each motion keeps its bounds (c, n) at every instant (c,)."""
+        reach = _reach(self.coefficients, np.diff(self.knots, axis=-1))
+        slack = position_rounding(bounds)
+        within = reach.lower.min(axis=-1) >= bounds.lower - slack
+        within &= reach.upper.max(axis=-1) <= bounds.upper + slack
+        for largest, bound in zip(reach[2:], bounds[2:], strict=True):
+            within &= largest.max(axis=-1) <= bound
+        respected: Mask = within.all(axis=-1)
+        return respected
+
+    def smooth(self, bounds: Allowance) -> Mask:
+        """Whether each motion is C2 and at rest at both ends, but for rounding, (c,)."""
+        pieces = np.moveaxis(self.coefficients, -1, 0)
+        ends = np.stack(after(pieces, np.diff(self.knots, axis=-1)), axis=-1)
+        starts = self.coefficients[..., :3]
+        jumps = np.abs(starts[..., 1:, :] - ends[..., :-1, :]).max(axis=-2, initial=0.0)
+        rest = np.maximum(np.abs(starts[..., 0, 1:]), np.abs(ends[..., -1, 1:]))
+        jumps[..., 1:] = np.maximum(jumps[..., 1:], rest)
+        smooth: Mask = np.all(jumps <= jump_rounding(bounds, self.durations), axis=(1, 2))
+        return smooth
+
+    def tables(self) -> list[PiecewiseCubic]:
+        """Return each motion as a table of its own, without pieces of no length."""
+        real = np.diff(self.knots, axis=-1) > 0.0
+        real[..., 0] |= ~real.any(axis=-1)
+        ends = np.cumsum(real.sum(axis=-1), axis=None).tolist()
+        times, pieces = self.knots[..., 1:][real], self.coefficients[real]
+        tables, begin, n_joints = [], 0, real.shape[1]
+        for row in range(0, len(ends), n_joints):
+            knots, coefficients = [], []
+            for end in ends[row : row + n_joints]:
+                knots.append(np.concatenate(([0.0], times[begin:end])))
+                coefficients.append(pieces[begin:end].copy())
+                begin = end
+            tables.append(PiecewiseCubic(tuple(knots), tuple(coefficients)))
+        return tables
+
+
+def after(piece: Any, x: Any) -> tuple[Any, Any, Any]:
+    """Return position, velocity, acceleration a time `x` into pieces (4, ...), or into one."""
+    p, v, a, j = piece
+    return (
+        p + x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0))),
+        v + x * (a + x * j * 0.5),
+        a + x * j,
+    )
+
+
+def pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
+    """Return coefficients (m, 4) of one joint that go on from times (m,) [s] within a motion."""
+    knots = motion.knots[joint]
+    piece = np.searchsorted(knots[1:-1], times, side="right")
+    pieces = motion.coefficients[joint][piece].T
+    return np.stack((*after(pieces, times - knots[piece]), pieces[3]), axis=1)
+
+
+def _reach(pieces: Array, length: Array) -> Extrema:
+    """Return how far pieces (..., 4) of lengths (...) [s] go, from their roots, (...) each."""
+    p, v, a, j = parts = np.moveaxis(pieces, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        fastest = -a / j
+        # Roots of v + a x + j x²/2 in the form that loses no digits when j is small.
+        root = -(a + np.copysign(np.sqrt(a * a - 2.0 * j * v), a))
+        times = np.stack((root / j, 2.0 * v / root, fastest, length))
+    # Any time inside its piece is a fair sample, so a root that does not exist may be that.
+    times = np.fmax(np.fmin(times, length), 0.0)
+    position, velocity, acceleration = after(parts, times)
+    return Extrema(
+        np.minimum(p, position.min(axis=0)),
+        np.maximum(p, position.max(axis=0)),
+        np.maximum(np.abs(v), np.abs(velocity).max(axis=0)),
+        np.maximum(np.abs(a), np.abs(acceleration[2:]).max(axis=0)),
+        np.abs(j),
+    )

@@ -12,17 +12,26 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from planner.arrays import Array
-from planner.checked_data import DAMAGED, number, numbers, one_or_more, rows, table, text
-from planner.commands import STOP, Fly, FlyDistance, FlyPercent, Move, Overrides
+from planner.arrays import Array, read_only
+from planner.checked_data import DAMAGED
 from planner.errors import InvalidPlanFile, InvalidSetting, PlannerError
 from planner.limits import JointLimits
-from planner.moves import MotionPlan, plan_moves
-from planner.piecewise_cubic import PiecewiseCubic, Trajectory
+from planner.moves import (
+    FlyDistance,
+    FlyPercent,
+    MotionPlan,
+    Move,
+    Overrides,
+    Stop,
+    Termination,
+    plan_moves,
+)
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
 from planner.toml_text import Angles, Rows, from_text, to_text
 from planner.verify import check_limits, check_smooth
 
@@ -72,17 +81,80 @@ def from_toml(text: str) -> dict[str, Any]:
         raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
 
 
-FORMAT = "joint motion plan"
-VERSION = 1
+FORMAT: Final = "joint motion plan"
+VERSION: Final = 1
 # Planned again on another machine a motion may differ in its last digits [rad, s], and in its
 # rates by as small a share of their limits; no more, at any instant.
 _SAME = 1e-9
 _SAME_RATES = 1e-6
-_LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
-_SHARES = ("joint_speed", "joint_acceleration", "joint_jerk")
-_FLY = ("fly_percent", "fly_distance")
-_MOVE = ("target", "speed", "acceleration", *_SHARES, *_FLY, "termination")
-_OVERRIDES = ("speed", "acceleration", "deceleration", "joint")
+
+
+class _Data(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class _MoveData(_Data):
+    target: list[float]
+    fly_percent: float | None = None
+    fly_distance: float | None = None
+    speed: float = 1.0
+    acceleration: float = 1.0
+    joint_speed: float | list[float] | None = None
+    joint_acceleration: float | list[float] | None = None
+    joint_jerk: float | list[float] | None = None
+    termination: Termination | None = None
+
+    @classmethod
+    def of(cls, move: Move) -> _MoveData:
+        shares = {
+            name: np.asarray(value).tolist()
+            for name in ("joint_speed", "joint_acceleration", "joint_jerk")
+            if (value := getattr(move, name)) is not None
+        }
+        return cls(
+            target=move.target.tolist(),
+            fly_percent=move.fly.percent if isinstance(move.fly, FlyPercent) else None,
+            fly_distance=move.fly.distance if isinstance(move.fly, FlyDistance) else None,
+            speed=move.speed,
+            acceleration=move.acceleration,
+            termination=None if move.termination == "nosettle" else move.termination,
+            **shares,
+        )
+
+    def move(self) -> Move:
+        fields = self.model_dump(exclude_none=True)
+        percent, distance = fields.pop("fly_percent", None), fields.pop("fly_distance", None)
+        if None not in (percent, distance):
+            raise InvalidPlanFile("a move flies by percentage or by distance, not both")
+        if percent is not None:
+            return Move(fly=FlyPercent(percent), **fields)
+        return Move(fly=Stop() if distance is None else FlyDistance(distance), **fields)
+
+
+class _OverridesData(_Data):
+    speed: float = 1.0
+    acceleration: float = 1.0
+    deceleration: float = 1.0
+    joint: float | list[float] = 1.0
+
+
+class _LimitsData(_Data):
+    lower: list[float]
+    upper: list[float]
+    velocity: list[float]
+    acceleration: list[float]
+    jerk: list[float]
+
+
+class _FileData(_Data):
+    format: Literal["joint motion plan"]
+    version: Annotated[int, Field(ge=VERSION, le=VERSION)]
+    joints: list[str]
+    start: list[float]
+    overrides: _OverridesData = _OverridesData()
+    limits: _LimitsData | None = None
+    moves: list[_MoveData]
+    motion: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +180,13 @@ class PlanFile:
     def __post_init__(self) -> None:
         n = len(self.joint_names)
         sizes = [self.start.size, *(move.target.size for move in self.moves)]
-        if self.limits is not None:
-            sizes.append(self.limits.n_joints)
-        if self.trajectory is not None:
-            sizes.append(self.trajectory.n_joints)
+        sizes += [part.n_joints for part in (self.limits, self.trajectory) if part is not None]
         if len(set(self.joint_names)) < n:
             raise InvalidPlanFile(f"a joint is named twice in {', '.join(self.joint_names)}")
         if n == 0 or any(size != n for size in sizes):
             raise InvalidPlanFile(f"{n} joints are named, but positions or limits are for {sizes}")
+        if not all(np.all(np.isfinite(q)) for q in (self.start, *(m.target for m in self.moves))):
+            raise InvalidPlanFile("start and targets must be finite positions")
 
     @classmethod
     def of(cls, plan: MotionPlan, joint_names: Sequence[str]) -> PlanFile:
@@ -147,23 +218,27 @@ class PlanFile:
         planned = plan_moves(self.start, self.moves, limits, self.overrides)
         if not own or self.trajectory is None:
             return planned
-        self._check_motion(self.trajectory, planned)
+        _check_motion(self.trajectory, planned)
         return replace(planned, trajectory=self.trajectory)
 
     def to_dict(self) -> dict[str, Any]:
         """Return lists in SI units; `from_dict` restores every bit, through JSON too."""
+        overrides = {
+            name: np.asarray(getattr(self.overrides, name)).tolist()
+            for name in _OverridesData.model_fields
+        }
         data: dict[str, Any] = {
             "format": FORMAT,
             "version": VERSION,
             "joints": list(self.joint_names),
             "start": self.start.tolist(),
         }
-        shares = {name: np.asarray(getattr(self.overrides, name)).tolist() for name in _OVERRIDES}
-        if any(np.any(np.asarray(share) != 1.0) for share in shares.values()):
-            data["overrides"] = shares
+        if any(np.any(np.asarray(share) != 1.0) for share in overrides.values()):
+            data["overrides"] = overrides
         if self.limits is not None:
-            data["limits"] = {name: getattr(self.limits, name).tolist() for name in _LIMITS}
-        data["moves"] = [_move_to_dict(move) for move in self.moves]
+            rates = _LimitsData.model_fields
+            data["limits"] = {name: getattr(self.limits, name).tolist() for name in rates}
+        data["moves"] = [_MoveData.of(move).model_dump(exclude_none=True) for move in self.moves]
         if self.trajectory is not None:
             data["motion"] = self.trajectory.to_dict()
         return data
@@ -176,11 +251,22 @@ class PlanFile:
             InvalidPlanFile: a field is missing, unknown, or not what it should be.
         """
         try:
-            return _from_dict(cls, table(data))
+            read = _FileData.model_validate(data)
+            overrides, limits = read.overrides.model_dump(), read.limits
+            return cls(
+                joint_names=tuple(read.joints),
+                start=read_only(read.start),
+                moves=tuple(move.move() for move in read.moves),
+                overrides=Overrides(**overrides),
+                limits=None if limits is None else JointLimits(**limits.model_dump()),
+                trajectory=None if read.motion is None else PiecewiseCubic.from_dict(read.motion),
+            )
         except InvalidPlanFile:
             raise
-        except KeyError as error:
-            raise InvalidPlanFile(f"{error.args[0]!r} is missing") from error
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            place = ".".join(map(str, first["loc"])) or "it"
+            raise InvalidPlanFile(f"not a plan: {place}: {first['msg']}") from error
         except (PlannerError, *DAMAGED) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
 
@@ -197,112 +283,27 @@ class PlanFile:
         """
         return cls.from_dict(from_toml(text))
 
-    def _check_motion(self, stored: PiecewiseCubic, planned: MotionPlan) -> None:
-        try:
-            check_limits(stored, planned.limits)
-            check_smooth(stored, planned.limits)
-        except PlannerError as error:
-            raise InvalidPlanFile(f"the stored motion: {error}") from error
-        again, limits = planned.trajectory, planned.limits
-        extrema = _apart(stored, again).extrema()
-        apart = float(max(np.max(-extrema.lower), np.max(extrema.upper)))
-        rates = max(
-            float(np.max(extrema.velocity / limits.velocity)),
-            float(np.max(extrema.acceleration / limits.acceleration)),
-        )
-        late = abs(stored.duration - again.duration)
-        if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
-            raise InvalidPlanFile(
-                f"the stored motion of {stored.duration:.6f} s is not what the moves plan to "
-                f"({again.duration:.6f} s, up to {apart:.3g} rad away): they were edited, or "
-                "planned by another version; take the motion out to plan them anew"
-            )
 
-
-def _from_dict(cls: type[PlanFile], data: Mapping[str, Any]) -> PlanFile:
-    if data.get("format") != FORMAT:
-        raise InvalidPlanFile(f"format is {data.get('format')!r:.80}; expected {FORMAT!r}")
-    version = data.get("version")
-    if type(version) is not int or version != VERSION:
-        raise InvalidPlanFile(f"version is {version!r:.80}; this reads {VERSION}")
-    _only(data, ("format", "version", "joints", "start", "overrides", "limits", "moves", "motion"))
-    overrides = _only(table(data.get("overrides", {})), _OVERRIDES)
-    joint = one_or_more(overrides.pop("joint", 1.0))
-    limits, motion = data.get("limits"), data.get("motion")
-    return cls(
-        joint_names=tuple(text(name) for name in rows(data["joints"])),
-        start=_vector(data["start"]),
-        moves=tuple(_move_from_dict(table(move)) for move in rows(data["moves"])),
-        overrides=Overrides(**{k: number(v) for k, v in overrides.items()}, joint=joint),
-        limits=None if limits is None else _limits_from_dict(table(limits)),
-        trajectory=None if motion is None else PiecewiseCubic.from_dict(table(motion)),
-    )
-
-
-def _limits_from_dict(data: Mapping[str, Any]) -> JointLimits:
-    known = _only(data, _LIMITS)
-    return JointLimits(**{name: numbers(known[name], 1) for name in _LIMITS})
-
-
-def _move_to_dict(move: Move) -> dict[str, Any]:
-    data: dict[str, Any] = {"target": move.target.tolist()}
-    match move.fly:
-        case FlyPercent(percent):
-            data["fly_percent"] = float(percent)
-        case FlyDistance(distance):
-            data["fly_distance"] = float(distance)
-    data |= {"speed": float(move.speed), "acceleration": float(move.acceleration)}
-    for name in _SHARES:
-        shares = getattr(move, name)
-        if shares is not None:
-            data[name] = np.asarray(shares).tolist()
-    if move.termination != "nosettle":
-        data["termination"] = move.termination
-    return data
-
-
-def _move_from_dict(data: Mapping[str, Any]) -> Move:
-    fields: dict[str, Any] = {}
-    for name, value in _only(data, _MOVE).items():
-        if name == "target":
-            fields[name] = _vector(value)
-        elif name == "termination":
-            fields[name] = text(value)
-        elif name in _SHARES:
-            fields[name] = one_or_more(value)
-        elif name not in _FLY:
-            fields[name] = number(value)
-    if "target" not in fields:
-        raise InvalidPlanFile("'target' is missing")
-    return Move(fly=_fly(data), **fields)
-
-
-def _fly(data: Mapping[str, Any]) -> Fly:
-    if "fly_percent" in data and "fly_distance" in data:
-        raise InvalidPlanFile("a move flies by percentage or by distance, not both")
-    if "fly_percent" in data:
-        return FlyPercent(number(data["fly_percent"]))
-    if "fly_distance" in data:
-        return FlyDistance(number(data["fly_distance"]))
-    return STOP
-
-
-def _only(data: Mapping[str, Any], known: Sequence[str]) -> dict[str, Any]:
-    for name in data:
-        if name not in known:
-            raise InvalidPlanFile(f"{name!r} is unknown; known are {', '.join(known)}")
-    return dict(data)
-
-
-def _vector(values: Any) -> Array:
+def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
+    again, limits = planned.trajectory, planned.limits
     try:
-        array = numbers(values, 1)
-    except (TypeError, OverflowError) as error:
-        reason = f"{values!r:.80} is not one finite position per joint: {error}"
-        raise InvalidPlanFile(reason) from error
-    if not np.all(np.isfinite(array)):
-        raise InvalidPlanFile(f"{values!r:.80} is not one finite position per joint")
-    return array
+        check_limits(stored, limits)
+        check_smooth(stored, limits)
+    except PlannerError as error:
+        raise InvalidPlanFile(f"the stored motion: {error}") from error
+    extrema = _apart(stored, again).extrema()
+    apart = float(max(np.max(-extrema.lower), np.max(extrema.upper)))
+    rates = max(
+        float(np.max(extrema.velocity / limits.velocity)),
+        float(np.max(extrema.acceleration / limits.acceleration)),
+    )
+    late = abs(stored.duration - again.duration)
+    if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
+        raise InvalidPlanFile(
+            f"the stored motion of {stored.duration:.6f} s is not what the moves plan to "
+            f"({again.duration:.6f} s, up to {apart:.3g} rad away): they were edited, or "
+            "planned by another version; take the motion out to plan them anew"
+        )
 
 
 def _apart(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
@@ -313,24 +314,13 @@ def _apart(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
     end = min(one.duration, other.duration)
     knots, coefficients = [], []
     for joint in range(one.n_joints):
-        times = np.union1d(one.knots[joint], other.knots[joint])
-        times = np.unique(np.minimum(times, end))
+        times = np.unique(np.minimum(np.concatenate((one.knots[joint], other.knots[joint])), end))
         times = times if len(times) > 1 else np.zeros(2)
-        ours, theirs = (_pieces_from(motion, joint, times[:-1]) for motion in (one, other))
         knots.append(times)
-        coefficients.append(ours - theirs)
+        coefficients.append(
+            pieces_from(one, joint, times[:-1]) - pieces_from(other, joint, times[:-1])
+        )
     return PiecewiseCubic(tuple(knots), tuple(coefficients))
-
-
-def _pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
-    """Return what goes on from times (m,) [s], coefficients (m, 4), of one joint."""
-    knots = motion.knots[joint]
-    piece = np.searchsorted(knots[1:-1], times, side="right")
-    p, v, a, j = motion.coefficients[joint][piece].T
-    x = times - knots[piece]
-    return np.stack(
-        (p + x * (v + x * (a / 2.0 + x * j / 6.0)), v + x * (a + x * j / 2.0), a + x * j, j), axis=1
-    )
 
 
 _QUANTITIES: Final = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]")

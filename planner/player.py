@@ -11,10 +11,9 @@ import numpy as np
 from planner.arrays import Array
 from planner.errors import InvalidSetting, LimitExceeded, NotBegun, StartMismatch
 from planner.fourier import FourierSeries
-from planner.limits import JointLimits
-from planner.piecewise_cubic import PiecewiseCubic, Trajectory
+from planner.limits import JointLimits, position_rounding
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
 from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
-from planner.verify import position_rounding
 
 
 class PathReader:
@@ -92,18 +91,9 @@ class _Sines:
 def _merged(trajectory: PiecewiseCubic) -> tuple[list[float], Array]:
     """Return the times at which the cubic of any joint changes, and the cubics (m, 4, n)."""
     begins = np.unique(np.concatenate(trajectory.knots))[:-1]
-    merged = np.empty((len(begins), 4, trajectory.n_joints))
-    for joint, (knots, pieces) in enumerate(
-        zip(trajectory.knots, trajectory.coefficients, strict=True)
-    ):
-        piece = np.searchsorted(knots[1:-1], begins, side="right")
-        x = begins - knots[piece]
-        p, v, a, j = pieces[piece].T
-        merged[:, 0, joint] = p + x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0)))
-        merged[:, 1, joint] = v + x * (a + x * j * 0.5)
-        merged[:, 2, joint] = (a + x * j) * 0.5
-        merged[:, 3, joint] = j * (1.0 / 6.0)
-    return begins.tolist(), merged
+    joints = range(trajectory.n_joints)
+    merged = np.stack([pieces_from(trajectory, joint, begins) for joint in joints], axis=2)
+    return begins.tolist(), merged * np.array([1.0, 1.0, 0.5, 1.0 / 6.0])[:, None]
 
 
 # A last period this much shorter than the others is rounding, not motion.

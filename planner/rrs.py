@@ -8,17 +8,13 @@ clients of ORL and RRS-1 use. Speeds, accelerations and jerks are percentages he
 from __future__ import annotations
 
 from enum import Enum, IntEnum
-from math import nan
-from numbers import Integral, Real
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
-import numpy as np
-
-from planner.arrays import Array, read_only
+from planner.arrays import Array
 
 
 class Status(IntEnum):
-    """What a service answers: 0 or more is success, less is a refusal that changed nothing."""
+    """What a service returns: 0 or more is success, less is a refusal that changed nothing."""
 
     OK = 0
     NEED_MORE_DATA = 1
@@ -28,23 +24,6 @@ class Status(IntEnum):
     NO_TARGET = -42
     FATAL = -68
     INCONSISTENT = -76
-
-    @property
-    def meaning(self) -> str:
-        """The status in words."""
-        return _MEANINGS[self]
-
-
-_MEANINGS = {
-    Status.OK: "done; the motion goes on",
-    Status.NEED_MORE_DATA: "done; the next target may be set, or the motion ends at the last one",
-    Status.FINAL_STEP: "the last step of the motion: speed is zero",
-    Status.OUTPUT_FORMAT: "the output format is not available: joint positions only",
-    Status.TIME_TOO_SHORT: "the motion is not possible in the given time",
-    Status.NO_TARGET: "no target is set; the arm stands",
-    Status.FATAL: "no motion to the target could be planned",
-    Status.INCONSISTENT: "the motion is specified incompletely or inconsistently",
-}
 
 
 class MotionType(IntEnum):
@@ -135,51 +114,3 @@ class Step(NamedTuple):
     elapsed_time: float
     joint_limits: int
     events: tuple[Event, ...]
-
-
-E = TypeVar("E", bound=IntEnum)
-
-
-def real(value: Any) -> float:
-    """Return a number as a float; NaN, which no range holds, for what is none, as True or "1"."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return nan
-    try:
-        return float(value)
-    except OverflowError:
-        return nan
-
-
-def whole(value: Any) -> int | None:
-    """Return a whole number, of Python's or numpy's types; None for what is none."""
-    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
-
-
-def member(kind: type[E], value: Any) -> E | None:
-    """Return the member of an enumeration with this number; None where there is none."""
-    number = whole(value)
-    return kind(number) if number is not None and number in kind._value2member_map_ else None
-
-
-def reals(values: Any) -> Array:
-    """Return numbers, one or rows of them, as a read-only array.
-
-    Raises:
-        ValueError: an entry is no number, as True or "1", is too large for one, or rows differ
-            in length.
-    """
-    raw = np.asarray(values)
-    if raw.dtype == object:  # whole numbers beyond 64 bits, or what is none
-        raw = np.array([real(value) for value in raw.flat]).reshape(raw.shape)
-        if np.any(np.isnan(raw)):
-            raise ValueError(f"{values!r:.80} holds what is no number")
-    if raw.dtype.kind not in "iuf" or _holds_truth(values):
-        raise ValueError(f"{values!r:.80} is not made of numbers")
-    return read_only(raw)
-
-
-def _holds_truth(values: Any) -> bool:
-    """Whether True or False is among numbers, which an array would make 1 and 0 of."""
-    if isinstance(values, list | tuple):
-        return any(_holds_truth(value) for value in values)
-    return isinstance(values, bool | np.bool_)

@@ -6,15 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from planner.arrays import Array
 from planner.errors import LimitExceeded, NotSmooth
-from planner.limits import Bounds
+from planner.limits import Bounds, jump_rounding, position_rounding
 from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
-
-# Rounding, not licence: a position may leave its range by this share of the range's size, and
-# neighbouring pieces may differ by this share of the limit of the quantity.
-POSITION_ROUNDING = 1e-12
-RATE_ROUNDING = 1e-9
 
 
 class Bounded(Protocol):
@@ -33,18 +27,13 @@ def check_limits(trajectory: Bounded, limits: Bounds) -> None:
     """
     extrema = trajectory.extrema()
     slack = position_rounding(limits)
-    for quantity, value, bound, excess in (
-        ("position", extrema.lower, limits.lower, limits.lower - extrema.lower - slack),
-        ("position", extrema.upper, limits.upper, extrema.upper - limits.upper - slack),
-        ("velocity", extrema.velocity, limits.velocity, extrema.velocity - limits.velocity),
-        (
-            "acceleration",
-            extrema.acceleration,
-            limits.acceleration,
-            extrema.acceleration - limits.acceleration,
-        ),
-        ("jerk", extrema.jerk, limits.jerk, extrema.jerk - limits.jerk),
+    for quantity, end, sign in (
+        ("position", "lower", -1.0),
+        ("position", "upper", 1.0),
+        *((rate, rate, 1.0) for rate in ("velocity", "acceleration", "jerk")),
     ):
+        value, bound = getattr(extrema, end), getattr(limits, end)
+        excess = sign * (value - bound) - (slack if quantity == "position" else 0.0)
         if not np.all(excess <= 0.0):  # written so that NaN is refused too
             joint = int(np.argmax(excess))
             raise LimitExceeded(quantity, joint, float(value[joint]), float(bound[joint]))
@@ -90,25 +79,3 @@ def check_rest(trajectory: Trajectory, limits: Bounds) -> None:
             float(times[end]),
             float(left[end, joint, which]),
         )
-
-
-def position_rounding(limits: Bounds) -> Array:
-    """Return by how much a position may leave its range, which counts as rounding, (..., n)."""
-    return POSITION_ROUNDING * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
-
-
-def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
-    """Return the jumps of position, velocity, acceleration that count as rounding, (..., n, 3).
-
-    Durations (...) [s] and limits (..., n) are of one motion or of many.
-    """
-    # A knot is reported no finer than the clock allows: late in a long motion that shows.
-    tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
-    return np.stack(
-        (
-            position_rounding(limits) + tick * limits.velocity,
-            RATE_ROUNDING * limits.velocity + tick * limits.acceleration,
-            RATE_ROUNDING * limits.acceleration + tick * limits.jerk,
-        ),
-        axis=-1,
-    )

@@ -24,12 +24,13 @@ import sys
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Generic, NamedTuple, ParamSpec, Self, TypeVar, cast
+from typing import Any, Final, ParamSpec, Self, TypeAlias, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -44,32 +45,23 @@ from planner.limits import JointLimits
 from planner.moves import plan
 from planner.piecewise_cubic import PiecewiseCubic
 
-# How much later than its caller gives up a process ends itself, should its caller be gone.
-_GRACE = 1.0
-# Bytes of the number of a call, which stands before the call and before its answer.
-_NUMBER = 8
-
-
-class Task(NamedTuple):
-    """A call, and how long it may take [s]."""
-
-    timeout: float
-    function: Callable[..., object]
-    args: tuple[Any, ...]
-    kwargs: Mapping[str, Any]
-
-
-class Answer(NamedTuple):
-    """What a call returned or raised."""
-
-    result: object
-    error: Exception | None
+# How much later than its caller gives up a process ends itself, should its caller be gone [s].
+_GRACE: Final = 1.0
+# A new interpreter has numpy to load; on a busy machine that takes seconds.
+_START_TIMEOUT: Final = 60.0
+_ONE_THREAD: Final = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+_SERVE: Final = "import sys; from planner.worker import serve; serve(int(sys.argv[1]))"
+# How often a child that died before it could be asked anything is started anew: the reason may be
+# somebody else's (a full memory, a kill), and a map may have hours of work behind it.
+_FRESH_STARTS: Final = 2
 
 
 def serve(descriptor: int) -> None:
-    """Answer calls that arrive on an inherited socket, until its other end is closed.
+    """Run the calls that arrive on an inherited socket, until its other end is closed.
 
-    That its caller is gone ends the process in the middle of a call, too: nobody wants the answer,
+    That its caller is gone ends the process in the middle of a call, too: nobody wants the result,
     and whoever begins the same again must not find it at work.
     """
     # A crash is expected here; it must not fill a disk.
@@ -77,13 +69,10 @@ def serve(descriptor: int) -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     connection: Connection[bytes, bytes] = Connection(descriptor)
     threading.Thread(target=_end_with, args=(descriptor,), daemon=True).start()
-    try:
+    with suppress(EOFError, OSError):
         connection.send_bytes(b"ready")
         while True:
-            number, message = unnumbered(connection.recv_bytes())
-            connection.send_bytes(numbered(number, _answer(message)))
-    except (EOFError, OSError):
-        return
+            connection.send_bytes(_outcome(connection.recv_bytes()))
 
 
 def _end_with(descriptor: int) -> None:
@@ -98,42 +87,32 @@ def _end_with(descriptor: int) -> None:
     os._exit(0)
 
 
-def numbered(number: int, message: bytes) -> bytes:
-    """Return a message under the number of its call: outside of it, so that it is always known."""
-    return number.to_bytes(_NUMBER, "big") + message
-
-
-def unnumbered(message: bytes) -> tuple[int, bytes]:
-    """Return the number of a call and the message that stood under it."""
-    return int.from_bytes(message[:_NUMBER], "big"), message[_NUMBER:]
+def _outcome(message: bytes) -> bytes:
+    """Return what a call returned and what it raised, one of them None."""
+    try:
+        timeout, function, args, kwargs = load(message)
+        # Kills even a solver that hangs where no Python runs.
+        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)
+        try:
+            return pack((function(*args, **kwargs), None))
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+    except Exception as error:
+        if not isinstance(error, PlannerError):  # unexpected: where it happened is needed
+            error.add_note(f"in the planning process:\n{traceback.format_exc()}")
+        return pack((None, error))
 
 
 def pack(message: object) -> bytes:
-    """Return a message as bytes: a `Task`, an `Answer`, or what one of them is to carry."""
+    """Return what is sent to a process, or a part of it, as bytes."""
     buffer = io.BytesIO()
     _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(message)
     return buffer.getvalue()
 
 
 def load(message: bytes) -> Any:
-    """Return the message that `pack` made into bytes."""
+    """Return what `pack` made into bytes."""
     return pickle.loads(message)
-
-
-def _answer(message: bytes) -> bytes:
-    try:
-        timeout, function, args, kwargs = cast(Task, load(message))
-        # Kills even a solver that hangs where no Python runs.
-        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)
-        try:
-            result = function(*args, **kwargs)
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-        return pack(Answer(result, None))
-    except Exception as error:
-        if not isinstance(error, PlannerError):  # unexpected: where it happened is needed
-            error.add_note(f"in the planning process:\n{traceback.format_exc()}")
-        return pack(Answer(None, error))
 
 
 class _Pickler(pickle.Pickler):
@@ -163,13 +142,6 @@ def _revived(kind: type[Exception], args: tuple[Any, ...], state: dict[str, Any]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# A new interpreter has numpy to load; on a busy machine that takes seconds.
-_START_TIMEOUT = 60.0
-_ONE_THREAD: Final = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-)
-_SERVE = "import sys; from planner.worker import serve; serve(int(sys.argv[1]))"
-
 
 class WorkerProcess:
     """A process that calls functions for this one, one at a time.
@@ -188,12 +160,11 @@ class WorkerProcess:
         PlannerCrashed: the process died (in `call`: over it); a new one is on its way.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
-        PlannerOutOfStep: there is an answer, but not to the call begun last in this process.
+        PlannerOutOfStep: no call was begun in this process.
         Exception: whatever the function itself raised.
     """
 
     def __init__(self, *, timeout: float = 10.0) -> None:
-        self._number = 0
         self._owner = os.getpid()
         self._timeout = timeout
         self._process: subprocess.Popen[bytes] | None = None
@@ -219,21 +190,21 @@ class WorkerProcess:
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Return what the function returns in the child.
-
-        A child that has answered before and died while it was idle is replaced.
-        """
-        try:
-            self.send(function, *args, **kwargs)
-        except PlannerCrashed:  # nothing of this call: the system may have needed its memory
-            self.send(function, *args, **kwargs)
+        """Return what the function returns in the child; one that died while idle is replaced."""
+        self.begin(function, *args, **kwargs)
         result: T = self.receive()
         return result
 
+    def begin(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Begin a call as `send` does; a child that died before, or as it started, is replaced."""
+        for _ in range(_FRESH_STARTS):
+            with suppress(PlannerCrashed, PlannerNotStarted):  # nothing of this call
+                return self.send(function, *args, **kwargs)
+        return self.send(function, *args, **kwargs)
+
     def send(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Begin a call, whose result `receive` then fetches."""
-        self._number += 1
-        message = numbered(self._number, pack(Task(self._timeout, function, args, kwargs)))
+        message = pack((self._timeout, function, args, kwargs))
         self._disown()
         if self._process is None:
             self._start()
@@ -250,17 +221,14 @@ class WorkerProcess:
         """Return the result of the call that `send` began, or raise what it raised."""
         self._disown()
         if self._process is None:
-            raise PlannerOutOfStep
+            raise PlannerOutOfStep("the planning process was asked nothing from here")
         try:
             if not self._greeted:
                 self._read()
                 self._greeted = True
                 self.deadline = monotonic() + self._timeout
-            number, message = unnumbered(self._read())
-            if number != self._number:
-                raise PlannerOutOfStep
-            answer = load(message)
-        except (PlanningTimedOut, PlannerOutOfStep):
+            result, error = load(self._read())
+        except PlanningTimedOut:
             self._restart()
             raise
         except (EOFError, OSError):
@@ -268,9 +236,9 @@ class WorkerProcess:
         except BaseException:  # interrupted: what the child sends later belongs to nobody
             self.close()
             raise
-        if answer.error is not None:
-            raise answer.error
-        return answer.result
+        if error is not None:
+            raise error
+        return result
 
     def close(self) -> None:
         """End the process; a later call starts a new one."""
@@ -399,13 +367,8 @@ atexit.register(close_child)
 os.register_at_fork(after_in_child=_after_fork)
 
 
-Chunk = Sequence[int]
-
-# How often a child that died before it could be asked anything is started anew: the reason may be
-# somebody else's (a full memory, a kill), and a map may have hours of work behind it.
-_FRESH_STARTS: Final = 2
-# How often an item must end its process by itself: once may be the work of somebody else.
-_CRASHES_ALONE: Final = 2
+Chunk: TypeAlias = Sequence[int]
+Outcome: TypeAlias = T | PlannerCrashed | PlanningTimedOut
 
 
 def chunks_of(count: int, size: int) -> list[range]:
@@ -420,7 +383,7 @@ def map_in_children(
     arguments: Callable[[Chunk], tuple[Any, ...]],
     *,
     done: Callable[[int], None] | None = None,
-) -> list[T | PlannerCrashed | PlanningTimedOut]:
+) -> list[Outcome[T]]:
     """Return, for each index in order, what `stream_in_children` yields of it."""
     found = dict(stream_in_children(children, function, chunks, arguments, done=done))
     return [found[index] for index in range(len(found))]
@@ -433,7 +396,7 @@ def stream_in_children(
     arguments: Callable[[Chunk], tuple[Any, ...]],
     *,
     done: Callable[[int], None] | None = None,
-) -> Generator[tuple[int, T | PlannerCrashed | PlanningTimedOut], None, None]:
+) -> Generator[tuple[int, Outcome[T]], None, None]:
     """Call a function chunk by chunk in child processes; a crash costs one item, not its chunk.
 
     A chunk that ends its process, or takes longer than the children's time for one call, is tried
@@ -456,14 +419,16 @@ def stream_in_children(
         PlannerNotStarted: a child died before it was given anything to do, several times.
         Exception: whatever the function itself raised.
     """
-    work, idle = _Work[T](chunks), list(children)
+    fresh, again = iter(chunks), deque[Chunk]()
+    crashed, not_started = set[int](), Counter[int]()
+    idle = list(children)
     busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
-    found: list[tuple[int, T | PlannerCrashed | PlanningTimedOut]] = []
+    found: list[tuple[int, Outcome[T]]] = []
     try:
         while True:
-            while idle and (chunk := work.next_chunk()) is not None:
+            while idle and (chunk := again.popleft() if again else next(fresh, None)) is not None:
                 child = idle.pop()
-                _begin(child, function, arguments(chunk))
+                child.begin(function, *arguments(chunk))
                 busy[child.connection] = child, chunk
             if done is not None and found:
                 done(len(found))
@@ -477,62 +442,24 @@ def stream_in_children(
             for link in {*ready, *late}:
                 child, chunk = busy.pop(link)
                 idle.append(child)
-                found += work.fetch(child, chunk)
+                try:
+                    found += zip(chunk, child.receive(), strict=True)
+                    not_started.pop(id(child), None)
+                except PlannerNotStarted:
+                    not_started[id(child)] += 1
+                    if not_started[id(child)] > _FRESH_STARTS:
+                        raise
+                    again.append(chunk)
+                except (PlannerCrashed, PlanningTimedOut) as error:
+                    first = chunk[0]
+                    if len(chunk) > 1:
+                        again.extend([index] for index in chunk)
+                    elif isinstance(error, PlannerCrashed) and first not in crashed:
+                        crashed.add(first)
+                        again.append(chunk)
+                    else:
+                        found.append((first, error))
     finally:  # after Ctrl-C, a fault of ours or a break: nobody will fetch what is under way
         for child in children:
             if child not in idle:
                 child.close()
-
-
-class _Work(Generic[T]):
-    """What is still to be done, and how often it went wrong."""
-
-    def __init__(self, chunks: Iterable[Chunk]) -> None:
-        self._chunks = iter(chunks)
-        self._again: deque[Chunk] = deque()
-        self._crashes: Counter[int] = Counter()
-        self._not_started: Counter[int] = Counter()
-
-    def next_chunk(self) -> Chunk | None:
-        """Return what is to be handed out next, None if nothing is."""
-        return self._again.popleft() if self._again else next(self._chunks, None)
-
-    def fetch(
-        self, child: WorkerProcess, chunk: Chunk
-    ) -> list[tuple[int, T | PlannerCrashed | PlanningTimedOut]]:
-        """Return the results of a chunk from a child; nothing if it is to be tried again."""
-        try:
-            found = list(child.receive())
-        except PlannerNotStarted:
-            self._not_started[id(child)] += 1
-            if self._not_started[id(child)] > _FRESH_STARTS:
-                raise
-            self._again.append(chunk)
-            return []
-        except (PlannerCrashed, PlanningTimedOut) as error:
-            return self._failed(chunk, error)
-        del self._not_started[id(child)]
-        return list(zip(chunk, found, strict=True))
-
-    def _failed(
-        self, chunk: Chunk, error: PlannerCrashed | PlanningTimedOut
-    ) -> list[tuple[int, T | PlannerCrashed | PlanningTimedOut]]:
-        if len(chunk) > 1:
-            self._again.extend([index] for index in chunk)
-            return []
-        (index,) = chunk
-        self._crashes[index] += isinstance(error, PlannerCrashed)
-        if isinstance(error, PlannerCrashed) and self._crashes[index] < _CRASHES_ALONE:
-            self._again.append(chunk)
-            return []
-        return [(index, error)]
-
-
-def _begin(child: WorkerProcess, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Give a child a task; one that died while idle, or while it was started, is replaced."""
-    for _ in range(_FRESH_STARTS):
-        try:
-            return child.send(function, *arguments)
-        except (PlannerCrashed, PlannerNotStarted):
-            continue
-    return child.send(function, *arguments)

@@ -22,7 +22,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.factor.factor import Factor
-from planner.checked_data import number, whole
+from planner.checked_data import Whole, strict
 
 Array = NDArray[np.float64]
 
@@ -61,12 +61,11 @@ class Criteria:
         """Restore what `dataclasses.asdict` returned.
 
         Raises:
-            TypeError, LookupError, OverflowError: the data are none, or of no numbers.
+            TypeError, LookupError, ValueError: the data are none, or of no numbers.
         """
-        given = {**data}
-        n_samples = whole(given.pop("n_samples"))
-        known = {name: number(value) for name, value in given.items() if value is not None}
-        return cls(**known, n_samples=n_samples)
+        given = {name: value for name, value in data.items() if value is not None}
+        n_samples = strict(Whole, given.pop("n_samples"))
+        return cls(**strict(dict[str, float], given), n_samples=n_samples)
 
     @classmethod
     def of_gram(cls, gram: Array, n_samples: int) -> Self:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
 from identification.excitation.criteria import Criteria
 from planner import FlyPercent, FourierSeries, Move, PiecewiseCubic
-from planner.checked_data import DAMAGED, number, numbers, table, text, whole
+from planner.checked_data import DAMAGED, Whole, numbers, strict
 
 Array = NDArray[np.float64]
 
@@ -116,29 +117,31 @@ class Excitation:
             sines = isinstance(trajectory, FourierSeries)
             return cls(
                 trajectory=trajectory,
-                criteria=Criteria.from_dict(table(data["criteria"])),
-                method=_name(data.get("method", _FIRST_METHOD)),
-                seed=whole(data["seed"]),
-                tried=whole(data["tried"]),
-                rejected={_name(why): whole(n) for why, n in table(data["rejected"]).items()},
+                criteria=Criteria.from_dict(data["criteria"]),
+                method=strict(Name, data.get("method", _FIRST_METHOD)),
+                seed=strict(Whole, data["seed"]),
+                tried=strict(Whole, data["tried"]),
+                rejected=strict(dict[Name, Whole], data["rejected"]),
                 **({} if sines else _planned(data, trajectory.n_joints)),
             )
         except DAMAGED as error:
-            raise ValueError(f"not an excitation: {error!r}") from error
+            raise ValueError(f"not an excitation: {error!r:.300}") from error
 
 
 def _planned(data: Mapping[str, Any], n_joints: int) -> dict[str, Any]:
     points, speed = numbers(data["via_points"], 2), numbers(data["speed"], 1)
     if len(points) < 2 or points.shape[1] != n_joints or len(speed) != n_joints:
         raise ValueError(f"via points {points.shape} and speeds {speed.shape} of {n_joints} joints")
-    return {"via_points": points, "speed": speed, "fly": number(data["fly"])}
+    return {"via_points": points, "speed": speed, "fly": strict(float, data["fly"])}
 
 
-def _name(value: Any) -> str:
-    name = text(value)
+def _printable(name: str) -> str:
     if not name.isprintable():
         raise ValueError(f"{name!r:.80} cannot be printed")
     return name
+
+
+Name = Annotated[str, AfterValidator(_printable)]
 
 
 def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:
@@ -147,6 +150,6 @@ def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSer
     Raises:
         TypeError, ValueError: the data are no motion.
     """
-    if table(data).get("type") == "fourier_series":
+    if data.get("type") == "fourier_series":
         return FourierSeries.from_dict(data)
     return PiecewiseCubic.from_dict(data)

@@ -24,8 +24,8 @@ from planner import (
     PiecewiseCubic,
     check_rest,
 )
+from planner.limits import position_rounding
 from planner.piecewise_cubic import Extrema
-from planner.verify import position_rounding
 
 Array = NDArray[np.float64]
 

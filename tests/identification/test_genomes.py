@@ -186,7 +186,7 @@ def test_a_motion_that_cannot_be_planned_is_told_in_its_place(monkeypatch):
     points[1, 2, 3] += 100.0
     monkeypatch.setattr(ViaPointGenome, "decode", lambda self, genes: (points, speed))
     kinds = [type(motion).__name__ for motion in OPEN.motions(genes)]
-    assert kinds == ["PiecewiseCubic", "ViaPointOutOfLimits", "PiecewiseCubic"]
+    assert kinds == ["PiecewiseCubic", "InvalidViaPoints", "PiecewiseCubic"]
 
 
 @pytest.mark.parametrize("genome", [OPEN, CLOSED])

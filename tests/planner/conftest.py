@@ -6,6 +6,7 @@ import pytest
 from planner import JointLimits, PiecewiseCubic
 from planner.corners import finish_many, solve_many
 from planner.limits import Allowance
+from planner.moves import Legs
 
 DEG = np.pi / 180.0
 
@@ -35,12 +36,25 @@ def random_points(six_axis_limits: JointLimits):
     return points
 
 
+def rows_of(*limits: JointLimits) -> Allowance:
+    """Limits as the rows of one table."""
+    return Allowance(
+        *(np.array([getattr(one, name) for one in limits]) for name in Allowance._fields)
+    )
+
+
+def legs_between(points: np.ndarray, limits: JointLimits) -> Legs:
+    """The moves from each point to the next, at full limits."""
+    bounds = rows_of(*[limits] * (len(points) - 1))
+    return Legs.between(points[:-1], points[1:], bounds, bounds.acceleration)
+
+
 @pytest.fixture(scope="session")
 def join():
     """Join two states (n, 3) within limits in about a time [s], as a corner does."""
 
     def joined(start, end, limits: JointLimits, time: float) -> PiecewiseCubic | None:
-        bounds = Allowance.of_many([limits])
+        bounds = rows_of(limits)
         found = solve_many(start[None], end[None], np.array([time]), bounds)
         return finish_many(found, bounds)[0] if found.found[0] is not None else None
 

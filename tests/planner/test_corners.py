@@ -9,42 +9,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner import PiecewiseCubic, plan
-from planner.corners import (
-    FIRST_SHARES,
-    LAST_SHARES,
-    STOP,
-    fly_by,
-    fly_within,
-    is_supported,
-    passing,
-    ranked,
-    solve_many,
-)
+from planner import FlyDistance, FlyPercent, PiecewiseCubic, Stop, plan
+from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, ranked, solve_many
 from planner.errors import UnsupportedSolver
-from planner.segments import StraightSegment
+from planner.interpolator import corner
+from planner.piecewise_cubic import Block
+from tests.planner.conftest import legs_between
 
-CUT = {"velocity": 0.99, "acceleration": 0.98, "jerk": 0.98}
+
+def flown(points, limits, share=0.5):
+    """The corner at the middle one of three points."""
+    return corner(legs_between(points, limits), FlyPercent(100.0 * share))
 
 
-def corner(points, limits):
-    cautious = limits.scaled(**CUT)
-    return (
-        StraightSegment.between(points[0], points[1], cautious),
-        StraightSegment.between(points[1], points[2], cautious),
-    )
+def cut(points, limits, share):
+    """The states that a corner joins, and the time that it replaces."""
+    moves = legs_between(points, limits).moves
+    leave, enter = share * moves.slowing_down[0], share * moves.speeding_up[1]
+    start, end = moves.states(np.array([moves.durations[0] - leave, enter]))
+    return start, end, leave + enter
 
 
 @pytest.mark.parametrize("fly", [0.05, 0.1, 0.5, 1.0])
-def test_a_join_begins_and_ends_exactly_in_the_states_it_joins(
-    six_axis_limits, random_points, join, fly
-):
+def test_a_join_begins_and_ends_exactly_in_its_states(six_axis_limits, random_points, join, fly):
     # The solver by itself is content with 1e-8 rad, which millisecond samples turn into jerk.
     for seed in range(20):
-        before, after = corner(random_points(seed, 3), six_axis_limits)
-        start = before.state(before.duration - fly * before.slowing_down)
-        end = after.state(fly * after.speeding_up)
-        joined = join(start, end, six_axis_limits, fly * (before.slowing_down + after.speeding_up))
+        start, end, time = cut(random_points(seed, 3), six_axis_limits, fly)
+        joined = join(start, end, six_axis_limits, time)
         assert joined is not None
         ends = np.array([table[-1] for table in joined.ends()])
         starts = np.array([table[0, :3] for table in joined.coefficients])
@@ -53,102 +44,85 @@ def test_a_join_begins_and_ends_exactly_in_the_states_it_joins(
         np.testing.assert_allclose(ends[:, 1:], end[:, 1:], rtol=0, atol=1e-9)
 
 
+class Solver:
+    """A solver that raises what a test wants."""
+
+    error: Exception = AssertionError("the solver was asked")
+
+    def __init__(self, n_joints):
+        assert n_joints == 6
+
+    def calculate(self, *_):
+        raise self.error
+
+
 @pytest.mark.parametrize("quantity", [1, 2])
 @pytest.mark.parametrize("which", [0, 1])
 def test_states_near_the_limits_never_reach_the_solver(
     six_axis_limits, join, monkeypatch, quantity, which
 ):
-    class NoSolver:
-        def __init__(self, n_joints):
-            assert n_joints == 6
-
-        def calculate(self, *_):
-            raise AssertionError("the solver was asked")
-
-    monkeypatch.setattr("planner.corners.ruckig.Ruckig", NoSolver)
+    monkeypatch.setattr("planner.corners.ruckig.Ruckig", Solver)
     states = np.zeros((2, 6, 3))
     bound = (six_axis_limits.velocity, six_axis_limits.acceleration)[quantity - 1]
     states[which, 3, quantity] = -0.995 * bound[3]
     assert join(*states, six_axis_limits, 0.4) is None
 
 
-@pytest.mark.parametrize("kind", ["RuckigError", "ValueError"])
-def test_whatever_the_solver_raises_the_motion_stops_instead(
-    six_axis_limits, random_points, monkeypatch, kind
+@pytest.mark.parametrize("error", [ruckig.RuckigError, ValueError])
+def test_whatever_the_solver_raises_the_motion_stops(
+    six_axis_limits, random_points, monkeypatch, error
 ):
     # A number of an error that its Python face does not know is a ValueError.
-    error = ruckig.RuckigError if kind == "RuckigError" else ValueError
-
-    class Refuses:
-        def __init__(self, n_joints):
-            assert n_joints == 6
-
-        def calculate(self, *_):
-            raise error("-101 is not a valid Result")
-
-    monkeypatch.setattr("planner.corners.ruckig.Ruckig", Refuses)
-    assert fly_by(*corner(random_points(4, 3), six_axis_limits), six_axis_limits, 0.5) is STOP
+    monkeypatch.setattr(Solver, "error", error("-101 is not a valid Result"))
+    monkeypatch.setattr("planner.corners.ruckig.Ruckig", Solver)
+    assert flown(random_points(4, 3), six_axis_limits) is STOP
 
 
-def test_a_join_that_would_leave_the_position_limits_is_tightened_until_it_does_not(
-    six_axis_limits, random_points
-):
+def test_a_join_beyond_a_position_limit_is_tightened(six_axis_limits, random_points):
     tightened = 0
     for seed in range(300):
         points = random_points(seed, 3)
         # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
         points[1] = six_axis_limits.upper
-        passed = fly_by(*corner(points, six_axis_limits), six_axis_limits, 1.0)
+        passed = flown(points, six_axis_limits, 1.0)
         if passed.join is not None:
             assert np.all(passed.join.extrema().upper <= six_axis_limits.upper + 1e-9)
-        before, _ = corner(points, six_axis_limits)
-        tightened += passed.leave < 0.89 * before.slowing_down
+        tightened += passed.share < 0.89
     assert tightened > 0
 
 
-def test_a_corner_that_would_take_longer_than_a_stop_is_given_up(
-    six_axis_limits, random_points, monkeypatch
-):
-    before, after = corner(random_points(1, 3), six_axis_limits)
-    asked = []
+def test_a_corner_slower_than_a_stop_is_given_up(six_axis_limits, random_points, monkeypatch):
+    points, asked = random_points(1, 3), []
 
-    def slow(starts, ends, times, bounds):
+    def slow(starts, *rest):
         asked.extend(starts)
-        found = solve_many(starts, ends, times, bounds)
+        found = solve_many(starts, *rest)
         return found._replace(durations=np.full(len(starts), 10.0))
 
     monkeypatch.setattr("planner.corners.solve_many", slow)
-    assert fly_by(before, after, six_axis_limits, 0.5) is STOP
-    tried = [
-        before.state(before.duration - 0.5 * part * before.slowing_down)
-        for part in FIRST_SHARES + LAST_SHARES
-    ]
+    assert flown(points, six_axis_limits) is STOP
+    parts = FIRST_SHARES + LAST_SHARES
+    tried = [cut(points, six_axis_limits, 0.5 * part)[0] for part in parts]
     np.testing.assert_array_equal(asked, tried)
 
 
-@pytest.mark.parametrize("missed", ["too slow", "unknown"])
-def test_a_join_that_the_solver_misses_is_replaced_by_one_next_to_it(
+@pytest.mark.parametrize("missed", [1.2, np.inf], ids=["too slow", "unknown"])
+def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(
     six_axis_limits, random_points, monkeypatch, missed
 ):
-    before, after = corner(random_points(1, 3), six_axis_limits)
-
     def misses_the_first(*asked):
         found = solve_many(*asked)
         # What was seen to happen: a join much longer than need be, still shorter than to stop.
-        found.durations[0] *= 1.2 if missed == "too slow" else np.inf
+        found.durations[0] *= missed
         return found
 
     monkeypatch.setattr("planner.corners.solve_many", misses_the_first)
-    passed = fly_by(before, after, six_axis_limits, 0.5)
-    assert passed.how == "reduced"
-    assert passed.share == 0.5 * 0.9999
+    passed = flown(random_points(1, 3), six_axis_limits)
+    assert (passed.how, passed.share) == ("reduced", 0.5 * 0.9999)
     assert passed.join is not None
 
 
-savings = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5)
-
-
-@given(savings)
+@given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5))
 def test_corners_are_ranked_by_what_they_save(savings):
     order = ranked(np.array(savings)).tolist()
     assert sorted(order) == list(range(len(savings)))
@@ -156,106 +130,100 @@ def test_corners_are_ranked_by_what_they_save(savings):
     assert all(a + 1e-9 >= b for a, b in pairwise(ranks))
 
 
-def test_the_corner_asked_for_comes_first_among_equals_and_an_unknown_one_last():
-    def order(*savings):
-        return ranked(np.array(savings)).tolist()
-
-    assert order(0.5, 0.5 + 1e-12, 0.5) == [0, 1, 2]
-    assert order(0.5, 0.6, 0.55) == [1, 2, 0]
-    # Where the one asked for is unknown, no other takes its place.
-    assert order(-np.inf, 0.5, 0.5 + 1e-12) == [2, 1, 0]
+@pytest.mark.parametrize(
+    ("savings", "order"),
+    [
+        ([0.5, 0.5 + 1e-12, 0.5], [0, 1, 2]),
+        ([0.5, 0.6, 0.55], [1, 2, 0]),
+        # Where the one asked for is unknown, no other takes its place.
+        ([-np.inf, 0.5, 0.5 + 1e-12], [2, 1, 0]),
+    ],
+)
+def test_the_corner_asked_for_comes_first_among_equals(savings, order):
+    assert ranked(np.array(savings)).tolist() == order
 
 
 @pytest.mark.parametrize("distance", [1e-6, 1e-3, 0.05, 0.3, 10.0])
-def test_a_corner_within_a_distance_uses_most_of_it_and_no_more(
-    six_axis_limits, random_points, distance
-):
+def test_a_corner_within_a_distance_uses_most_of_it(six_axis_limits, random_points, distance):
     used = []
     for seed in range(25):
-        before, after = corner(random_points(seed, 3), six_axis_limits)
-        passed = fly_within(before, after, six_axis_limits, distance)
-        whole = fly_by(before, after, six_axis_limits, 1.0)
+        points = random_points(seed, 3)
+        passed = corner(legs_between(points, six_axis_limits), FlyDistance(distance))
+        whole = flown(points, six_axis_limits, 1.0)
         assert passed.join is not None and whole.join is not None
         q = passed.join.sample(np.linspace(0.0, passed.join.duration, 20001))[0]
-        nearest = np.linalg.norm(q - after.start, axis=1).min()
+        nearest = np.linalg.norm(q - points[1], axis=1).min()
         assert nearest <= distance * (1 + 1e-6)
-        widest = passing(whole.join, after.start).distance
-        used.append(nearest / min(distance, widest))
+        used.append(nearest / min(distance, passing(whole.join, points[1]).distance))
     assert np.median(used) >= 0.9
 
 
-def test_a_distance_of_nothing_is_a_stop(six_axis_limits, random_points):
-    assert fly_within(*corner(random_points(2, 3), six_axis_limits), six_axis_limits, 0.0) is STOP
-
-
-def test_no_corner_is_planned_with_an_unknown_solver(six_axis_limits, random_points, monkeypatch):
-    monkeypatch.setattr("planner.corners._VERSION", "0.20.1")
-    monkeypatch.setattr("planner.corners._SUPPORTED", False)
-    segments = corner(random_points(3, 3), six_axis_limits)
-    with pytest.raises(UnsupportedSolver, match=r"0\.20\.1.*0\.19"):
-        fly_by(*segments, six_axis_limits, 0.5)
-    assert fly_by(*segments, six_axis_limits, 0.0) is STOP
-
-
-@pytest.mark.parametrize(
-    ("version", "known"),
-    [("0.19.4", True), ("0.19.9", True), ("0.20.0", False), ("0.1.9", False), ("unknown", False)],
-)
-def test_the_series_of_a_version_is_what_counts(version, known):
-    assert is_supported(version) is known
+@pytest.mark.parametrize("version", ["0.20.1", "0.1.9", "unknown", "0.19.9"])
+def test_no_corner_is_planned_with_an_unknown_solver(
+    six_axis_limits, random_points, monkeypatch, version
+):
+    monkeypatch.setattr("planner.corners._VERSION", version)
+    points = random_points(3, 3)
+    assert flown(points, six_axis_limits, 0.0) is STOP
+    if version == "0.19.9":
+        assert flown(points, six_axis_limits).how == "flown"
+    else:
+        with pytest.raises(UnsupportedSolver, match=rf"{version}.*0\.19"):
+            flown(points, six_axis_limits)
 
 
 def test_nothing_is_cut_from_a_stop(six_axis_limits, random_points):
     a, b, c = random_points(6, 3)
-    assert fly_by(*corner((a, b, c), six_axis_limits), six_axis_limits, 0.0) is STOP
-    assert fly_by(*corner((a, b, b), six_axis_limits), six_axis_limits, 0.5) is STOP
+    for fly in (Stop(), FlyPercent(0.0), FlyDistance(0.0)):
+        assert corner(legs_between(np.array([a, b, c]), six_axis_limits), fly) is STOP
+    assert flown(np.array([a, b, b]), six_axis_limits) is STOP
 
 
 numbers = st.floats(-3.0, 3.0)
 
 
-def test_it_finds_the_foot_of_the_perpendicular():
-    # Along the first joint at 2 rad/s, past a point that lies 0.5 rad beside the line.
-    line = PiecewiseCubic(
-        (np.array([0.0, 3.0]),) * 2, (np.array([[0, 2, 0, 0.0]]), np.zeros((1, 4)))
+class TestPassing:
+    """Where a motion is nearest to a point."""
+
+    def test_it_finds_the_foot_of_the_perpendicular(self):
+        # Along the first joint at 2 rad/s, past a point that lies 0.5 rad beside the line.
+        line = PiecewiseCubic(
+            (np.array([0.0, 3.0]),) * 2, (np.array([[0, 2, 0, 0.0]]), np.zeros((1, 4)))
+        )
+        passed = passing(line, np.array([1.37, 0.5]))
+        assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
+        assert passed.distance == pytest.approx(0.5, abs=1e-12)
+
+    def test_a_point_on_the_path_is_met(self, six_axis_limits, random_points):
+        # As long as a join, at rest at one end, at both, or at neither.
+        points = random_points(1, 3)
+        joined = flown(points, six_axis_limits).join
+        start, stop = (plan(points[k : k + 2], six_axis_limits) for k in (0, 1))
+        for motion in (joined, start, stop):
+            for time in np.linspace(0.01, 0.99, 37) * motion.duration:
+                here = motion.sample_one(time)[0]
+                passed = passing(motion, here)
+                assert passed.distance < 1e-8
+                assert motion.sample_one(passed.time)[0] == pytest.approx(here, abs=1e-7)
+
+    @given(
+        arrays(np.float64, (2, 3), elements=numbers),
+        arrays(np.float64, (2, 4), elements=numbers),
+        arrays(np.float64, 2, elements=numbers),
     )
-    passed = passing(line, np.array([1.37, 0.5]))
-    assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
-    assert passed.distance == pytest.approx(0.5, abs=1e-12)
+    def test_no_sample_is_nearer_than_between_two_looks(self, start, jerks, point):
+        knots = np.tile(np.linspace(0.0, 1.0, 5), (1, 2, 1))
+        (motion,) = Block.from_jerks(start[None], knots, jerks[None]).tables()
+        passed = passing(motion, point)
+        q = motion.sample(np.linspace(0.0, 1.0, 2001))[0]
+        sampled = np.linalg.norm(q - point, axis=1).min()
+        # Two dips of like depth between the looks at a path may be mistaken for one another.
+        between = 0.5 / 64 * np.linalg.norm(motion.extrema().velocity)
+        assert sampled - 0.0005 * between * 64 <= passed.distance <= sampled + between
+        # What is said is true of the path: the point is that near at that time.
+        reached = motion.sample_one(passed.time)[0]
+        assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
 
-
-def test_a_point_on_the_path_is_met(six_axis_limits, random_points):
-    whole = plan(random_points(1, 3), six_axis_limits, fly=0.5)
-    # As long as a join, at rest at one end, at both, or at neither.
-    for begin in (0.0, 0.3 * whole.duration, whole.duration - 0.5):
-        motion = whole.restricted(begin, begin + 0.5)
-        for time in np.linspace(0.01, 0.99, 37) * motion.duration:
-            passed = passing(motion, motion.sample_one(time)[0])
-            assert passed.distance < 1e-8
-            assert motion.sample_one(passed.time)[0] == pytest.approx(
-                motion.sample_one(time)[0], abs=1e-8
-            )
-
-
-@given(
-    arrays(np.float64, (2, 3), elements=numbers),
-    arrays(np.float64, (2, 4), elements=numbers),
-    arrays(np.float64, 2, elements=numbers),
-)
-def test_no_sample_is_nearer_by_more_than_the_path_runs_between_two(start, jerks, point):
-    knots = np.tile(np.linspace(0.0, 1.0, 5), (2, 1))
-    motion = PiecewiseCubic.from_jerks(start, knots, jerks)
-    passed = passing(motion, point)
-    q = motion.sample(np.linspace(0.0, 1.0, 2001))[0]
-    sampled = np.linalg.norm(q - point, axis=1).min()
-    # Two dips of like depth between the looks at a path may be mistaken for one another.
-    between = 0.5 / 64 * np.linalg.norm(motion.extrema().velocity)
-    assert sampled - 0.0005 * between * 64 <= passed.distance <= sampled + between
-    # What is said is true of the path: the point is that near at that time.
-    reached = motion.sample_one(passed.time)[0]
-    assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
-
-
-def test_a_motion_of_no_length_is_where_it_is():
-    still = PiecewiseCubic((np.zeros(2),), (np.zeros((1, 4)),))
-    assert passing(still, np.array([0.25])) == (0.0, 0.25)
+    def test_a_motion_of_no_length_is_where_it_is(self):
+        still = PiecewiseCubic((np.zeros(2),), (np.zeros((1, 4)),))
+        assert passing(still, np.array([0.25])) == (0.0, 0.25)

@@ -1,22 +1,72 @@
+"""The interpolator: its motion, its services in any order, and its page."""
+
 from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from scipy.spatial import cKDTree
 
-from planner.commands import FlyDistance, FlyPercent, Move, Overrides, Stop
-from planner.moves import plan_moves
+from planner import JointLimits, worker
+from planner.errors import InvalidSetting, PlannerNotStarted
+from planner.interpolator import Interpolator, corner
+from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
 from planner.rrs import AccelerationKind, EventKind, FlybyCriterion, SpeedCorrection, Status
-from tests.planner.interpolating import (
-    PERIOD,
-    events,
-    positions,
-    queue,
-    ready,
-    steps_to_rest,
-    worst_ratios,
-)
+from planner.worker import in_child
+
+PERIOD = 0.002
+
+
+def ready(limits, position, *, fly=None, advance=1, **options):
+    """An interpolator that waits for targets, flying by `fly` %."""
+    interpolator = Interpolator(limits, PERIOD, **options)
+    assert interpolator.initialize() == Status.OK
+    assert interpolator.set_initial_position(position) == Status.OK
+    if fly is not None:
+        interpolator.select_flyby_mode(True)
+        interpolator.set_flyby_criteria_parameter(FlybyCriterion.PERCENT, fly)
+    interpolator.set_advance_motion(advance)
+    return interpolator
+
+
+def queue(interpolator, points, first=1):
+    for target_id, point in enumerate(points, first):
+        assert interpolator.set_next_target(target_id, point) >= 0, interpolator.refusal
+
+
+def steps_to_rest(interpolator, at_most=20_000):
+    """All steps up to one that is final."""
+    steps = []
+    while not steps or steps[-1].status in (Status.OK, Status.NEED_MORE_DATA):
+        steps.append(interpolator.get_next_step())
+        assert len(steps) < at_most
+    assert steps[-1].status == Status.FINAL_STEP
+    return steps
+
+
+def positions(steps):
+    return np.array([step.position for step in steps])
+
+
+def events(steps):
+    return [(event.kind, event.target_id) for step in steps for event in step.events]
+
+
+def worst_ratios(start, q, limits, period=PERIOD):
+    """Largest velocity, acceleration, jerk of set-points from rest to rest, by differences."""
+    padded = np.concatenate((np.tile(start, (4, 1)), q, np.tile(q[-1], (4, 1))))
+    return [
+        np.max(np.abs(np.diff(padded, order, axis=0)) / period**order / bound)
+        for order, bound in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1)
+    ]
+
 
 # -- the motion ---------------------------------------------------------------------------
 
@@ -94,9 +144,7 @@ def test_a_target_set_in_time_is_as_good_as_one_set_at_once(six_axis_limits, ran
 
 @given(st.integers(0, 10**6), st.floats(0.0, 1.0))
 @settings(max_examples=15, deadline=None)
-def test_a_late_target_finds_the_arm_stopping_at_the_point_before(
-    six_axis_limits, random_points, seed, late
-):
+def test_a_late_target_finds_the_arm_stopping(six_axis_limits, random_points, seed, late):
     a, b, c = random_points(seed, 3)
     plan = plan_moves(a, [Move(b, fly=FlyPercent(50.0)), Move(c)], six_axis_limits)
     alone = plan_moves(a, [Move(b)], six_axis_limits).trajectory.duration
@@ -205,9 +253,7 @@ def test_the_same_calls_give_the_same_bits(six_axis_limits, random_points):
 
 
 @pytest.mark.parametrize("advance", [0, 1, 3])
-def test_data_are_asked_for_while_fewer_targets_are_ahead_than_wanted(
-    six_axis_limits, random_points, advance
-):
+def test_data_are_asked_for_while_few_targets_are_ahead(six_axis_limits, random_points, advance):
     points = random_points(30, 6)
     interpolator = ready(six_axis_limits, points[0], fly=50.0, advance=advance)
     answers = [interpolator.set_next_target(k, point) for k, point in enumerate(points[1:])]
@@ -248,7 +294,7 @@ def test_a_motion_time_is_met(six_axis_limits, random_points, seed, factor):
     assert last == pytest.approx(factor * shortest + first, rel=1e-9)
 
 
-def test_a_motion_time_too_short_is_refused_and_changes_nothing(six_axis_limits, random_points):
+def test_a_motion_time_too_short_is_refused(six_axis_limits, random_points):
     a, b = random_points(40, 2)
     shortest = plan_moves(a, [Move(b)], six_axis_limits).trajectory.duration
     interpolator = ready(six_axis_limits, a)
@@ -271,3 +317,694 @@ def test_the_interpolation_time_changes_the_steps_not_the_motion(six_axis_limits
     every_other = positions(fast)[1 : 2 * len(slow) - 2 : 2]
     np.testing.assert_allclose(positions(slow)[:-1], every_other, rtol=0, atol=1e-12)
     assert slow[-1].elapsed_time == pytest.approx(fast[-1].elapsed_time)
+
+
+# -- overrides, stopping, continuing and cancelling ---------------------------------------
+
+PACE_ROUNDING = 1e-5
+OVERRIDE = np.array([1.0, 1.3, 1.7]) + PACE_ROUNDING
+STOP = np.array([1.0, 2.0, 3.0]) + PACE_ROUNDING
+
+
+@pytest.fixture(scope="module")
+def points(random_points):
+    return random_points(100, 4)
+
+
+@pytest.fixture(scope="module")
+def flown(six_axis_limits, points):
+    moves = [Move(point, fly=FlyPercent(50.0)) for point in points[1:]]
+    return plan_moves(points[0], moves, six_axis_limits).trajectory
+
+
+@pytest.fixture(scope="module")
+def off_path(flown):
+    """How far points (m, n) lie off the path of the plan, in the largest joint [rad]."""
+    times = np.linspace(0.0, flown.duration, 200_001)
+    tree = cKDTree(flown.sample(times)[0])
+
+    def distance(q):
+        _, nearest = tree.query(q)
+        t = times[nearest]
+        for _ in range(3):  # Newton's way to the foot of the perpendicular
+            p, v, _ = flown.sample(t)
+            square = np.maximum(np.sum(v * v, axis=1), 1e-12)
+            t = np.clip(t + np.sum((q - p) * v, axis=1) / square, 0.0, flown.duration)
+        return np.abs(flown.sample(t)[0] - q).max()
+
+    on_path = flown.sample(np.linspace(0.1, flown.duration, 50))[0]
+    assert distance(on_path) <= 1e-11
+    assert distance(on_path + 1e-8 * np.array([1, -1, 1, -1, 1, -1])) > 1e-9  # it can tell
+    return distance
+
+
+def run(interpolator, commands):
+    """All steps to the end of the motion; `commands` are called before the steps they name."""
+    steps = []
+    while not any(kind is EventKind.MOTION_ENDED for kind, _ in events(steps[-1:])):
+        for command in commands.get(len(steps), ()):
+            assert command() == Status.OK
+        steps.append(interpolator.get_next_step())
+        assert len(steps) < 20_000
+    return steps
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3000), st.sampled_from([0.0, 1.0, 20.0, 50.0, 99.0, 100.0])),
+        max_size=5,
+    )
+)
+@settings(max_examples=20, deadline=None)
+def test_an_override_changes_when_and_never_where(
+    six_axis_limits, points, flown, off_path, changes
+):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    queue(interpolator, points[1:])
+    commands = {}
+    last = max((when for when, _ in changes), default=0)
+    for when, percent in [*changes, (last + 1, 100.0)]:
+        order = lambda percent=percent: interpolator.set_override_speed(percent)  # noqa: E731
+        commands.setdefault(when, []).append(order)
+    q = positions(run(interpolator, commands))
+    assert off_path(q) <= 1e-9
+    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= OVERRIDE)
+    np.testing.assert_array_equal(q[-1], points[-1])
+
+
+def test_a_constant_override_stretches_time(six_axis_limits, points, flown):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    interpolator.set_override_speed(20.0)
+    queue(interpolator, points[1:])
+    steps = steps_to_rest(interpolator)
+    q, _, _ = flown.sample(0.2 * PERIOD * np.arange(1, len(steps) + 1))
+    np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
+    assert steps[-1].elapsed_time == pytest.approx(5.0 * flown.duration, rel=1e-9)
+
+
+@given(st.integers(1, 1200), st.integers(0, 300), st.sampled_from([100.0, 60.0, 5.0]))
+@settings(max_examples=20, deadline=None)
+def test_stop_and_continue_stay_on_the_path(
+    six_axis_limits, points, off_path, when, pause, percent
+):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    interpolator.set_override_speed(percent)
+    queue(interpolator, points[1:])
+    commands = {
+        when: [interpolator.stop_motion],
+        when + pause: [lambda: interpolator.set_override_speed(100.0)],
+        when + pause + 1: [interpolator.continue_motion],
+    }
+    steps = run(interpolator, commands)
+    q = positions(steps)
+    assert off_path(q) <= 1e-9
+    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= STOP)
+    told = [kind for kind, _ in events(steps)]
+    assert told.count(EventKind.VIA_POINT_PASSED) == 2
+    still = np.all(np.diff(q, axis=0) == 0.0, axis=1)
+    # What was told of a stop is so, and an arm that stood was told to stand.
+    assert told.count(EventKind.MOTION_STOPPED) == int(np.any(still))
+
+
+@pytest.mark.parametrize("after", [20, 60, 120, 180, 199])
+def test_an_override_that_is_no_change_disturbs_nothing(six_axis_limits, points, after):
+    """By then it gathers speed so fast that under the bounds of an override it would overshoot."""
+
+    def go_on(*, again):
+        interpolator = ready(six_axis_limits, points[0], fly=50.0)
+        queue(interpolator, points[1:])
+        commands = {
+            200: [interpolator.stop_motion],
+            400: [interpolator.continue_motion],
+            400 + after: [lambda: interpolator.set_override_speed(100.0)] if again else [],
+        }
+        return positions(run(interpolator, commands))
+
+    np.testing.assert_allclose(go_on(again=True), go_on(again=False), rtol=0, atol=1e-12)
+
+
+def test_a_stopped_arm_stands_until_it_may_go_on(six_axis_limits, points):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    queue(interpolator, points[1:])
+    for _ in range(200):
+        interpolator.get_next_step()
+    target = interpolator.get_current_target_id()
+    interpolator.stop_motion()
+    stopping = steps_to_rest(interpolator)
+    assert events(stopping)[-1] == (EventKind.MOTION_STOPPED, target)
+    interpolator.set_override_speed(50.0)  # for later
+    standing = [interpolator.get_next_step() for _ in range(50)]
+    assert {step.status for step in standing} == {Status.FINAL_STEP}
+    assert len({step.position.tobytes() for step in [stopping[-1], *standing]}) == 1
+    assert not events(standing)
+    assert interpolator.stop_motion() == Status.OK
+    interpolator.continue_motion()
+    assert events(steps_to_rest(interpolator))[-1] == (EventKind.MOTION_ENDED, 3)
+
+
+def test_a_stop_before_the_first_step_holds_the_arm_where_it_is(six_axis_limits, points):
+    interpolator = ready(six_axis_limits, points[0])
+    interpolator.stop_motion()
+    queue(interpolator, points[1:2])
+    for _ in range(3):
+        step = interpolator.get_next_step()
+        assert step.status == Status.FINAL_STEP
+        np.testing.assert_array_equal(step.position, points[0])
+    interpolator.continue_motion()
+    other = ready(six_axis_limits, points[0])
+    queue(other, points[1:2])
+    np.testing.assert_array_equal(
+        positions(steps_to_rest(interpolator)), positions(steps_to_rest(other))
+    )
+
+
+def test_a_stop_outlasts_the_end_of_the_motion(six_axis_limits, points):
+    """An arm that was told to stop does not set off for a target that comes later."""
+    interpolator = ready(six_axis_limits, points[0])
+    queue(interpolator, points[1:2])
+    steps = []
+    while interpolator.get_current_target_id() is not None:
+        steps.append(interpolator.get_next_step())
+        if len(steps) > 1 and np.abs(points[1] - steps[-1].position).max() < 1e-3:
+            interpolator.stop_motion()
+    assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
+    queue(interpolator, points[2:3], first=2)
+    step = interpolator.get_next_step()
+    assert (step.status, step.events) == (Status.FINAL_STEP, ())
+    np.testing.assert_array_equal(step.position, points[1])
+    interpolator.continue_motion()
+    assert events(steps_to_rest(interpolator)) == [(EventKind.MOTION_ENDED, 2)]
+
+
+@given(st.integers(1, 1000), st.booleans())
+@settings(max_examples=20, deadline=None)
+def test_a_cancelled_motion_leaves_the_arm_on_its_path(
+    six_axis_limits, points, off_path, when, stopped
+):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    queue(interpolator, points[1:])
+    steps = [interpolator.get_next_step() for _ in range(when)]
+    assume(not any(kind is EventKind.MOTION_ENDED for kind, _ in events(steps)))
+    if stopped:
+        interpolator.stop_motion()
+        steps += [interpolator.get_next_step() for _ in range(300)]
+        assume(interpolator.get_current_target_id() is not None)  # else the end came first
+    interpolator.cancel_motion()
+    if not stopped:
+        assert interpolator.set_next_target(9, points[0]) == Status.INCONSISTENT
+        steps += steps_to_rest(interpolator)
+    assert off_path(positions(steps)) <= 1e-9
+    assert interpolator.get_next_step().status == Status.NO_TARGET
+    assert interpolator.get_current_target_id() is None
+    queue(interpolator, points[:1], first=9)
+    back = steps_to_rest(interpolator)
+    q = positions(steps + back)
+    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= STOP)
+    np.testing.assert_array_equal(q[-1], points[0])
+    assert events(back) == [(EventKind.MOTION_ENDED, 9)]
+
+
+def test_targets_may_come_while_the_override_changes(six_axis_limits, points, flown, off_path):
+    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+    queue(interpolator, points[1:2])
+    interpolator.set_override_speed(30.0)
+    steps = [interpolator.get_next_step() for _ in range(20)]
+    interpolator.set_override_speed(100.0)
+    steps += [interpolator.get_next_step() for _ in range(20)]
+    queue(interpolator, points[2:], first=2)
+    steps += steps_to_rest(interpolator)
+    assert off_path(positions(steps)) <= 1e-9
+
+
+# -- refusals -----------------------------------------------------------------------------
+
+
+def test_nothing_is_done_before_initialize_and_after_terminate(six_axis_limits, random_points):
+    a, b = random_points(50, 2)
+    interpolator = Interpolator(six_axis_limits, PERIOD)
+    for _ in range(2):
+        for refused in (
+            interpolator.set_initial_position(a),
+            interpolator.set_next_target(1, b),
+            interpolator.set_override_speed(50.0),
+            interpolator.stop_motion(),
+            interpolator.cancel_motion(),
+            interpolator.select_flyby_mode(True),
+            interpolator.reset(),
+            interpolator.terminate(),
+        ):
+            assert refused == Status.INCONSISTENT
+        step = interpolator.get_next_step()
+        assert step.status == Status.INCONSISTENT
+        assert np.all(np.isnan(step.position))
+        interpolator.initialize()
+        assert interpolator.set_next_target(1, b) == Status.INCONSISTENT  # no position yet
+        interpolator.set_initial_position(a)
+        assert interpolator.get_next_step().status == Status.NO_TARGET == -42
+        queue(interpolator, [b])
+        steps_to_rest(interpolator)
+        assert interpolator.terminate() == Status.OK
+
+
+@pytest.mark.parametrize(
+    ("service", "arguments"),
+    [
+        ("select_motion_type", (2,)),
+        ("select_motion_type", (4,)),
+        ("set_advance_motion", (-1,)),
+        ("set_advance_motion", (1.5,)),
+        ("set_advance_motion", (True,)),
+        ("set_advance_motion", ("1",)),
+        ("select_motion_type", (True,)),
+        ("select_motion_type", ([1],)),
+        ("set_joint_speeds", (50.0, [-1])),
+        ("set_joint_speeds", (50.0, [True, False])),
+        ("set_joint_speeds", (50.0, [0.5])),
+        ("set_joint_speeds", (50.0, 1)),
+        ("set_joint_speeds", ([[50.0] * 6],)),
+        ("set_joint_speeds", (10**400,)),
+        ("set_joint_speeds", (None,)),
+        ("set_joint_speeds", ([True] * 6,)),
+        ("set_override_speed", ("fast",)),
+        ("set_override_speed", (None,)),
+        ("set_override_speed", (True,)),
+        ("set_override_speed", (10**400,)),
+        ("set_override_speed", (50.0, 7)),
+        ("set_override_speed", (50.0, [])),
+        ("set_override_acceleration", ("50",)),
+        ("set_override_acceleration", (50.0, 9)),
+        ("select_flyby_mode", ("off",)),
+        ("select_flyby_mode", (None,)),
+        ("select_flyby_mode", ([],)),
+        ("select_flyby_criteria", (np.nan,)),
+        ("select_flyby_criteria", ([],)),
+        ("set_flyby_criteria_parameter", ([], 1.0)),
+        ("set_flyby_criteria_parameter", (FlybyCriterion.PERCENT, "x")),
+        ("cancel_flyby_criteria", ({},)),
+        ("select_point_accuracy", ("fine",)),
+        ("select_point_accuracy", (True,)),
+        ("set_motion_time", (None,)),
+        ("set_motion_time", ("1",)),
+        ("set_interpolation_time", ("a",)),
+        ("set_interpolation_time", (np.nan,)),
+        ("set_initial_position", (None,)),
+        ("set_initial_position", ([10**400] + [0] * 5,)),
+        ("set_initial_position", ([1j] * 6,)),
+        ("set_initial_position", ([[0.0], [0.0, 1.0]],)),
+        ("set_next_target", ("two", [0.0] * 6)),
+        ("set_next_target", (True, [0.0] * 6)),
+        ("set_next_target", (2, ["0"] * 6)),
+        ("set_next_target", (2, [False] * 6)),
+        ("set_joint_speeds", (0.0,)),
+        ("set_joint_speeds", (101.0,)),
+        ("set_joint_speeds", (np.nan,)),
+        ("set_joint_speeds", ([50.0, 50.0],)),
+        ("set_joint_speeds", (50.0, [6])),
+        ("set_joint_accelerations", (-5.0,)),
+        ("set_joint_jerks", ("fast",)),
+        ("set_override_speed", (-1.0,)),
+        ("set_override_speed", (np.nan,)),
+        ("set_override_speed", (0.0, SpeedCorrection.PROGRAM)),
+        ("set_override_acceleration", (0.0,)),
+        ("select_flyby_criteria", (7,)),
+        ("set_flyby_criteria_parameter", (FlybyCriterion.PERCENT, 100.5)),
+        ("set_flyby_criteria_parameter", (FlybyCriterion.DISTANCE, -0.1)),
+        ("set_flyby_criteria_parameter", (3, 10.0)),
+        ("set_point_accuracy_parameter", (3, 10.0)),
+        ("cancel_flyby_criteria", (3,)),
+        ("select_point_accuracy", (9,)),
+        ("set_motion_time", (-1.0,)),
+        ("set_motion_time", (np.inf,)),
+        ("set_interpolation_time", (0.0,)),
+        ("set_next_target", (2, [0.0] * 5)),
+        ("set_next_target", (2, [np.nan] * 6)),
+        ("set_next_target", (2, [0.0] * 5 + [99.0])),
+        ("set_next_target", (2, ["north"] * 6)),
+    ],
+)
+def test_a_refused_service_changes_nothing(six_axis_limits, random_points, service, arguments):
+    points = random_points(51, 3)
+
+    def run(*, disturbed):
+        interpolator = ready(six_axis_limits, points[0], fly=80.0)
+        if disturbed:
+            assert getattr(interpolator, service)(*arguments) == Status.INCONSISTENT == -76
+            assert interpolator.refusal
+        queue(interpolator, points[1:])
+        return positions(steps_to_rest(interpolator))
+
+    np.testing.assert_array_equal(run(disturbed=True), run(disturbed=False))
+
+
+def test_numbers_of_numpy_are_numbers(six_axis_limits, random_points):
+    points = random_points(56, 2)
+    interpolator = ready(six_axis_limits, points[0])
+    for status in (
+        interpolator.set_advance_motion(np.int64(2)),
+        interpolator.set_joint_speeds(np.float32(50.0), np.arange(2)),
+        interpolator.set_joint_speeds(np.full(6, 50)),
+        interpolator.set_override_speed(np.int32(100), np.int64(SpeedCorrection.PROGRAM)),
+        interpolator.select_flyby_mode(np.True_),
+        interpolator.select_flyby_criteria(np.int16(FlybyCriterion.DISTANCE)),
+    ):
+        assert status == Status.OK, interpolator.refusal
+    assert interpolator.set_next_target(np.int64(3), points[1]) >= 0
+    assert interpolator.get_current_target_id() == 3
+
+
+@pytest.mark.parametrize("wanted", ["joint", 5, None, [0], np.zeros(2)])
+def test_a_step_in_any_other_format_is_refused(six_axis_limits, random_points, wanted):
+    a, b = random_points(57, 2)
+    interpolator = ready(six_axis_limits, a)
+    queue(interpolator, [b])
+    assert interpolator.get_next_step(wanted).status == Status.OUTPUT_FORMAT
+    assert interpolator.get_next_step(np.int64(0)).status >= 0
+
+
+@pytest.mark.parametrize("bring_to_rest", ["stop_motion", "cancel_motion"])
+@pytest.mark.parametrize("service", ["initialize", "reset", "terminate"])
+def test_a_moving_arm_is_not_forgotten(six_axis_limits, random_points, service, bring_to_rest):
+    a, b = random_points(58, 2)
+    interpolator = ready(six_axis_limits, a)
+    queue(interpolator, [b])
+    moving = [interpolator.get_next_step() for _ in range(50)]
+    assert getattr(interpolator, service)() == Status.INCONSISTENT
+    getattr(interpolator, bring_to_rest)()
+    assert getattr(interpolator, service)() == Status.INCONSISTENT  # it still comes to rest
+    steps = moving + steps_to_rest(interpolator)
+    assert np.max(np.abs(np.diff(positions(steps), axis=0))) < 1.01 * PERIOD * np.max(
+        six_axis_limits.velocity
+    )
+    assert getattr(interpolator, service)() == Status.OK
+    assert interpolator.get_current_target_id() is None
+
+
+def test_what_would_make_a_moving_arm_jump_is_refused(six_axis_limits, random_points):
+    a, b = random_points(52, 2)
+    interpolator = ready(six_axis_limits, a)
+    queue(interpolator, [b])
+    for _ in range(20):
+        interpolator.get_next_step()
+    assert interpolator.set_initial_position(b) == Status.INCONSISTENT
+    assert interpolator.set_interpolation_time(0.001) == Status.INCONSISTENT
+    assert interpolator.reset() == Status.INCONSISTENT
+    cartesian = interpolator.get_next_step(1)
+    assert cartesian.status == Status.OUTPUT_FORMAT == -13
+    steps_to_rest(interpolator)
+    assert interpolator.reset() == Status.OK
+    assert interpolator.get_next_step().status == Status.INCONSISTENT
+
+
+def test_a_planner_that_died_leaves_the_motion_before(six_axis_limits, random_points):
+    points = random_points(53, 3)
+    interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=True)
+    queue(interpolator, points[1:2])
+
+    dead = in_child(os.getpid)
+    os.kill(dead, signal.SIGKILL)
+    assert worker._warm[0].connection.poll(5.0)
+    assert interpolator.set_next_target(2, points[2]) == Status.FATAL == -68
+    assert "signal 9" in interpolator.refusal
+    steps = steps_to_rest(interpolator)
+    assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
+    np.testing.assert_array_equal(steps[-1].position, points[1])
+    assert in_child(os.getpid) != dead
+
+
+def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, monkeypatch):
+    points = random_points(55, 3)
+
+    def careless(legs, fly):
+        planned = corner(legs, fly)
+        return planned._replace(leave=0.9 * planned.leave)
+
+    monkeypatch.setattr("planner.interpolator.corner", careless)
+    interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=False)
+    queue(interpolator, points[1:2])
+    assert interpolator.set_next_target(2, points[2]) == Status.FATAL
+    steps = steps_to_rest(interpolator)
+    assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
+    assert max(worst_ratios(points[0], positions(steps), six_axis_limits)) <= 1.0 + 1e-5
+
+
+def test_corners_planned_in_a_child_process_are_the_same(six_axis_limits, random_points):
+    points = random_points(54, 4)
+    runs = []
+    for isolated in (False, True):
+        interpolator = ready(six_axis_limits, points[0], fly=60.0, isolated=isolated)
+        queue(interpolator, points[1:])
+        runs.append(positions(steps_to_rest(interpolator)))
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize(
+    ("period", "options"),
+    [
+        (0.0, {}),
+        (np.nan, {}),
+        (PERIOD, {"override_bounds": (1.0, 1.7)}),
+        (PERIOD, {"override_bounds": (2.5, 2.5)}),
+        (PERIOD, {"stop_bounds": (1.2, 3.0)}),
+    ],
+)
+def test_an_interpolator_that_cannot_be_is_refused(six_axis_limits, period, options):
+    with pytest.raises(InvalidSetting):
+        Interpolator(six_axis_limits, period, **options)
+
+
+def test_joints_at_an_end_of_their_range_are_flagged(six_axis_limits):
+    start = np.zeros(6)
+    target = np.zeros(6)
+    target[[1, 4]] = six_axis_limits.upper[1], six_axis_limits.lower[4]
+    interpolator = ready(six_axis_limits, start)
+    queue(interpolator, [target])
+    steps = steps_to_rest(interpolator)
+    assert steps[-1].joint_limits == 0b010010
+    assert not any(step.joint_limits for step in steps[:-2])
+
+
+def test_without_a_planning_process_it_is_not_initialized(
+    six_axis_limits, random_points, monkeypatch
+):
+    def fails(*_):
+        raise PlannerNotStarted(1)
+
+    monkeypatch.setattr("planner.interpolator.in_child", fails)
+    interpolator = Interpolator(six_axis_limits, PERIOD)
+    assert interpolator.initialize() == Status.FATAL
+    assert "could not be started" in interpolator.refusal
+    assert interpolator.set_initial_position(random_points(0, 1)[0]) == Status.INCONSISTENT
+    assert Interpolator(six_axis_limits, PERIOD, isolated=False).initialize() == Status.OK
+
+
+# -- any services in any order ------------------------------------------------------------
+
+ROUNDING = 1e-4  # of differences over three periods
+PERIODS = (0.004, 0.01)
+LIMITS = JointLimits(
+    lower=np.array([-3.0, -1.0, -0.02]),
+    upper=np.array([3.0, 2.0, 0.03]),
+    velocity=np.array([2.5, 3.0, 0.5]),
+    acceleration=np.array([9.0, 25.0, 6.0]),
+    jerk=np.array([90.0, 400.0, 90.0]),
+)
+RATES = (LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk)
+SHARES = st.one_of(st.just(0.0), st.just(1.0), st.floats(0.0, 1.0))
+PERCENT = st.one_of(st.just(100.0), st.floats(30.0, 100.0))
+
+
+def point(shares):
+    inside = LIMITS.lower + np.array(shares) * (LIMITS.upper - LIMITS.lower)
+    return np.clip(inside, LIMITS.lower, LIMITS.upper)
+
+
+class AnyServices(RuleBasedStateMachine):
+    """Set-points are judged as a guard would: by differences of what was sent."""
+
+    @initialize(shares=st.tuples(SHARES, SHARES, SHARES))
+    def begin(self, shares):
+        self.interpolator = Interpolator(LIMITS, PERIODS[0])
+        self.period = PERIODS[0]
+        start = point(shares)
+        assert self.interpolator.set_next_target(1, start) == Status.INCONSISTENT
+        assert self.interpolator.initialize() == Status.OK
+        assert self.interpolator.set_initial_position(start) == Status.OK
+        self.sent = [start] * 4
+        self.queued: list[tuple[int, np.ndarray]] = []
+        self.next_id = 1
+        self.factors = (1.0, 1.0, 1.0)
+        self.stopped = self.cancelled = False
+
+    @rule(shares=st.tuples(SHARES, SHARES, SHARES), tiny=st.booleans())
+    def set_target(self, shares, tiny):
+        target = point(shares)
+        if tiny:
+            last = self.queued[-1][1] if self.queued else self.sent[-1]
+            target = np.clip(last + 1e-6 * (target - last), LIMITS.lower, LIMITS.upper)
+        status = self.interpolator.set_next_target(self.next_id, target)
+        if self.cancelled:
+            assert status == Status.INCONSISTENT
+        elif status != Status.TIME_TOO_SHORT and status != Status.INCONSISTENT:
+            assert status in (Status.OK, Status.NEED_MORE_DATA), self.interpolator.refusal
+            self.queued.append((self.next_id, target))
+            self.next_id += 1
+        else:
+            assert "motion time" in self.interpolator.refusal
+            assert self.interpolator.set_motion_time(0.0) == Status.OK
+
+    @rule(seconds=st.floats(0.0, 2.0))
+    def take_time(self, seconds):
+        assert self.interpolator.set_motion_time(seconds) == Status.OK
+
+    @rule(count=st.sampled_from([1, 3, 20, 100]))
+    def step(self, count):
+        for _ in range(count):
+            self._step()
+
+    def _step(self):
+        step = self.interpolator.get_next_step()
+        if not self.queued:
+            assert step.status == Status.NO_TARGET
+        else:
+            assert step.status in (Status.OK, Status.NEED_MORE_DATA, Status.FINAL_STEP)
+        self.sent = [*self.sent[-3:], step.position]
+        for order, (rate, factor) in enumerate(zip(RATES, self.factors, strict=True), 1):
+            reached = np.abs(np.diff(self.sent[-order - 1 :], order, axis=0)[-1])
+            assert np.all(reached <= factor * (1.0 + ROUNDING) * rate * self.period**order)
+        assert np.all(step.position >= LIMITS.lower - 1e-11)
+        assert np.all(step.position <= LIMITS.upper + 1e-11)
+        for event in step.events:
+            self._heed(event, step)
+
+    def _heed(self, event, step):
+        target_id, target = self.queued[0]
+        assert event.target_id == target_id
+        if event.kind is EventKind.MOTION_STOPPED:
+            assert step.status == Status.FINAL_STEP
+            assert self.stopped or self.cancelled
+            if self.cancelled:
+                self.queued.clear()
+                self.stopped = self.cancelled = False
+            return
+        self.queued.pop(0)
+        if event.kind is EventKind.MOTION_ENDED:
+            assert step.status == Status.FINAL_STEP
+            assert not self.queued
+            np.testing.assert_array_equal(step.position, target)
+            self.cancelled = False
+
+    @rule(percent=st.one_of(st.just(0.0), PERCENT))
+    def override(self, percent):
+        self.factors = tuple(np.maximum(self.factors, (1.0, 1.3, 1.7)))
+        assert self.interpolator.set_override_speed(percent) == Status.OK
+
+    @rule()
+    def stop(self):
+        self.factors = (1.0, 2.0, 3.0)
+        assert self.interpolator.stop_motion() == Status.OK
+        self.stopped = True
+
+    @rule()
+    def go_on(self):
+        assert self.interpolator.continue_motion() == Status.OK
+        self.stopped = False
+
+    @rule()
+    def cancel(self):
+        self.factors = (1.0, 2.0, 3.0)
+        assert self.interpolator.cancel_motion() == Status.OK
+        if self.interpolator.get_current_target_id() is None:  # the arm stood already
+            self.queued.clear()
+            self.stopped = self.cancelled = False
+        else:
+            self.cancelled = True
+
+    @rule(on=st.booleans(), percent=st.floats(0.0, 100.0), distance=st.floats(1e-6, 0.5))
+    def fly(self, on, percent, distance):
+        interpolator = self.interpolator
+        assert interpolator.select_flyby_mode(on) == Status.OK
+        if percent < 50.0:
+            status = interpolator.set_point_accuracy_parameter(FlybyCriterion.DISTANCE, distance)
+        else:
+            status = interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, percent)
+        assert status == Status.OK
+
+    @rule(a=PERCENT, b=PERCENT, c=PERCENT, joint=st.integers(0, 2))
+    def rates(self, a, b, c, joint):
+        interpolator = self.interpolator
+        assert interpolator.set_joint_speeds(a) == Status.OK
+        assert interpolator.set_joint_accelerations(b, [joint]) == Status.OK
+        assert interpolator.set_joint_jerks(c, [joint]) == Status.OK
+        assert interpolator.set_override_speed(c, SpeedCorrection.PROGRAM) == Status.OK
+        assert interpolator.set_override_acceleration(a, AccelerationKind.DECELERATION) == 0
+
+    @rule(period=st.sampled_from(PERIODS))
+    def change_period(self, period):
+        if self.interpolator.set_interpolation_time(period) == Status.OK:
+            self.period = period
+            self.sent = [self.sent[-1]] * 4  # only an arm at rest lets it change
+
+    @precondition(lambda self: not self.queued)
+    @rule()
+    def place(self):
+        assert self.interpolator.set_initial_position(self.sent[-1]) in (0, -76)
+
+    @invariant()
+    def the_current_target_is_the_first_not_told(self):
+        expected = self.queued[0][0] if self.queued else None
+        assert self.interpolator.get_current_target_id() == expected
+
+    def teardown(self):
+        if not hasattr(self, "sent"):
+            return
+        self.go_on()
+        self.override(100.0)
+        last = self.queued[-1][1] if self.queued and not self.cancelled else None
+        for _ in range(40_000):
+            if not self.queued:
+                break
+            self._step()
+        assert not self.queued
+        if last is not None:
+            np.testing.assert_array_equal(self.sent[-1], last)
+
+
+class TestAnyServices(AnyServices.TestCase):
+    settings = settings(max_examples=25, stateful_step_count=25, deadline=None)
+
+
+@pytest.mark.slow
+class TestManyServices(AnyServices.TestCase):
+    settings = settings(max_examples=1000, stateful_step_count=60, deadline=None)
+
+
+# -- the page ------------------------------------------------------------------------------
+
+PAGE = Path(__file__).parents[2] / "docs" / "interpolator.md"
+
+
+@pytest.fixture(scope="module")
+def page():
+    return PAGE.read_text()
+
+
+def test_the_example_runs_to_its_last_target(page):
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict = {}
+    exec(code, names)
+    assert [event.target_id for event in names["events"]] == [1, 2, 3, 4]
+    assert names["events"][-1].kind is EventKind.MOTION_ENDED
+    np.testing.assert_array_equal(names["set_points"][-1], [0.0, 0.0])
+    assert not any(np.allclose(q, [1.0, 0.5], atol=1e-4) for q in names["set_points"])  # flown by
+
+
+def test_every_service_and_code_is_on_the_page_and_no_other(page):
+    services = {
+        name
+        for name in dir(Interpolator)
+        if not name.startswith("_") and callable(getattr(Interpolator, name))
+    }
+    table = page.split("## Services")[1].split("## Where")[0]
+    assert set(re.findall(r"`([a-z_]+)`", table)) == services
+    codes = re.findall(r"^\| (-?\d+) \| ([A-Z_]+) \|", page, re.MULTILINE)
+    assert [(int(code), name) for code, name in codes] == [(s.value, s.name) for s in Status]

@@ -1,3 +1,5 @@
+"""Planning: one motion move by move, one through via points, many together."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -5,11 +7,26 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from planner import InvalidSetting, InvalidViaPoints, JointLimits, TooFewViaPoints, plan
-from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
+from planner import (
+    InvalidSetting,
+    InvalidViaPoints,
+    JointLimits,
+    LimitExceeded,
+    NotSmooth,
+    PiecewiseCubic,
+    PlanningError,
+    check_limits,
+    plan,
+    plan_chunk,
+)
+from planner.moves import Fly, FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
+from planner.piecewise_cubic import Block
+from planner.straight import StraightMoves
+from planner.verify import check_smooth
+from tests.planner.conftest import rows_of
 
 
 def decades(low: float, high: float) -> st.SearchStrategy[float]:
@@ -98,196 +115,298 @@ def rounding_of(limits: JointLimits, duration: float) -> tuple[np.ndarray, ...]:
     )
 
 
-@given(problems())
-@settings(max_examples=100)
-def test_no_input_makes_a_motion_break_a_limit_or_jump(problem):
-    points, moves, limits, overrides = problem
-    motion = plan_moves(points[0], moves, limits, overrides)
-    extrema = motion.trajectory.extrema()
-    position, velocity, acceleration = rounding_of(limits, motion.duration)
-    assert np.all(extrema.lower >= limits.lower - position)
-    assert np.all(extrema.upper <= limits.upper + position)
-    assert np.all(extrema.velocity <= limits.velocity)
-    assert np.all(extrema.acceleration <= limits.acceleration)
-    assert np.all(extrema.jerk <= limits.jerk)
-    for joint, ends in enumerate(motion.trajectory.ends()):
-        jumps = np.abs(motion.trajectory.coefficients[joint][1:, :3] - ends[:-1])
-        assert np.all(jumps <= [position[joint], velocity[joint], acceleration[joint]])
-    q, qd, qdd = motion.trajectory.sample(np.array([0.0, motion.duration]))
-    assert np.all(np.abs(q - points[[0, -1]]) <= 2.0 * position)
-    assert np.all(np.abs(qd) <= velocity)
-    assert np.all(np.abs(qdd) <= acceleration)
+class TestMotion:
+    """Laws of every motion through moves."""
 
+    @given(problems())
+    @settings(max_examples=150)
+    def test_no_input_makes_it_break_a_limit_or_jump(self, problem):
+        points, moves, limits, overrides = problem
+        motion = plan_moves(points[0], moves, limits, overrides)
+        extrema = motion.trajectory.extrema()
+        position, velocity, acceleration = rounding_of(limits, motion.duration)
+        assert np.all(extrema.lower >= limits.lower - position)
+        assert np.all(extrema.upper <= limits.upper + position)
+        assert np.all(extrema.velocity <= limits.velocity)
+        assert np.all(extrema.acceleration <= limits.acceleration)
+        assert np.all(extrema.jerk <= limits.jerk)
+        for joint, ends in enumerate(motion.trajectory.ends()):
+            jumps = np.abs(motion.trajectory.coefficients[joint][1:, :3] - ends[:-1])
+            assert np.all(jumps <= [position[joint], velocity[joint], acceleration[joint]])
+        q, qd, qdd = motion.trajectory.sample(np.array([0.0, motion.duration]))
+        assert np.all(np.abs(q - points[[0, -1]]) <= 2.0 * position)
+        assert np.all(np.abs(qd) <= velocity)
+        assert np.all(np.abs(qdd) <= acceleration)
+        # Pieces of no length are of no use to those who sample.
+        knots = motion.trajectory.knots
+        assert all(np.all(np.diff(times) > 0.0) for times in knots if times[-1] > 0.0)
 
-@given(problems())
-@settings(max_examples=60)
-def test_every_target_is_passed_as_it_says(problem):
-    points, moves, limits, overrides = problem
-    motion = plan_moves(points[0], moves, limits, overrides)
-    position, velocity, _ = rounding_of(limits, motion.duration)
-    assert [passage.index for passage in motion.targets] == list(range(len(moves)))
-    times = [passage.time for passage in motion.targets]
-    assert all(a <= b + 4.0 * np.spacing(b) for a, b in pairwise([0.0, *times, motion.duration]))
-    for passage, move in zip(motion.targets, moves, strict=True):
-        q, qd, _ = motion.trajectory.sample_one(passage.time)
-        apart = np.linalg.norm(q - move.target)
-        assert apart == pytest.approx(passage.distance, rel=1e-6, abs=2.0 * position.max())
-        if passage.how == "stopped":
-            assert np.all(np.abs(q - move.target) <= 2.0 * position)
-            assert np.all(np.abs(qd) <= velocity)
-            assert passage.fly == 0.0
-        elif isinstance(move.fly, FlyDistance):
-            assert passage.distance <= move.fly.distance
-        else:
-            assert isinstance(move.fly, FlyPercent)
-            asked = move.fly.percent / 100.0
-            assert 0.0 < passage.fly <= asked
-            assert (passage.how == "flown") == (passage.fly == asked)
-    assert motion.targets[-1].how == "stopped"
+    @given(problems())
+    @settings(max_examples=60)
+    def test_every_target_is_passed_as_it_says(self, problem):
+        points, moves, limits, overrides = problem
+        motion = plan_moves(points[0], moves, limits, overrides)
+        position, velocity, _ = rounding_of(limits, motion.duration)
+        assert [passage.index for passage in motion.targets] == list(range(len(moves)))
+        times = [0.0, *(passage.time for passage in motion.targets), motion.duration]
+        assert all(a <= b + 4.0 * np.spacing(b) for a, b in pairwise(times))
+        for passage, move in zip(motion.targets, moves, strict=True):
+            q, qd, _ = motion.trajectory.sample_one(passage.time)
+            apart = np.linalg.norm(q - move.target)
+            assert apart == pytest.approx(passage.distance, rel=1e-6, abs=2.0 * position.max())
+            if passage.how == "stopped":
+                assert np.all(np.abs(q - move.target) <= 2.0 * position)
+                assert np.all(np.abs(qd) <= velocity)
+                assert passage.fly == 0.0
+            elif isinstance(move.fly, FlyDistance):
+                assert passage.distance <= move.fly.distance
+            else:
+                assert isinstance(move.fly, FlyPercent)
+                asked = move.fly.percent / 100.0
+                assert 0.0 < passage.fly <= asked
+                assert (passage.how == "flown") == (passage.fly == asked)
+        assert motion.targets[-1].how == "stopped"
 
+    @given(problems(), st.floats(0.02, 1.0))
+    @settings(max_examples=60)
+    def test_stops_take_longer_than_flying_and_less_with_more_speed(self, problem, share):
+        points, moves, limits, overrides = problem
+        motion = plan_moves(points[0], moves, limits, overrides)
+        stopping = [replace(move, fly=Stop()) for move in moves]
+        stops = plan_moves(points[0], stopping, limits, overrides)
+        assert stops.duration == pytest.approx(motion.duration_with_stops, rel=1e-14)
+        # Equal but for the rounding of a sum in which a corner replaces times by themselves.
+        assert motion.duration <= stops.duration * (1 + 1e-13)
+        for corner in motion.corners:
+            if corner.join is not None:
+                assert corner.join.duration <= corner.leave + corner.enter
+        slower = replace(overrides, speed=share * overrides.speed)
+        slow = plan_moves(points[0], stopping, limits, slower)
+        assert stops.duration <= slow.duration * (1 + 1e-13)
+        for fly in (FlyPercent(0.0), FlyDistance(0.0)):
+            none = [replace(move, fly=fly) for move in moves]
+            other = plan_moves(points[0], none, limits, overrides).trajectory
+            assert other.to_dict() == stops.trajectory.to_dict()
 
-@given(problems())
-@settings(max_examples=60)
-def test_flying_by_never_takes_longer_than_stopping(problem):
-    points, moves, limits, overrides = problem
-    motion = plan_moves(points[0], moves, limits, overrides)
-    stops = plan_moves(points[0], [replace(m, fly=Stop()) for m in moves], limits, overrides)
-    assert stops.duration == pytest.approx(motion.duration_with_stops, rel=1e-14)
-    # Equal but for the rounding of a sum in which a corner replaces times by themselves.
-    assert motion.duration <= stops.duration * (1 + 1e-13)
-    for corner in motion.corners:
-        if corner.join is not None:
-            assert corner.join.duration <= corner.leave + corner.enter
+    @given(problems(), st.floats(0.0, 50.0), st.floats(0.02, 1.0))
+    @settings(max_examples=60)
+    def test_to_half_of_the_ramps_more_speed_takes_no_longer(self, problem, percent, share):
+        # Seen backwards from its stop, a ramp from a higher speed begins with at least half of one
+        # from a lower speed: so the faster motion may follow the slower one's join, and a join that
+        # replaces more saves more. Above half this is not so; see the slow test.
+        points, moves, limits, overrides = problem
+        moves = [replace(move, fly=FlyPercent(percent)) for move in moves]
+        slower = replace(overrides, speed=share * overrides.speed)
+        fast = plan_moves(points[0], moves, limits, overrides).duration
+        assert fast <= plan_moves(points[0], moves, limits, slower).duration * (1 + 1e-9)
 
-
-@given(problems())
-@settings(max_examples=25)
-def test_a_fly_of_nothing_is_a_stop(problem):
-    points, moves, limits, overrides = problem
-    tables = [
-        plan_moves(points[0], [replace(m, fly=fly) for m in moves], limits, overrides)
-        for fly in (Stop(), FlyPercent(0.0), FlyDistance(0.0))
-    ]
-    assert all(passage.how == "stopped" for table in tables for passage in table.targets)
-    for other in tables[1:]:
-        assert other.trajectory.to_dict() == tables[0].trajectory.to_dict()
-
-
-@given(problems(), st.floats(0.02, 1.0))
-@settings(max_examples=60)
-def test_with_stops_more_speed_never_takes_longer(problem, share):
-    points, moves, limits, overrides = problem
-    moves = [replace(move, fly=Stop()) for move in moves]
-    slower = replace(overrides, speed=share * overrides.speed)
-    fast = plan_moves(points[0], moves, limits, overrides).duration
-    assert fast <= plan_moves(points[0], moves, limits, slower).duration * (1 + 1e-13)
-
-
-@given(problems(), st.floats(0.0, 50.0), st.floats(0.02, 1.0))
-@settings(max_examples=60)
-def test_up_to_half_of_the_ramps_more_speed_never_takes_longer(problem, percent, share):
-    # Seen backwards from its stop, a ramp from a higher speed begins with at least half of one
-    # from a lower speed: so the faster motion may follow the slower one's join, and a join that
-    # replaces more saves more. Above half this is not so; see the slow test.
-    points, moves, limits, overrides = problem
-    moves = [replace(move, fly=FlyPercent(percent)) for move in moves]
-    slower = replace(overrides, speed=share * overrides.speed)
-    fast = plan_moves(points[0], moves, limits, overrides).duration
-    assert fast <= plan_moves(points[0], moves, limits, slower).duration * (1 + 1e-9)
-
-
-@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.3, 0.5, 1.0]), st.floats(0.1, 1.0))
-@settings(max_examples=20)
-def test_plan_is_the_same_motion(six_axis_limits, random_points, seed, fly, speed):
-    points = random_points(seed)
-    moves = [Move(point, speed=speed, fly=FlyPercent(100.0 * fly)) for point in points[1:]]
-    table = plan_moves(points[0], moves, six_axis_limits).trajectory
-    assert table.to_dict() == plan(points, six_axis_limits, speed=speed, fly=fly).to_dict()
+    @given(st.integers(0, 10**6), st.sampled_from([0.05, 0.25, 0.5, 1.0]))
+    @settings(max_examples=25)
+    def test_differences_of_its_set_points_keep_the_limits(
+        self, six_axis_limits, random_points, seed, fly
+    ):
+        motion = plan(random_points(seed), six_axis_limits, fly=fly)
+        period = 0.001
+        q = motion.sample(np.arange(-5.0, motion.duration / period + 5.0) * period)[0]
+        for order, bound in ((1, "velocity"), (2, "acceleration"), (3, "jerk")):
+            rate = np.abs(np.diff(q, order, axis=0)) / period**order
+            assert np.all(rate <= getattr(six_axis_limits, bound) * (1 + 1e-5)), bound
 
 
 def ramps(motion):
-    """Largest share of each limit while speeding up and while slowing down, along a line."""
-    law = motion.trajectory
-    t = np.linspace(0.0, law.duration, 20001)
-    _, qd, qdd = law.sample(t)
+    """Largest acceleration while speeding up and while slowing down, along a line."""
+    _, qd, qdd = motion.trajectory.sample(np.linspace(0.0, motion.duration, 20001))
     along = qd * qdd
-    return np.max(np.where(along > 0, np.abs(qdd), 0), axis=0), np.max(
-        np.where(along < 0, np.abs(qdd), 0), axis=0
-    )
+    return [np.max(np.where(sign * along > 0, np.abs(qdd), 0), axis=0) for sign in (1, -1)]
 
 
-@pytest.mark.parametrize(("name", "ramp"), [("acceleration", 0), ("deceleration", 1)])
-def test_an_override_of_one_ramp_leaves_the_other_as_it_is(
-    six_axis_limits, random_points, name, ramp
-):
-    start, end = random_points(3, 2)
-    plain = plan_moves(start, [Move(end)], six_axis_limits)
-    gentle = plan_moves(start, [Move(end)], six_axis_limits, Overrides(**{name: 0.25}))
-    changed, unchanged = ramps(gentle)[ramp], ramps(gentle)[1 - ramp]
-    np.testing.assert_allclose(changed, 0.25 * ramps(plain)[ramp], rtol=1e-3)
-    np.testing.assert_allclose(unchanged, ramps(plain)[1 - ramp], rtol=1e-3)
-    extrema, before = gentle.trajectory.extrema(), plain.trajectory.extrema()
-    np.testing.assert_allclose(extrema.velocity, before.velocity)
-    np.testing.assert_allclose(extrema.jerk, before.jerk)
+class TestShares:
+    """What overrides and shares of moves change, and what they leave."""
 
-
-def test_an_override_of_speed_leaves_acceleration_and_jerk_as_they_are(
-    six_axis_limits, random_points
-):
-    start, end = random_points(4, 2)
-    plain = plan_moves(start, [Move(end)], six_axis_limits).trajectory.extrema()
-    slow = plan_moves(start, [Move(end)], six_axis_limits, Overrides(speed=0.5))
-    extrema = slow.trajectory.extrema()
-    np.testing.assert_allclose(extrema.velocity, 0.5 * plain.velocity)
-    np.testing.assert_allclose(extrema.acceleration, plain.acceleration)
-    np.testing.assert_allclose(extrema.jerk, plain.jerk)
-
-
-def test_shares_of_one_joint_bind_that_joint_alone(six_axis_limits, random_points):
-    start, end = random_points(5, 2)
-    share = np.array([1.0, 1.0, 1.0, 0.05, 1.0, 1.0])
-    for move, overrides, quantity in (
-        (Move(end, joint_speed=share), Overrides(), "velocity"),
-        (Move(end), Overrides(joint=share), "velocity"),
-        (Move(end, joint_acceleration=share), Overrides(), "acceleration"),
-        (Move(end, joint_jerk=share), Overrides(), "jerk"),
+    @pytest.mark.parametrize(("name", "ramp"), [("acceleration", 0), ("deceleration", 1)])
+    def test_an_override_of_one_ramp_leaves_the_other(
+        self, six_axis_limits, random_points, name, ramp
     ):
+        start, end = random_points(3, 2)
+        full = plan_moves(start, [Move(end)], six_axis_limits)
+        gentle = plan_moves(start, [Move(end)], six_axis_limits, Overrides(**{name: 0.25}))
+        changed, unchanged = ramps(gentle)[ramp], ramps(gentle)[1 - ramp]
+        np.testing.assert_allclose(changed, 0.25 * ramps(full)[ramp], rtol=1e-3)
+        np.testing.assert_allclose(unchanged, ramps(full)[1 - ramp], rtol=1e-3)
+        extrema, before = gentle.trajectory.extrema(), full.trajectory.extrema()
+        np.testing.assert_allclose(extrema.velocity, before.velocity)
+        np.testing.assert_allclose(extrema.jerk, before.jerk)
+
+    def test_an_override_of_speed_leaves_acceleration_and_jerk(
+        self, six_axis_limits, random_points
+    ):
+        start, end = random_points(4, 2)
+        full = plan_moves(start, [Move(end)], six_axis_limits).trajectory.extrema()
+        slow = plan_moves(start, [Move(end)], six_axis_limits, Overrides(speed=0.5))
+        extrema = slow.trajectory.extrema()
+        np.testing.assert_allclose(extrema.velocity, 0.5 * full.velocity)
+        np.testing.assert_allclose(extrema.acceleration, full.acceleration)
+        np.testing.assert_allclose(extrema.jerk, full.jerk)
+
+    @pytest.mark.parametrize(
+        ("of_move", "of_program", "quantity"),
+        [
+            ("joint_speed", None, "velocity"),
+            (None, "joint", "velocity"),
+            ("joint_acceleration", None, "acceleration"),
+            ("joint_jerk", None, "jerk"),
+        ],
+    )
+    def test_a_share_of_one_joint_binds_that_joint_alone(
+        self, six_axis_limits, random_points, of_move, of_program, quantity
+    ):
+        start, end = random_points(5, 2)
+        share = np.array([1.0, 1.0, 1.0, 0.05, 1.0, 1.0])
+        move = Move(end, **({of_move: share} if of_move else {}))
+        overrides = Overrides(**({of_program: share} if of_program else {}))
         reached = plan_moves(start, [move], six_axis_limits, overrides).trajectory.extrema()
         used = getattr(reached, quantity) / getattr(six_axis_limits, quantity)
         assert used[3] == pytest.approx(0.05, rel=0.03)
         assert used[3] <= 0.05
         assert np.all(used <= 1.0)
 
+    def test_each_move_keeps_its_own_shares(self, six_axis_limits, random_points):
+        points = random_points(6, 4)
+        speeds = (1.0, 0.2, 0.6)
+        moves = [Move(p, speed=s) for p, s in zip(points[1:], speeds, strict=True)]
+        motion = plan_moves(points[0], moves, six_axis_limits)
+        arrivals = [0.0, *(passage.time for passage in motion.targets)]
+        for (begin, end), speed in zip(pairwise(arrivals), speeds, strict=True):
+            _, qd, _ = motion.trajectory.sample(np.linspace(begin, end, 5000))
+            largest = np.max(np.abs(qd) / six_axis_limits.velocity)
+            assert 0.9 * speed < largest <= speed * (1 + 1e-12)
 
-def test_each_move_keeps_its_own_shares(six_axis_limits, random_points):
-    points = random_points(6, 4)
-    speeds = (1.0, 0.2, 0.6)
-    moves = [Move(p, speed=s, fly=Stop()) for p, s in zip(points[1:], speeds, strict=True)]
-    motion = plan_moves(points[0], moves, six_axis_limits)
-    arrivals = [0.0, *(passage.time for passage in motion.targets)]
-    for (begin, end), speed in zip(pairwise(arrivals), speeds, strict=True):
-        reached = motion.trajectory.restricted(begin, end).extrema().velocity
-        assert np.max(reached / six_axis_limits.velocity) <= speed
-        assert np.max(reached / six_axis_limits.velocity) > 0.9 * speed
 
+class TestCorners:
+    """How fly-by shapes a whole motion."""
 
-def test_corners_that_were_not_rounded_as_asked_are_counted(six_axis_limits, random_points):
-    a, b, c = random_points(7, 3)
-    repeated = plan_moves(a, [Move(p, fly=FlyPercent(50)) for p in (b, b, c)], six_axis_limits)
-    assert (repeated.reduced_corners, repeated.stopped_corners) == (0, 0)  # nothing to round
-    reduced = 0
-    for seed in range(300):
-        a, b, c = random_points(seed, 3)
-        # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
-        motion = plan_moves(
-            a,
-            [Move(p, fly=FlyPercent(100)) for p in (six_axis_limits.upper, c)],
-            six_axis_limits,
+    def test_corners_not_rounded_as_asked_are_reported(self, six_axis_limits, random_points):
+        a, b, c = random_points(7, 3)
+        repeated = plan_moves(a, [Move(p, fly=FlyPercent(50)) for p in (b, b, c)], six_axis_limits)
+        assert (repeated.reduced_corners, repeated.stopped_corners) == (0, 0)  # nothing to round
+        reduced = 0
+        for seed in range(300):
+            a, b, c = random_points(seed, 3)
+            # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
+            moves = [Move(p, fly=FlyPercent(100)) for p in (six_axis_limits.upper, c)]
+            motion = plan_moves(a, moves, six_axis_limits)
+            assert motion.reduced_corners == (motion.targets[0].how == "reduced")
+            assert motion.stopped_corners == (motion.targets[0].how == "stopped")
+            reduced += motion.reduced_corners
+        assert reduced > 0
+
+    def test_more_fly_is_faster_and_rounder(self, six_axis_limits):
+        # Ranges, time against stopping everywhere and passing distances as measured elsewhere.
+        narrow = np.pi / 180.0 * np.array([[180, 92, 78, 200, 125, 200], [0, 33, -87, 0, 0, 0]])
+        limits = replace(six_axis_limits, lower=narrow[1] - narrow[0], upper=narrow[1] + narrow[0])
+        draws = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 6, 6))
+        sets = narrow[1] + draws * narrow[0]
+        durations, distances = [], []
+        for fly in (0.0, 10.0, 25.0, 50.0, 75.0, 100.0):
+            plans = [
+                plan_moves(p[0], [Move(q, fly=FlyPercent(fly)) for q in p[1:]], limits)
+                for p in sets
+            ]
+            durations.append(np.mean([each.duration for each in plans]))
+            passed = [target.distance for each in plans for target in each.targets[:-1]]
+            distances.append(np.rad2deg(np.mean(passed)))
+        np.testing.assert_allclose(
+            np.array(durations[1:]) / durations[0], [0.99, 0.96, 0.93, 0.915, 0.90], atol=0.012
         )
-        assert motion.reduced_corners == (motion.targets[0].how == "reduced")
-        assert motion.stopped_corners == (motion.targets[0].how == "stopped")
-        reduced += motion.reduced_corners
-    assert reduced > 0
+        assert distances == sorted(distances)
+        np.testing.assert_allclose(distances[3:], [2.6, 8.0, 16.0], rtol=0.3)
+
+    def test_a_repeated_point_is_a_stop(self, six_axis_limits, random_points):
+        a, b, c = random_points(12, 3)
+        motion = plan([a, b, b, c], six_axis_limits, fly=1.0)
+        q, qd, _ = motion.sample(np.linspace(0.0, motion.duration, 5000)[1:-1])
+        apart = np.abs(q - b).max(axis=1)
+        assert np.max(np.abs(qd[np.argmin(apart)])) < 0.1
+        assert np.min(apart) < 1e-4
+        assert plan([a, b, c], six_axis_limits, fly=1.0).duration < motion.duration
+
+    def test_a_motion_that_goes_nowhere_takes_no_time(self, six_axis_limits, random_points):
+        point = random_points(13, 1)[0]
+        motion = plan([point, point, point], six_axis_limits)
+        assert motion.duration == 0.0
+        q, qd, _ = motion.sample(np.array([0.0, 1.0]))
+        np.testing.assert_array_equal(q, [point, point])
+        assert not np.any(qd)
+
+    def test_a_miss_at_three_neighbouring_shares_is_passed_by(self):
+        # Speeds 0.07 % apart: at the second, full, 0.999 and 0.97 of the corner fall on a miss.
+        limits = JointLimits(
+            np.full(2, -3.0),
+            np.full(2, 3.0),
+            np.array([2.8797932657906435, 2.2689280275926285]),
+            np.array([12.481528566433276, 9.833931597795916]),
+            np.array([64.82294527864293, 51.0726235528702]),
+        )
+        points = [
+            [0.25196215279360334, 0.5058684088195267],
+            [-2.3053591353560425, -0.9312528155581958],
+            [0.14937923146811105, -1.0521382451814305],
+            [-0.4542626743936493, 0.009917351632736882],
+        ]
+        speeds = (0.7058524290377093, 0.7063463775534808)
+        slow, fast = (plan(points, limits, speed=s, fly=0.4).duration for s in speeds)
+        assert fast < slow
+
+
+def speedings(limits, count):
+    """Routes long and short, some over a corner of the range, each with rising speeds."""
+    random = np.random.default_rng(5)
+    half, centre = (limits.upper - limits.lower) / 2.0, (limits.upper + limits.lower) / 2.0
+    for _ in range(count):
+        shares = random.uniform(-1.0, 1.0, (random.integers(3, 6), limits.n_joints))
+        points = centre + half * shares * random.choice([1.0, 0.2, 0.03, 1e-4])
+        if random.random() < 0.2:
+            on = random.random(limits.n_joints) < 0.5
+            points[1] = np.where(on, limits.lower, limits.upper)
+        yield points, np.sort(random.uniform(0.05, 1.0, 4))
+
+
+def lengthened(limits, fly: Fly, count: int) -> list[float]:
+    """By how much of its duration each motion grew when it was given more speed, where it did."""
+    grown = []
+    for points, speeds in speedings(limits, count):
+        durations = [
+            plan_moves(points[0], [Move(p, speed=s, fly=fly) for p in points[1:]], limits).duration
+            for s in speeds
+        ]
+        grown += [fast / slow - 1.0 for slow, fast in pairwise(durations)]
+    return [share for share in grown if share > 1e-9]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fly", [FlyPercent(25.0), FlyPercent(50.0)])
+def test_to_half_of_the_ramps_none_of_ten_thousand_grows(six_axis_limits, fly):
+    # Not a law: the solver misses the fastest join at a few isolated states, and now and then all
+    # the shares next to each other that it is asked about fall on such. The steps of speed here
+    # are large, so that what they gain hides a small miss; docs/motion.md tells the rate of it.
+    assert lengthened(six_axis_limits, fly, 3400) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fly", [FlyPercent(75.0), FlyDistance(0.02)])
+def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(six_axis_limits, fly):
+    # A joint can be unable to take just so long from one moving state to another: it is too fast
+    # to come to rest on the way, and too slow without. At a higher speed the cuts of a fixed share
+    # lie at faster states, so that a corner can fall into such a gap that it cleared before. Within
+    # a distance short moves use more than half, too, and the share is searched for.
+    grown = lengthened(six_axis_limits, fly, 3400)
+    assert 0 < len(grown) < 30
+    assert max(grown) < 0.1
+
+
+@pytest.mark.slow
+def test_with_a_stop_at_every_target_none_grows(six_axis_limits):
+    assert lengthened(six_axis_limits, FlyPercent(0.0), 1000) == []
 
 
 @pytest.mark.parametrize(
@@ -315,29 +434,273 @@ def test_a_move_that_is_none_is_refused_by_name(bad):
     assert refusal.value.name == next(iter(bad))
 
 
-@pytest.mark.parametrize("value", [-1.0, 100.5, float("nan")])
-def test_a_fly_percentage_out_of_range_is_refused(value):
-    with pytest.raises(InvalidSetting, match="percentage"):
-        FlyPercent(value)
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        *((lambda v=v: FlyPercent(v), "fly percentage") for v in (-1.0, 100.5, np.nan)),
+        *((lambda v=v: FlyDistance(v), "fly distance") for v in (-1e-9, np.inf, np.nan)),
+        (lambda: Overrides(joint=[1.0, 0.0]), "joint override"),
+        (lambda: Overrides(deceleration=0.0), "deceleration override"),
+    ],
+)
+def test_a_setting_out_of_range_is_refused_by_name(make, name):
+    with pytest.raises(InvalidSetting) as refusal:
+        make()
+    assert refusal.value.name == name
 
 
-@pytest.mark.parametrize("value", [-1e-9, float("inf"), float("nan")])
-def test_a_fly_distance_out_of_range_is_refused(value):
-    with pytest.raises(InvalidSetting, match="distance"):
-        FlyDistance(value)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("fly", value) for value in (-0.1, 1.1, np.nan)),
+        *(("speed", value) for value in (0.0, 1.01, -1.0, np.nan, [1.0, 1.0], [1.0] * 5 + [0.0])),
+    ],
+)
+def test_a_plan_with_a_setting_out_of_range_is_refused(six_axis_limits, name, value):
+    with pytest.raises(InvalidSetting) as refusal:
+        plan(np.zeros((2, 6)), six_axis_limits, **{name: value})
+    assert refusal.value.name == name
 
 
 def test_moves_of_another_arm_are_refused(six_axis_limits, random_points):
     a, b = random_points(8, 2)
-    with pytest.raises(InvalidViaPoints):
-        plan_moves(a, [Move(b[:5])], six_axis_limits)
-    with pytest.raises(InvalidViaPoints):
-        plan_moves(a[:5], [Move(b[:5])], six_axis_limits)
+    for start, moves in ((a, [Move(b[:5])]), (a[:5], [Move(b[:5])]), (a, [])):
+        with pytest.raises(InvalidViaPoints):
+            plan_moves(start, moves, six_axis_limits)
     with pytest.raises(InvalidSetting, match="joint override"):
         plan_moves(a, [Move(b)], six_axis_limits, Overrides(joint=[1.0] * 5))
-    with pytest.raises(TooFewViaPoints):
-        plan_moves(a, [], six_axis_limits)
-    with pytest.raises(InvalidSetting, match="joint override"):
-        Overrides(joint=[1.0, 0.0])
-    with pytest.raises(InvalidSetting, match="deceleration override"):
-        Overrides(deceleration=0.0)
+
+
+@example(np.nextafter(1.0, 2.0))
+@given(st.floats(1.0, 1e9, exclude_min=True))
+@settings(max_examples=20)
+def test_a_via_point_out_of_limits_is_named(six_axis_limits, random_points, factor):
+    points = random_points(15)
+    points[2, 4] = six_axis_limits.lower[4] * factor
+    with pytest.raises(InvalidViaPoints, match=r"via point 2, joint 4: .* outside"):
+        plan(points, six_axis_limits)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_via_point_that_is_no_number_is_named(six_axis_limits, random_points, value):
+    points = random_points(16)
+    points[5, 0] = value
+    with pytest.raises(InvalidViaPoints, match=r"via point 5, joint 0: .* not a finite"):
+        plan(points, six_axis_limits)
+
+
+@pytest.mark.parametrize(
+    ("points", "problem"),
+    [
+        (np.zeros((1, 6)), "at least 2"),
+        (np.zeros((0, 6)), "at least 2"),
+        (np.zeros((3, 5)), "shape"),
+        (np.zeros(6), "shape"),
+        (np.zeros((2, 3, 6)), "shape"),
+        ([[0.0] * 6, [0.0] * 5], "table of numbers"),
+        ([["north"] * 6, ["south"] * 6], "table of numbers"),
+    ],
+)
+def test_via_points_of_the_wrong_form_are_refused(six_axis_limits, points, problem):
+    with pytest.raises(InvalidViaPoints, match=problem):
+        plan(points, six_axis_limits)
+
+
+def with_position(motion: PiecewiseCubic, value: float) -> PiecewiseCubic:
+    table = motion.coefficients[2].copy()
+    table[7, 0] = value
+    return PiecewiseCubic(motion.knots, (*motion.coefficients[:2], table, *motion.coefficients[3:]))
+
+
+class TestFinalCheck:
+    """What is checked on a finished motion."""
+
+    @pytest.mark.parametrize("quantity", ["velocity", "acceleration", "jerk"])
+    def test_it_finds_each_kind_of_excess(self, six_axis_limits, random_points, quantity):
+        motion = plan(random_points(18), six_axis_limits)
+        check_limits(motion, six_axis_limits)
+        with pytest.raises(LimitExceeded) as refusal:
+            check_limits(motion, six_axis_limits.scaled(**{quantity: 0.9}))
+        assert refusal.value.quantity == quantity
+        assert refusal.value.value > refusal.value.bound
+
+    def test_it_finds_positions_jumps_and_what_is_no_number(self, six_axis_limits, random_points):
+        motion = plan(random_points(19), six_axis_limits)
+        with pytest.raises(NotSmooth) as refusal:
+            jumped = with_position(motion, motion.coefficients[2][7, 0] + 1e-8)
+            check_smooth(jumped, six_axis_limits)
+        assert (refusal.value.quantity, refusal.value.joint) == ("position", 2)
+        with pytest.raises(LimitExceeded):
+            check_limits(with_position(motion, np.nan), six_axis_limits)
+        with pytest.raises(LimitExceeded) as refusal:
+            outside = with_position(motion, six_axis_limits.upper[2] + 0.1)
+            check_limits(outside, six_axis_limits)
+        assert (refusal.value.quantity, refusal.value.joint) == ("position", 2)
+
+    def test_a_motion_that_is_not_what_a_plan_promises_is_refused(
+        self, six_axis_limits, random_points, monkeypatch
+    ):
+        monkeypatch.setattr("planner.moves.SEGMENT_JERK", 1.1)
+        points = random_points(20)
+        with pytest.raises(LimitExceeded, match="jerk"):
+            plan(points, six_axis_limits, fly=0.0)
+        with pytest.raises(LimitExceeded, match="jerk"):
+            plan_moves(points[0], [Move(points[1])], six_axis_limits)
+
+
+def bits(motion: PiecewiseCubic) -> bytes:
+    return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
+
+
+def rates_of(draw, n: int) -> JointLimits:
+    """Limits of joints of very different nature."""
+    exponents = st.lists(st.floats(-2.0, 1.0), min_size=4, max_size=4)
+    span, velocity, ramp, rise = 10.0 ** np.array([draw(exponents) for _ in range(n)]).T
+    acceleration = velocity / ramp
+    return JointLimits(-span, span, velocity, acceleration, acceleration / rise)
+
+
+@st.composite
+def populations(draw):
+    """Motions that planners stumble over, together: still, microscopic, along limits."""
+    n, count, k = draw(st.integers(1, 6)), draw(st.integers(1, 5)), draw(st.integers(2, 6))
+    limits = rates_of(draw, n)
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    points = random.uniform(limits.lower, limits.upper, (count, k, n))
+    for row in points.reshape(-1, n)[1:]:
+        kind = draw(st.sampled_from(["random", "random", "limits", "same", "tiny", "one joint"]))
+        before = points[0, 0]
+        if kind == "limits":
+            row[:] = np.where(random.random(n) < 0.5, limits.lower, limits.upper)
+        elif kind == "same":
+            row[:] = before
+        elif kind == "tiny":
+            row[:] = before * (1.0 - 10.0 ** draw(st.integers(-15, -4)))
+        elif kind == "one joint":
+            row[1:] = before[1:]
+    speed = random.uniform(0.05, 1.0, (count, n))
+    return points, limits, speed, draw(st.sampled_from([0.0, 0.01, 0.07, 0.25, 0.5, 1.0]))
+
+
+class TestPopulation:
+    """Motions planned together, as a search does."""
+
+    @given(populations(), st.data())
+    @settings(max_examples=100)
+    def test_company_changes_no_bit(self, problem, data):
+        points, limits, speed, fly = problem
+        together = plan_chunk(points, speed, limits, fly)
+        index = data.draw(st.integers(0, len(points) - 1))
+        alone = plan(points[index], limits, speed=speed[index], fly=fly)
+        assert bits(alone) == bits(together[index])
+        moves = [
+            Move(point, joint_speed=speed[index], fly=FlyPercent(100.0 * fly))
+            for point in points[index, 1:]
+        ]
+        assert bits(plan_moves(points[index, 0], moves, limits).trajectory) == bits(alone)
+
+    def test_what_cannot_be_planned_is_an_error_in_its_place(self, six_axis_limits, random_points):
+        good, outside, unknown = random_points(0), random_points(1), random_points(2)
+        outside[3, 2] = 50.0
+        unknown[0, 0] = np.nan
+        individuals = [good, outside, good[:1], unknown, good[:, :5], good[:3], good]
+        planned = plan_chunk(individuals, np.ones((7, 6)), six_axis_limits, 0.5)
+        assert [isinstance(each, InvalidViaPoints) for each in planned] == [False] + [True] * 4 + [
+            False
+        ] * 2
+        assert bits(planned[0]) == bits(planned[6])
+        assert planned[5].sample(np.array([np.inf]))[0][0] == pytest.approx(good[2], abs=1e-11)
+
+    def test_nobody_to_plan_for(self, six_axis_limits):
+        assert plan_chunk([], np.ones((0, 6)), six_axis_limits, 0.5) == []
+
+
+COUNT, JOINTS, PIECES = 3, 2, 5
+JUST = [0.5, 1.0 - 1e-6, 1.0, 1.0 + 1e-6, 2.0]
+
+
+@st.composite
+def blocks(draw):
+    """Motions of constant jerks, some pieces without length or without jerk."""
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = (COUNT, JOINTS, PIECES)
+    knots = np.zeros((COUNT, JOINTS, PIECES + 1))
+    lengths = random.uniform(0.0, 1.0, shape) * (random.random(shape) < 0.8)
+    knots[..., 1:] = np.cumsum(lengths, axis=-1)
+    knots *= (1.0 / np.maximum(knots[..., -1:], 1e-3)) * random.uniform(0.1, 10.0, (COUNT, 1, 1))
+    knots[..., -1] = knots[:, :1, -1]
+    jerks = random.normal(size=shape) * (random.random(shape) < 0.8)
+    return Block.from_jerks(random.normal(size=(COUNT, JOINTS, 3)), knots, jerks)
+
+
+def table(block: Block, row: int) -> PiecewiseCubic:
+    return PiecewiseCubic(tuple(block.knots[row].copy()), tuple(block.coefficients[row].copy()))
+
+
+def holds(check, motion: PiecewiseCubic, limits: JointLimits) -> bool:
+    try:
+        check(motion, limits)
+    except PlanningError:
+        return False
+    return True
+
+
+@given(blocks(), st.lists(st.sampled_from(JUST), min_size=5, max_size=5))
+def test_limits_are_kept_where_the_check_of_one_motion_says_so(block, factors):
+    each = []
+    for row in range(COUNT):
+        reach = table(block, row).extrema()
+        far = 1.0 + np.maximum(np.abs(reach.lower), np.abs(reach.upper))
+        lower = np.where(reach.lower < 0, reach.lower * factors[0], -far)
+        upper = np.where(reach.upper > 0, reach.upper * factors[1], far)
+        rates = [
+            np.maximum(rate, 1e-3) * factor
+            for rate, factor in zip(reach[2:], factors[2:], strict=True)
+        ]
+        each.append(JointLimits(lower, upper, *rates))
+    rows = rows_of(*each)
+    expected = [holds(check_limits, table(block, row), each[row]) for row in range(COUNT)]
+    assert block.keeps(rows).tolist() == expected
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 6),
+    st.integers(0, 2),
+    st.sampled_from([0.0, 1e-11, 1e-3]),
+)
+def test_motions_are_smooth_where_the_check_of_one_says_so(seed, piece, quantity, jump):
+    starts, ends = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, COUNT, JOINTS))
+    ones = np.ones((COUNT, JOINTS))
+    unit = JointLimits(-ones[0], ones[0], ones[0], ones[0], ones[0])
+    moves = StraightMoves.between(starts, ends, rows_of(*[unit] * COUNT), ones)
+    knots, pieces = moves.cut(np.zeros(COUNT), moves.durations)
+    pieces[1, 0, piece, quantity] += jump
+    motion = Block.of_pieces(np.repeat(knots[:, None], JOINTS, axis=1), pieces)
+    rows = rows_of(*[unit] * COUNT)
+    expected = [holds(check_smooth, table(motion, row), unit) for row in range(COUNT)]
+    assert motion.smooth(rows).tolist() == expected
+    assert expected[0]
+    assert expected[2]
+    if jump != 1e-11:  # about what counts as rounding: there only the two have to agree
+        assert expected[1] is (jump == 0.0)
+
+
+@given(blocks())
+def test_tables_are_the_same_motions_without_empty_pieces(block):
+    for row, motion in enumerate(block.tables()):
+        whole = table(block, row)
+        assert motion.duration == whole.duration
+        times = np.linspace(-0.1, 1.1, 97) * whole.duration
+        for ours, theirs in zip(motion.sample(times), whole.sample(times), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        assert all(np.all(np.diff(knots) > 0.0) for knots in motion.knots)
+
+
+def test_a_motion_of_no_length_keeps_one_piece():
+    still = Block.from_jerks(
+        np.array([[[1.0, 0.0, 0.0]]]), np.zeros((1, 1, PIECES + 1)), np.zeros((1, 1, PIECES))
+    )
+    (motion,) = still.tables()
+    assert motion.duration == 0.0
+    assert motion.sample(np.array([0.0]))[0] == pytest.approx(1.0)

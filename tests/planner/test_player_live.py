@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from drivers.execution import MotionExecution
 from drivers.guard import Guard, GuardLimits
-from planner import InvalidSetting, PiecewiseCubic, TrajectoryPlayer, plan
+from planner import InvalidSetting, TrajectoryPlayer, plan
+from planner.piecewise_cubic import Block
 from planner.time_law import ramp, slowing_bounds, within
 
 PERIOD = 0.002
@@ -47,7 +48,8 @@ def all_at_their_limits(limits):
     half_way = limits.velocity * (2.0 * rise + flat + 0.1) / 2.0
     start[:, 0] = (limits.lower + limits.upper) / 2 - half_way
     jerks = limits.jerk[:, None] * np.concatenate((signs, -signs))
-    return PiecewiseCubic.from_jerks(start, knots, jerks)
+    (motion,) = Block.from_jerks(start[None], knots[None], jerks[None]).tables()
+    return motion
 
 
 class Motions(list):

@@ -13,17 +13,8 @@ from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
 from identification.excitation.searches.problem import Problem, Scores, unplannable, unplanned
 from identification.excitation.violation import Violation
-from planner import (
-    FourierSeries,
-    PiecewiseCubic,
-    PlannerCrashed,
-    PlanningTimedOut,
-    WorkerProcess,
-    chunks_of,
-    load,
-    map_in_children,
-    pack,
-)
+from planner import FourierSeries, PiecewiseCubic, PlannerCrashed, PlanningTimedOut
+from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import operator
 import os
 import signal
 import subprocess
@@ -12,17 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-import planner.worker
-from planner import ViaPointOutOfLimits, plan
-from planner.batch import plan_chunk
-from planner.errors import (
-    PlannerCrashed,
-    PlannerNotStarted,
-    PlannerOutOfStep,
-    PlanningTimedOut,
-)
-from planner.limits import JointLimits
+from planner import InvalidSetting, InvalidViaPoints, JointLimits, plan, plan_chunk
+from planner.errors import PlannerCrashed, PlannerNotStarted, PlannerOutOfStep, PlanningTimedOut
 from planner.worker import (
     WorkerProcess,
     chunks_of,
@@ -30,6 +25,7 @@ from planner.worker import (
     in_child,
     map_in_children,
     plan_in_child,
+    stream_in_children,
 )
 
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
@@ -119,7 +115,7 @@ def test_the_solver_crashes_on_legal_input():
     assert done.returncode == -signal.SIGSEGV
 
 
-def test_the_states_that_crash_the_solver_are_refused_before_it_is_asked(join):
+def test_the_states_that_crash_the_solver_are_not_asked_for(join):
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
@@ -136,11 +132,9 @@ def test_planning_in_a_child_is_planning(six_axis_limits, random_points):
 
 
 def test_errors_come_back_whole(six_axis_limits, random_points):
-    points = random_points(3)
-    points[2, 1] = 99.0
-    with pytest.raises(ViaPointOutOfLimits, match="via point 2, joint 1") as caught:
-        plan_in_child(points, six_axis_limits)
-    assert (caught.value.index, caught.value.joint, caught.value.value) == (2, 1, 99.0)
+    with pytest.raises(InvalidSetting, match="fly = 2") as caught:
+        plan_in_child(random_points(3), six_axis_limits, fly=2.0)
+    assert (caught.value.name, caught.value.value) == ("fly", 2.0)
 
 
 def test_an_unexpected_error_tells_where_it_happened():
@@ -205,7 +199,7 @@ def killed(child):
     return pid
 
 
-def test_a_child_that_died_idle_is_replaced_and_told_only_to_who_begins_a_call():
+def test_a_child_that_died_idle_is_replaced():
     with WorkerProcess() as child:
         pid = killed(child)
         assert child.call(os.getpid) != pid
@@ -215,7 +209,7 @@ def test_a_child_that_died_idle_is_replaced_and_told_only_to_who_begins_a_call()
         assert child.call(os.getpid) != pid
 
 
-def test_a_process_that_cannot_start_is_not_the_fault_of_what_it_was_to_plan(
+def test_a_process_that_cannot_start_is_an_error_of_its_own(
     tmp_path, monkeypatch, six_axis_limits, random_points
 ):
     (tmp_path / "ruckig.py").write_text("raise SystemExit(3)", encoding="utf-8")
@@ -240,7 +234,7 @@ def test_a_call_that_takes_too_long_is_ended():
 
 
 @pytest.mark.parametrize("task", ["", "child.send(time.sleep, 60.0)"], ids=["idle", "busy"])
-def test_a_child_ends_with_its_parent_even_in_the_middle_of_a_long_call(task):
+def test_a_child_ends_with_its_parent_even_while_it_works(task):
     script = f"""
 import os, signal, time
 from planner.worker import WorkerProcess
@@ -285,7 +279,7 @@ def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits,
         for other in others:
             assert type(one) is type(other)
             assert str(one) == str(other) if index in (7, 33) else same(one, other)
-    assert isinstance(runs[0][7], ViaPointOutOfLimits)
+    assert isinstance(runs[0][7], InvalidViaPoints)
     assert isinstance(runs[0][33], PlannerCrashed)
 
 
@@ -394,14 +388,94 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
     busy.join()
 
 
-def test_an_answer_to_another_call_is_refused_and_the_next_one_is_right(monkeypatch):
-    with WorkerProcess() as child:
-        child.call(os.getpid)
-        honest = planner.worker.numbered
-        monkeypatch.setattr(
-            planner.worker, "numbered", lambda number, message: honest(number + 1, message)
+@pytest.fixture
+def importable(monkeypatch):
+    """A child finds the functions of these tests under the name that they have here."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+
+
+@given(st.integers(0, 200), st.integers(1, 50))
+def test_chunks_hold_every_index_once_and_in_order(count, size):
+    chunks = chunks_of(count, size)
+    assert [index for chunk in chunks for index in chunk] == list(range(count))
+    assert all(len(chunk) == size for chunk in chunks[:-1])
+    assert all(1 <= len(chunk) <= size for chunk in chunks)
+
+
+def test_results_come_in_order_whoever_was_free():
+    with WorkerProcess() as one, WorkerProcess() as other:
+        results = map_in_children(
+            [one, other], np.negative, chunks_of(50, 3), lambda chunk: (np.array(chunk),)
         )
-        with pytest.raises(PlannerOutOfStep):
-            child.call(os.getpid)
-        monkeypatch.undo()
-        assert child.call(os.getpid) == child.pid
+    assert results == [-index for index in range(50)]
+
+
+def test_what_the_function_raises_ends_the_map():
+    with WorkerProcess() as child:
+        with pytest.raises(ZeroDivisionError):
+            map_in_children([child], operator.truediv, chunks_of(3, 2), lambda _: (1, 0))
+        assert map_in_children([child], list, chunks_of(3, 2), lambda chunk: (chunk,)) == [0, 1, 2]
+
+
+def killed_so_often(indices, folder, often):
+    """Negate, but for the item 5, end the process so many times as if from outside."""
+    for index in indices:
+        count = len(list(Path(folder).iterdir()))
+        if index == 5 and count < often:
+            (Path(folder) / str(count)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return [-index for index in indices]
+
+
+@pytest.mark.parametrize(("size", "often"), [(1, 1), (4, 2), (1, 99)])
+def test_an_item_killed_from_outside_is_tried_again(size, often, tmp_path, importable):
+    """Alone as much as in company; what ends every process is believed at last."""
+    with WorkerProcess() as child:
+        results = map_in_children(
+            [child],
+            killed_so_often,
+            chunks_of(9, size),
+            lambda chunk: (list(chunk), str(tmp_path), often),
+        )
+    if often == 99:
+        assert isinstance(results.pop(5), PlannerCrashed)
+        assert len(list(tmp_path.iterdir())) == 2
+    assert results == [-index for index in range(9) if often < 99 or index != 5]
+
+
+def test_a_child_killed_while_it_starts_is_started_again():
+    with WorkerProcess() as one, WorkerProcess() as other:
+        os.kill(one.pid, signal.SIGKILL)
+        results = map_in_children([one, other], list, chunks_of(9, 3), lambda chunk: (chunk,))
+    assert results == list(range(9))
+
+
+def test_what_is_done_is_told_as_it_comes():
+    told = []
+    with WorkerProcess() as child:
+        map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=told.append)
+    assert told == [3, 3, 1]
+
+
+class TestStreamInChildren:
+    def test_asks_for_a_chunk_when_a_child_is_free(self):
+        asked = []
+
+        def chunks():
+            for index in range(50):
+                asked.append(index)
+                yield [index]
+
+        with WorkerProcess() as child:
+            results = stream_in_children([child], list, chunks(), lambda chunk: (chunk,))
+            assert next(results) == (0, 0)
+            assert asked == [0, 1]
+            assert sorted(results) == [(index, index) for index in range(1, 50)]
+
+    def test_a_break_costs_no_child_that_is_idle(self):
+        with WorkerProcess() as one, WorkerProcess() as other:
+            results = stream_in_children([one, other], list, [[0]], lambda chunk: (chunk,))
+            assert next(results) == (0, 0)
+            pids = one.pid, other.pid
+            results.close()
+            assert (one.pid, other.pid) == pids
