@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
-from hil.archive.cdr import Rows, joint_state_layout
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
     COMMANDED,
@@ -21,9 +20,9 @@ from hil.archive.schema import (
     PROFILE,
     Channel,
     description_messages,
+    joint_states,
     profile,
     set_points,
-    stamped,
 )
 from hil.archive.writer import register
 from hil.errors import InputError
@@ -125,7 +124,7 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
     messages = []
     for topic, (times, values) in states.items():
         number = register(writer, Channel(topic, measured.schema, measured.definition))
-        messages.append((number, times + shift, _states(names, times + shift, values)))
+        messages.append((number, times + shift, joint_states(names, times + shift, values)))
     last = max(int(times[-1]) for _, times, _ in messages)
     for start in range(first, last + 1, _CHUNK):
         for number, times, rows in messages:
@@ -142,14 +141,3 @@ def _recorded_at(archive: Archive) -> int | None:
         return round(datetime.fromisoformat(archive.header.recorded_at or "").timestamp()) * 10**9
     except ValueError:
         return None
-
-
-def _states(names: tuple[str, ...], stamp: Stamps, values: Mapping[str, Array]) -> Rows:
-    position, velocity, effort = (
-        len(names) * (word in values) for word in ("position", "velocity", "effort")
-    )
-    layout = joint_state_layout(names, position=position, velocity=velocity, effort=effort)
-    rows = stamped(layout, stamp)
-    for word, column in values.items():
-        rows[word] = column
-    return rows

@@ -140,8 +140,9 @@ class LayoutBuilder:
             self._constant.append(part)
 
 
+@lru_cache(maxsize=64)
 def joint_state_layout(
-    names: Sequence[str], *, position: int, velocity: int, effort: int
+    names: tuple[str, ...], *, position: int, velocity: int, effort: int
 ) -> MessageLayout:
     """Lay out a sensor_msgs/JointState with these names and lengths of its arrays."""
     builder = LayoutBuilder()

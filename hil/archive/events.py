@@ -12,12 +12,14 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 
 from hil.archive.cdr import ENCAPSULATION, LayoutError
 from hil.reading import json_of
+
+_HEAD = struct.Struct("<iIB")  # seconds, nanoseconds, level
 
 
 class Level(IntEnum):
@@ -63,12 +65,11 @@ class ArchivedEvent:
         if self.data:
             lines.append(json.dumps(_document(self.data), sort_keys=True, allow_nan=False))
         times = divmod(self.stamp if stamp is None else stamp, 10**9)
-        message = bytearray(ENCAPSULATION + struct.pack("<iIB", *times, self.level))
+        message = bytearray(ENCAPSULATION + _HEAD.pack(*times, self.level))
         for text in (self.name, "\n".join(lines), "", ""):  # file and function stay empty
-            message += bytes(-len(message) % 4)
             encoded = text.encode() + b"\0"
-            message += struct.pack("<I", len(encoded)) + encoded
-        return bytes(message + bytes(-len(message) % 4) + struct.pack("<I", 0))
+            message += bytes(-len(message) % 4) + struct.pack("<I", len(encoded)) + encoded
+        return bytes(message + bytes(-len(message) % 4 + 4))  # and no line of a file
 
     @classmethod
     def decode(cls, message: bytes) -> Self:
@@ -80,34 +81,27 @@ class ArchivedEvent:
         if message[: len(ENCAPSULATION)] != ENCAPSULATION:
             raise LayoutError("the message is not little-endian CDR")
         try:
-            seconds, nanoseconds, level = struct.unpack_from("<iIB", message, len(ENCAPSULATION))
-            name, end = _string(message, _NAME_AT)
-            whole, _ = _string(message, end)
+            seconds, nanoseconds, level = _HEAD.unpack_from(message, len(ENCAPSULATION))
+            end, texts = len(ENCAPSULATION) + _HEAD.size, []
+            for _ in ("name", "text"):
+                start = end + -end % 4 + 4
+                end = start + int(struct.unpack_from("<I", message, start - 4)[0])
+                if end == start or end > len(message):
+                    raise LayoutError("a string does not fit into the message")
+                texts.append(message[start : end - 1].decode())
         except struct.error as error:
             raise LayoutError("the message ends before its last field") from error
         except UnicodeDecodeError as error:
             raise LayoutError("a string is not UTF-8") from error
+        name, whole = texts
         text, _, second = whole.partition("\n")
         data: Any = None
-        if second:
-            with suppress(ValueError):
-                data = json_of(second)
+        with suppress(ValueError):
+            data = json_of(second)
         if not isinstance(data, dict):
             text, data = whole, {}
         known = max((one for one in Level if one <= level), default=Level.DEBUG)
         return cls((seconds * 10**9 + nanoseconds) * 1e-9, name, text, known, data)
-
-
-_NAME_AT: Final = 16  # bytes from the beginning of a message
-
-
-def _string(message: bytes, at: int) -> tuple[str, int]:
-    """The string at a place, and where the next one begins."""
-    (length,) = struct.unpack_from("<I", message, at)
-    end = at + 4 + length
-    if not length or end > len(message):
-        raise LayoutError(f"a string of {length} bytes does not fit into the message")
-    return message[at + 4 : end - 1].decode(), end + -end % 4
 
 
 def _document(value: Any) -> Any:
@@ -120,6 +114,4 @@ def _document(value: Any) -> Any:
         return [_document(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    return str(value)
+    return value if value is None or isinstance(value, str | int) else str(value)

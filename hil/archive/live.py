@@ -21,7 +21,15 @@ from drivers.drive_train import DriveTrain
 from drivers.exchange.event_log import ExchangeEvent
 from hil.archive.events import ArchivedEvent
 from hil.archive.recorder import describe, level_of
-from hil.archive.schema import EVENT_CHANNEL, Channel, CycleEncoder
+from hil.archive.schema import (
+    COMMANDED,
+    CYCLE,
+    EVENT_CHANNEL,
+    MEASURED,
+    Channel,
+    cycle_messages,
+    profile,
+)
 from hil.version import install_command
 
 if TYPE_CHECKING:
@@ -140,10 +148,12 @@ class LivePublisher:
         self._server, self._context = _serve(asked.view)
         self.port = int(self._server.port)
         self.drive_train = asked.drive_train
-        self._encoder = CycleEncoder(asked.joint_names, asked.period)
+        self._names = asked.joint_names
+        known = profile(len(asked.joint_names))
+        cycles = (known[topic] for topic in (CYCLE, MEASURED, COMMANDED))
         self._period = asked.period
         self._step = max(1, round(1.0 / (asked.view.rate * asked.period)))
-        self._channels = [_channel(channel, self._context) for channel in self._encoder.channels]
+        self._channels = [_channel(channel, self._context) for channel in cycles]
         self._events = _channel(EVENT_CHANNEL, self._context)
         self._clock = ViewerClock()
         self._waiting: deque[_Portion] = deque(maxlen=QUEUE)
@@ -177,7 +187,7 @@ class LivePublisher:
         records = portion.records
         if len(records):
             torque = portion.drive_train.joint_torque(records["target_current"])
-            batch = self._encoder.encode(records, torque)
+            batch = cycle_messages(self._names, self._period, records, torque)
             times = [self._clock.at(int(stamp)) for stamp in batch.stamp]
             for channel, rows in zip(self._channels, batch.messages.values(), strict=True):
                 size = rows.dtype.itemsize

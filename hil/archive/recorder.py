@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,69 +44,63 @@ from hil.archive.events import Level
 from hil.archive.writer import ArchiveWriter
 from hil.terminal_text import plural
 
+_SENTENCES: Final[Mapping[type, str]] = {
+    StateChanged: "{0.before.name} -> {0.after.name} in cycle {0.cycle}",
+    MotionStarted: "first set-point in cycle {0.cycle}",
+    MotionEnded: "{0.outcome} in cycle {0.cycle}: {0.reason}",
+    Refused: "{0.error}; {0.error.remedy}",
+    Leaving: "the exchange comes to its end: {0.reason}",
+    ExchangeEnded: "the exchange ended: {0.reason}",
+    OverrideRefused: "no override of {0.fraction:g}: {0.reason}",
+    HoldRefused: "nothing is held: {0.reason}",
+    ResumeRefused: "the motion cannot be resumed: {0.reason}",
+    EventsLost: "{0.count} events were overwritten before they could be archived",
+}
+
 
 def describe(event: ExchangeEvent) -> str:
     """One line for a person."""
     match event:
-        case StateChanged():
-            return f"{event.before.name} -> {event.after.name} in cycle {event.cycle}"
         case GapSeen():
             return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
             were = f"{plural(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
             return f"{were} not accepted by the controller, until cycle {event.cycle}"
-        case MotionStarted():
-            return f"first set-point in cycle {event.cycle}"
         case OverrideChanged():
             return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
         case HoldChanged():
             return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
-        case MotionEnded():
-            return f"{event.outcome} in cycle {event.cycle}: {event.reason}"
         case PacketRejected(kind="answered late"):
             return f"{plural(event.count, 'answer')} left more than a cycle after their packet"
         case PacketRejected():
             why = f" ({event.why})" if event.why else ""
             return f"{plural(event.count, f'{event.kind} packet')} got no answer{why}"
-        case Refused():
-            return f"{event.error}; {event.error.remedy}"
-        case LinkLost(stale=stale) if stale:
-            packets = f"{plural(stale, 'packet')} that cannot follow the last one"
-            return f"only {packets} for {event.silence:.3f} s in state {event.state.name}"
-        case LinkLost():
-            return f"nothing heard for {event.silence:.3f} s in state {event.state.name}"
+        case LinkLost(stale=stale):
+            packets = f"only {plural(stale, 'packet')} that cannot follow the last one"
+            what = packets if stale else "nothing heard"
+            return f"{what} for {event.silence:.3f} s in state {event.state.name}"
         case InitReceived():
-            return event.unusable or "; ".join(
-                ["the controller started a session", *event.differences]
-            )
-        case Leaving():
-            return f"the exchange comes to its end: {event.reason}"
-        case ExchangeEnded():
-            return f"the exchange ended: {event.reason}"
+            started = ["the controller started a session", *event.differences]
+            return event.unusable or "; ".join(started)
         case ExchangeFailed():
             return f"the exchange failed: {event.trace.strip().splitlines()[-1]}"
         case ExchangeStarted():
             return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
-        case OverrideRefused():
-            return f"no override of {event.fraction:g}: {event.reason}"
-        case HoldRefused():
-            return f"nothing is held: {event.reason}"
-        case ResumeRefused():
-            return f"the motion cannot be resumed: {event.reason}"
-        case EventsLost():
-            return f"{event.count} events were overwritten before they could be archived"
+    return _SENTENCES[type(event)].format(event)
+
+
+_ERRORS: Final = (Refused, LinkLost, ExchangeFailed, EventsLost)
+_WARNINGS: Final = (
+    *(GapSeen, AnswersLost, PacketRejected),
+    *(OverrideRefused, ResumeRefused, HoldRefused),
+)
 
 
 def level_of(event: ExchangeEvent) -> Level:
     """How serious an event is."""
-    if isinstance(event, Refused | LinkLost | ExchangeFailed | EventsLost):
+    if isinstance(event, _ERRORS):
         return Level.ERROR
-    if isinstance(
-        event,
-        GapSeen | AnswersLost | PacketRejected | OverrideRefused | ResumeRefused | HoldRefused,
-    ):
-        return Level.WARN
-    return Level.INFO
+    return Level.WARN if isinstance(event, _WARNINGS) else Level.INFO
 
 
 Records = NDArray[np.void]
@@ -178,7 +172,7 @@ class Recorder:
         missed: packets that never arrived.
         late: packets whose answer was late or left out for a newer one.
         untaken: answers that the controller did not take.
-        newest_packet: cycle of the newest raw packet archived, -1 before the first.
+        newest: cycle of the newest record archived, -1 before the first.
     """
 
     def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
@@ -194,10 +188,10 @@ class Recorder:
         self.missed = 0
         self.late = 0
         self.untaken = 0
+        self.newest = -1
         self._drive_train = drive_train
-        self._newest = -1
+        self._newest_packet = -1
         self._cut = False
-        self.newest_packet = -1
         self._packets_cut = False
 
     def take_packets(self, packets: Records, lost: int = 0) -> None:
@@ -211,80 +205,51 @@ class Recorder:
         self.packets_lost += lost
         if self._packets_cut or not len(packets):
             return
-        cycles = packets["cycle"]
-        beyond = (np.diff(cycles, prepend=self.newest_packet) < 0) | (cycles > self._last_cycle)
-        if beyond.any():
-            self._packets_cut = True
-            packets = packets[: int(np.argmax(beyond))]
+        packets, self._packets_cut = self._ours(packets, self._newest_packet, least=0)
         if len(packets):
             self.writer.add_packets(packets)
-            self.newest_packet = int(packets["cycle"][-1])
+            self._newest_packet = int(packets["cycle"][-1])
 
     def take(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
         """Archive what has come; `lost` records before these were overwritten unread.
 
-        The records must be those up to the newest of the events, or more.
+        The records must be those up to the newest of the events, or more. Of events only those up
+        to the init packet that begins another session are archived, that one included.
 
         Raises:
             ArchiveWriteError: the disk refuses.
         """
-        ours = self._of_this_session(events)
+        restarts = [k for k, event in enumerate(events) if isinstance(event, InitReceived)]
+        ours = () if self.restarted else events[: restarts[0] + 1] if restarts else events
         self.note(events)
         self._write(records)
         for event in ours:
-            self._count(event)
-            self._tell(event)
+            if isinstance(event, EventsLost):
+                self.events_lost += event.count
+            elif isinstance(event, AnswersLost):
+                self.untaken += event.count
+            elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
+                self.late += event.count
+            self._archive(event)
         if lost:
             self.records_lost += lost
             self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
 
     def witness(self, outcome: Outcome, interval: int) -> None:
         """Take it from elsewhere that the motion has ended: the event that says so was lost."""
-        ended = MotionEnded(outcome, "the event that said why was lost", interval, self._newest)
+        ended = MotionEnded(outcome, "the event that said why was lost", interval, self.newest)
         self.note([ended])
-        self._tell(ended)
+        self._archive(ended)
 
     def remark(self, name: str, text: str) -> None:
         """Archive a warning of our own."""
         self.writer.event(None, name, text, level=Level.WARN)
 
-    def note(self, events: Sequence[ExchangeEvent]) -> None:
-        """Take in what events say of the interval, without archiving them."""
-        for event in events:
-            if isinstance(event, MotionEnded):
-                self.ended = event
-            self.restarted = self.restarted or isinstance(event, InitReceived)
-            self.link_lost = self.link_lost or isinstance(event, LinkLost)
-            if isinstance(event, Refused):
-                self.refused = event
-
-    def _tell(self, event: ExchangeEvent) -> None:
-        self.writer.event(
-            getattr(event, "cycle", None),
-            type(event).__name__,
-            describe(event),
-            level=level_of(event),
-            data=_data(event),
-        )
-
-    def _count(self, event: ExchangeEvent) -> None:
-        if isinstance(event, EventsLost):
-            self.events_lost += event.count
-        elif isinstance(event, AnswersLost):
-            self.untaken += event.count
-        elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
-            self.late += event.count
-
-    @property
-    def newest(self) -> int:
-        """Cycle of the newest record archived, -1 before the first."""
-        return self._newest
-
     @property
     def lacks_packets(self) -> bool:
         """Whether raw packets of the newest record archived are still to come, if any are."""
         packets_wanted = self.writer.with_packets and not self._packets_cut
-        return packets_wanted and self.newest_packet < self._newest
+        return packets_wanted and self._newest_packet < self.newest
 
     @property
     def over(self) -> bool:
@@ -293,8 +258,7 @@ class Recorder:
             return False
         if _at_rest(self.ended) or self._cut or self.restarted:
             return True
-        aftermath = round(AFTERMATH / self.writer.period)
-        return self._newest - self.ended.cycle >= aftermath
+        return self.newest >= self._last_cycle
 
     def close(self, outcome: str, reason: str = "") -> None:
         """Complete the archive."""
@@ -309,14 +273,20 @@ class Recorder:
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
 
-    def _of_this_session(self, events: Sequence[ExchangeEvent]) -> Sequence[ExchangeEvent]:
-        """Events up to the init packet that begins another session, that one included."""
-        if self.restarted:
-            return ()
-        for index, event in enumerate(events):
-            if isinstance(event, InitReceived):
-                return events[: index + 1]
-        return events
+    def note(self, events: Sequence[ExchangeEvent]) -> None:
+        """Take in what events say of the interval, without archiving them."""
+        for event in events:
+            if isinstance(event, MotionEnded):
+                self.ended = event
+            elif isinstance(event, Refused):
+                self.refused = event
+            self.restarted |= isinstance(event, InitReceived)
+            self.link_lost |= isinstance(event, LinkLost)
+
+    def _archive(self, event: ExchangeEvent) -> None:
+        data = {name: getattr(event, name) for name in _DATA.get(type(event), ())}
+        cycle, name = getattr(event, "cycle", None), type(event).__name__
+        self.writer.event(cycle, name, describe(event), level=level_of(event), data=data)
 
     @property
     def _last_cycle(self) -> int:
@@ -325,33 +295,37 @@ class Recorder:
             return int(np.iinfo(np.int64).max)
         return self.ended.cycle + round(AFTERMATH / self.writer.period)
 
+    def _ours(self, rows: Records, newest: int, *, least: int) -> tuple[Records, bool]:
+        """Rows up to the end of the session and of the aftermath, and whether others follow.
+
+        Args:
+            rows: that came.
+            newest: cycle of the row before them.
+            least: by which cycles grow from row to row.
+        """
+        cycles = rows["cycle"]
+        beyond = (np.diff(cycles, prepend=newest) < least) | (cycles > self._last_cycle)
+        return (rows[: int(np.argmax(beyond))], True) if beyond.any() else (rows, False)
+
     def _write(self, records: Records) -> None:
         """Archive the records up to the end of the session and of the aftermath."""
         if self._cut or not len(records):
             return
-        cycles = records["cycle"]
-        beyond = (np.diff(cycles, prepend=self._newest) <= 0) | (cycles > self._last_cycle)
-        if beyond.any():
-            self._cut = True
-            records = records[: int(np.argmax(beyond))]
+        records, self._cut = self._ours(records, self.newest, least=1)
         if not len(records):
             return
         self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
         self.records += len(records)
         self.missed += int(records["gap"].sum())
-        self._newest = int(records["cycle"][-1])
+        self.newest = int(records["cycle"][-1])
 
 
-def _data(event: ExchangeEvent) -> dict[str, float | bool] | None:
-    """What a program may want to know of an event beside its cycle."""
-    match event:
-        case AnswersLost():
-            return {"count": event.count}
-        case OverrideChanged():
-            return {"fraction": event.fraction}
-        case HoldChanged():
-            return {"held": event.held}
-    return None
+_DATA: Final[Mapping[type, Sequence[str]]] = {
+    AnswersLost: ("count",),
+    OverrideChanged: ("fraction",),
+    HoldChanged: ("held",),
+}
+"""What a program may want to know of an event beside its cycle."""
 
 
 def _at_rest(ended: MotionEnded) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 from typing import Any, Final, NamedTuple
 from xml.etree.ElementTree import Element, ParseError, fromstring
@@ -49,7 +50,6 @@ PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
 LATER_FIELDS = frozenset(("age",))
 """Fields of a cycle that older archives do not have; zero is what they would have held."""
 
-_STAMP = ("sec", "nanosec")
 _STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
 
@@ -197,6 +197,7 @@ TRANSFORM_CHANNEL = Channel(
 )
 
 
+@lru_cache(maxsize=16)
 def profile(n_joints: int) -> Mapping[str, Channel]:
     """The channels of the profile by topic, for so many joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
@@ -229,43 +230,75 @@ class Batch(NamedTuple):
     messages: Mapping[str, Rows]
 
 
-class CycleEncoder:
-    """Turns cycle records into the three messages that an archive holds for each cycle.
+def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: Array) -> Batch:
+    """The three messages that an archive holds for each cycle.
 
     `/hil/cycle` holds everything; the two JointState channels repeat what viewers plot.
 
-    Attributes:
-        channels: the channels.
+    Args:
+        names: of the joints.
+        period: of the controller [s].
+        records: of k cycles.
+        torque: of their joints (k, n).
     """
+    stamp = _stamp(records, period)
+    columns = {name: records[name] for name in records.dtype.names or ()}
+    measured = {"position": records["position"], "velocity": records["velocity"], "effort": torque}
+    commanded = {name: set_points(records, name) for name in ("position", "velocity")}
+    return Batch(
+        stamp,
+        {
+            CYCLE: _numbers(profile(len(names))[CYCLE], stamp, {**columns, "torque": torque}),
+            MEASURED: joint_states(names, stamp, measured),
+            COMMANDED: joint_states(names, stamp, commanded),
+        },
+    )
 
-    def __init__(self, joint_names: Sequence[str], period: float) -> None:
-        n = len(joint_names)
-        self._period_ns = period * 1e9
-        channels = profile(n)
-        self.channels = (channels[CYCLE], channels[MEASURED], channels[COMMANDED])
-        self._cycle = fixed_layout(channels[CYCLE].definition)
-        self._measured = joint_state_layout(joint_names, position=n, velocity=n, effort=n)
-        self._commanded = joint_state_layout(joint_names, position=n, velocity=n, effort=0)
-        self._copied = [
-            name for name in self._cycle.dtype.names or () if name not in (*_STAMP, "torque")
-        ]
 
-    def encode(self, records: Rows, torque: Array) -> Batch:
-        """Encode k cycle records, and the joint torques (k, n) that belong to them."""
-        stamp = np.rint(records["cycle"] * self._period_ns).astype(np.int64)
-        cycle, measured, commanded = (
-            stamped(layout, stamp) for layout in (self._cycle, self._measured, self._commanded)
-        )
-        for name in self._copied:
-            if name in (records.dtype.names or ()):  # records of old archives have no age
-                cycle[name] = records[name]
-        cycle["torque"] = torque
-        measured["position"] = records["position"]
-        measured["velocity"] = records["velocity"]
-        measured["effort"] = torque
-        for name in ("position", "velocity"):
-            commanded[name] = set_points(records, name)
-        return Batch(stamp, {CYCLE: cycle, MEASURED: measured, COMMANDED: commanded})
+def packet_messages(period: float, packets: Rows) -> Batch:
+    """Raw packets of the link, rows of `drivers.record.PACKET_DTYPE`, as messages."""
+    stamp = _stamp(packets, period)
+    columns = {name: packets[name] for name in packets.dtype.names or ()}
+    return Batch(stamp, {PACKETS: _numbers(profile(0)[PACKETS], stamp, columns)})
+
+
+def sample_messages(
+    names: Sequence[str],
+    stamp: NDArray[np.int64],
+    states: Mapping[str, Array],
+    motor_current: Array | None,
+) -> Batch:
+    """Samples of a foreign recording as messages.
+
+    Args:
+        names: of the joints.
+        stamp: (k,) [ns].
+        states: ``position``, ``velocity`` and ``effort`` (k, n), as far as they were recorded; what
+            was not is left out of the messages, not invented.
+        motor_current: (k, n) [A], None where it was not recorded.
+    """
+    messages = {MEASURED: joint_states(names, stamp, states)}
+    if motor_current is not None:
+        channel = profile(len(names))[MOTOR_CURRENT]
+        messages[MOTOR_CURRENT] = _numbers(channel, stamp, {"motor_current": motor_current})
+    return Batch(stamp, messages)
+
+
+def joint_states(
+    names: Sequence[str], stamp: NDArray[np.int64], values: Mapping[str, Array]
+) -> Rows:
+    """Messages sensor_msgs/JointState with stamps (k,) [ns] and those values (k, n) that are given.
+
+    Args:
+        names: of the joints.
+        stamp: theirs.
+        values: of ``position``, ``velocity`` and ``effort``.
+    """
+    position, velocity, effort = (
+        len(names) * (word in values) for word in ("position", "velocity", "effort")
+    )
+    layout = joint_state_layout(tuple(names), position=position, velocity=velocity, effort=effort)
+    return _filled(layout, stamp, values)
 
 
 def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
@@ -279,66 +312,25 @@ def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
     return np.where(np.isnan(sent), records[f"target_{name}"], sent)
 
 
-class PacketEncoder:
-    """Turns raw packets of the link into messages.
-
-    Attributes:
-        channel: theirs.
-    """
-
-    channel = profile(0)[PACKETS]
-
-    def __init__(self, period: float) -> None:
-        self._period_ns = period * 1e9
-        self._layout = fixed_layout(self.channel.definition)
-
-    def encode(self, packets: Rows) -> Batch:
-        """Encode k packets, rows of `drivers.record.PACKET_DTYPE`."""
-        stamp = np.rint(packets["cycle"] * self._period_ns).astype(np.int64)
-        rows = stamped(self._layout, stamp)
-        for name in packets.dtype.names or ():
-            rows[name] = packets[name]
-        return Batch(stamp, {PACKETS: rows})
+def _stamp(records: Rows, period: float) -> NDArray[np.int64]:
+    return np.rint(records["cycle"] * (period * 1e9)).astype(np.int64)
 
 
-class SampleEncoder:
-    """Turns the samples of a foreign recording into JointState and motor current messages.
+def _numbers(
+    channel: Channel, stamp: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
+) -> Rows:
+    return _filled(fixed_layout(channel.definition), stamp, columns)
 
-    Quantities that the recording does not have are left out of the messages, not invented.
 
-    Attributes:
-        channels: the channels.
-    """
-
-    def __init__(
-        self, joint_names: Sequence[str], *, velocity: bool, torque: bool, motor_current: bool
-    ) -> None:
-        n = len(joint_names)
-        self._state = joint_state_layout(
-            joint_names, position=n, velocity=n * velocity, effort=n * torque
-        )
-        current = profile(n)[MOTOR_CURRENT]
-        self._current = fixed_layout(current.definition) if motor_current else None
-        self.channels = [profile(n)[MEASURED], *([current] if motor_current else [])]
-
-    def encode(
-        self,
-        stamp: NDArray[np.int64],
-        position: Array | None,
-        velocity: Array | None,
-        torque: Array | None,
-        motor_current: Array | None,
-    ) -> Batch:
-        """Encode k samples; arrays (k, n), None for what was declared as absent."""
-        state = stamped(self._state, stamp)
-        for name, values in (("position", position), ("velocity", velocity), ("effort", torque)):
-            if values is not None:
-                state[name] = values
-        if self._current is None or motor_current is None:
-            return Batch(stamp, {MEASURED: state})
-        current = stamped(self._current, stamp)
-        current["motor_current"] = motor_current
-        return Batch(stamp, {MEASURED: state, MOTOR_CURRENT: current})
+def _filled(
+    layout: MessageLayout, stamp: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
+) -> Rows:
+    """Messages with these stamps (k,) [ns], and the columns that they have a place for."""
+    rows = layout.rows(len(stamp))
+    rows["sec"], rows["nanosec"] = np.divmod(stamp, 10**9)
+    for name in columns.keys() & set(rows.dtype.names or ()):
+        rows[name] = columns[name]
+    return rows
 
 
 def message_layout(
@@ -353,44 +345,31 @@ def message_layout(
         first: one of them; joint states may lack quantities.
 
     Raises:
-        LayoutError: they are not those of the profile.
+        LayoutError: they are not those of the profile: a number is missing, or of another type or
+            length.
     """
+    n = len(joints)
     if topic in (MEASURED, COMMANDED):
         row = np.frombuffer(first, np.uint8)[None]
-        for position, velocity, effort in product((len(joints), 0), repeat=3):
-            state = joint_state_layout(joints, position=position, velocity=velocity, effort=effort)
+        for lengths in product((n, 0), repeat=3):
+            sizes = dict(zip(("position", "velocity", "effort"), lengths, strict=True))
+            state = joint_state_layout(tuple(joints), **sizes)
             if state.size == len(first) and state.holds_in(row):
                 return state
-        raise LayoutError(f"they are no joint states of these {len(joints)} joints")
+        raise LayoutError(f"they are no joint states of these {n} joints")
     if record is None:
         raise LayoutError("their schema is missing")
     layout = fixed_layout(record.data.decode(errors="replace"))
-    check_fields(topic, layout, len(joints))
-    return layout
-
-
-def check_fields(topic: str, layout: MessageLayout, n_joints: int) -> None:
-    """Check that the numbers in messages are those of the profile, of so many joints.
-
-    Raises:
-        LayoutError: one is missing, or of another type or length.
-    """
     found: Mapping[str, Any] = layout.dtype.fields or {}
     expected: Mapping[str, Any] = _STAMP_TYPES
     if topic in (CYCLE, MOTOR_CURRENT, PACKETS):
-        expected = fixed_layout(profile(n_joints)[topic].definition).dtype.fields or {}
+        expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
         if name not in found and name not in LATER_FIELDS:
             raise LayoutError(f"they have no {name}")
         if name in found and found[name][0] != kind:
-            raise LayoutError(f"their {name} is not that of {n_joints} joints")
-
-
-def stamped(layout: MessageLayout, stamp: NDArray[np.int64]) -> Rows:
-    """So many messages with these stamps (k,) [ns]."""
-    rows = layout.rows(len(stamp))
-    rows["sec"], rows["nanosec"] = np.divmod(stamp, 10**9)
-    return rows
+            raise LayoutError(f"their {name} is not that of {n} joints")
+    return layout
 
 
 WORLD: Final = "world"
@@ -398,50 +377,54 @@ WORLD: Final = "world"
 
 
 def description_messages(urdf: bytes) -> dict[Channel, bytes]:
-    """The messages that describe an arm, by channel; none of what is no URDF, or is too long."""
-    builder = LayoutBuilder()
+    """The messages that describe an arm, by channel; none of what is no URDF, or is too long.
+
+    The transforms are those of the fixed joints, and of the base in the world.
+    """
+    builder, transforms = LayoutBuilder(), LayoutBuilder()
     try:
         text = urdf.decode()
         builder.string(text)
-        return {
-            DESCRIPTION_CHANNEL: builder.build().template,
-            TRANSFORM_CHANNEL: _encoded([*_transforms(text)]),
-        }
+        root = fromstring(text)
+        poses = [*_base_poses(root), *_fixed_poses(root)]
+        transforms.count(len(poses))
+        for k, (parent, child, _) in enumerate(poses):
+            transforms.variable(f"stamp{k}", "uint32", 2)  # zero: at all times
+            transforms.string(parent)
+            transforms.string(child)
+            transforms.variable(f"pose{k}", "float64", 7)
+        row = transforms.build().rows(1)
+        for k, (*_, pose) in enumerate(poses):
+            row[f"pose{k}"] = pose
     except (LayoutError, LookupError, ParseError, ValueError):
         return {}
+    return {DESCRIPTION_CHANNEL: builder.build().template, TRANSFORM_CHANNEL: row.tobytes()}
 
 
-_Transform = tuple[str, str, list[float]]
+_Pose = tuple[str, str, tuple[float, ...]]
+"""Parent, child, and the child's origin [m] and quaternion (x, y, z, w) in the parent."""
 
 
-def _transforms(urdf: str) -> Iterator[_Transform]:
-    """Parent, child, and the child's origin [m] and quaternion (x, y, z, w) in the parent.
-
-    Raises:
-        ParseError: the text is no XML.
-        ValueError: a number is none, or there is no link.
-    """
-    root = fromstring(urdf)
+def _base_poses(root: Element) -> Iterator[_Pose]:
     links = [link.get("name", "") for link in root.findall("link")]
     if not links:
         raise ValueError("it has no link")
-    joints = root.findall("joint")
-    children = {_link(joint, "child") for joint in joints}
+    children = {_link(joint, "child") for joint in root.findall("joint")}
     for base in links:
         if WORLD not in links and base not in children:
-            yield WORLD, base, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-    for joint in joints:
+            yield WORLD, base, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def _fixed_poses(root: Element) -> Iterator[_Pose]:
+    for joint in root.findall("joint"):
         if joint.get("type") == "fixed":
             origin = joint.find("origin")
             stated = {} if origin is None else origin.attrib
-            xyz, (roll, pitch, yaw) = (
-                [float(x) for x in stated.get(key, "0 0 0").split()] for key in ("xyz", "rpy")
+            (x, y, z), (roll, pitch, yaw) = (
+                map(float, stated.get(key, "0 0 0").split()) for key in ("xyz", "rpy")
             )
-            yield (
-                _link(joint, "parent"),
-                _link(joint, "child"),
-                [*xyz, *_quaternion(roll, pitch, yaw)],
-            )
+            pose = (x, y, z, *_quaternion(roll, pitch, yaw))
+            yield _link(joint, "parent"), _link(joint, "child"), pose
 
 
 def _link(joint: Element, end: str) -> str:
@@ -458,17 +441,3 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, fl
         p * q * c - a * b * r,
         p * q * r + a * b * c,
     )
-
-
-def _encoded(transforms: list[_Transform]) -> bytes:
-    builder = LayoutBuilder()
-    builder.count(len(transforms))
-    for k, (parent, child, _) in enumerate(transforms):
-        builder.variable(f"stamp{k}", "uint32", 2)  # zero: at all times
-        builder.string(parent)
-        builder.string(child)
-        builder.variable(f"pose{k}", "float64", 7)
-    row = builder.build().rows(1)
-    for k, (_, _, pose) in enumerate(transforms):
-        row[f"pose{k}"] = pose
-    return row.tobytes()

@@ -1,4 +1,4 @@
-"""Writes cycle records to an archive while they arrive."""
+"""Writes cycle records to an archive while they arrive, and whole foreign recordings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,24 +32,31 @@ from hil.archive.header import (
 )
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
+    COMMANDED,
     CYCLE,
-    EVENT_CHANNEL,
     EVENTS,
     LIBRARY,
+    MEASURED,
+    MOTOR_CURRENT,
     PACKETS,
     PROFILE,
     Batch,
     Channel,
-    CycleEncoder,
-    PacketEncoder,
-    SampleEncoder,
+    cycle_messages,
     description_messages,
+    packet_messages,
+    profile,
+    sample_messages,
 )
 from hil.errors import ArchiveWriteError
 from hil.files import sync_folder
 
-_MOST_NUMBERS = 1 << 32  # message numbers are counted modulo this
-_MEDIA_TYPES = {
+Array = NDArray[np.float64]
+
+FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash costs at most that
+_SAMPLES_PER_CHUNK: Final = 1000
+_MOST_NUMBERS: Final = 1 << 32  # message numbers are counted modulo this
+_MEDIA_TYPES: Final = {
     ".toml": "application/toml",
     ".urdf": "application/xml",
     ".json": "application/json",
@@ -66,8 +73,12 @@ class ArchiveFile:
 
     Args:
         path: where to write.
-        channels: all channels.
-        metadata: entries of the ``hil`` metadata record.
+        joint_names: joints in the order of the columns.
+        topics: of the channels.
+        metadata: entries of the ``hil`` metadata record. Kind, index and attempt are read from the
+            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, must be
+            among them.
+        period: cycle time [s], None where it is not fixed.
         attachments: file name to content; viewers get a ``robot.urdf`` as a message as well.
         durable: wait at each flush until the disk has the data.
 
@@ -77,31 +88,37 @@ class ArchiveFile:
         closed: whether the file is closed, by `finish` or by a failure of the disk.
 
     Raises:
-        ArchiveWriteError: the file exists or cannot be created.
+        ArchiveWriteError: the file exists or cannot be created, or the metadata cannot stand.
     """
 
     def __init__(
         self,
         path: Path,
         *,
-        channels: Sequence[Channel],
+        joint_names: Sequence[str],
+        topics: Sequence[str],
         metadata: Mapping[str, str],
+        period: float | None,
         attachments: Mapping[str, bytes],
         durable: bool,
     ) -> None:
+        described = _checked_metadata(path, metadata) | {"joint_names": json.dumps([*joint_names])}
+        if period is not None:
+            described["period"] = json.dumps(period)
+        described["format_version"] = str(FORMAT_VERSION)
+        described["attachments"] = json.dumps(sorted(attachments))
         self._once = description_messages(attachments.get("robot.urdf", b""))
-        channels = [*channels, *self._once]
+        known = profile(len(joint_names))
+        channels = [*(known[topic] for topic in topics), *self._once]
         self.counts = {channel.topic: 0 for channel in channels}
         self.slowest_flush = 0.0
         self.closed = False
         self._path = path
         self._durable = durable
+        self._description = checksum(described)
         self._descriptor = _create(path)
         self._parts: list[bytes] = []  # to be written at once
         self._writer = McapWriter(self._parts.append, PROFILE, LIBRARY)
-        names = json.dumps(sorted(attachments))
-        described = {**metadata, "format_version": str(FORMAT_VERSION), "attachments": names}
-        self._description = checksum(described)
         with self._guarded():
             self._writer.add_metadata(METADATA, sealed(described))
             for name, data in sorted(attachments.items()):
@@ -213,9 +230,29 @@ def _create(path: Path) -> int:
         ) from error
 
 
-Array = NDArray[np.float64]
+def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
+    """The caller's entries with what the file name says.
 
-FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash costs at most that
+    Raises:
+        ArchiveWriteError: no kind or an unknown one, or a contradiction between entries and file
+            name.
+    """
+    name = ArchiveName.parse(path)
+    named = name.metadata() if name else {}
+    entries = {**named, **{key: str(value) for key, value in metadata.items()}}
+    for key, value in named.items():
+        if entries[key] != value:
+            raise ArchiveWriteError(
+                path, f"{key} is {entries[key]!r}, but the file name says {value!r}", field=key
+            )
+    if entries.get("kind") not in KINDS:
+        raise ArchiveWriteError(
+            path,
+            f"{entries.get('kind')!r} is no kind of archive",
+            field="kind",
+            remedy=f"use {', '.join(KINDS)}",
+        )
+    return entries
 
 
 class ArchiveWriter:
@@ -230,13 +267,15 @@ class ArchiveWriter:
         path: the file, which must not exist.
         joint_names: joints in the order of the records' columns.
         period: cycle time of the controller [s].
-        metadata: entries of the ``hil`` metadata record. Kind, index and attempt are read from the
-            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, must be
-            among them. Times of day belong here only when a real arm moved.
+        metadata: see `ArchiveFile`. Times of day belong here only when a real arm moved.
         attachments: what the archive needs to be understood alone, by file name: ``cell.toml``,
             ``robot.urdf``, ``drive_train.json``, ``plan.json``.
         durable: wait at each flush until the disk has the data.
         packets: whether raw packets will come as well, see `add_packets`.
+
+    Attributes:
+        path, period: as given.
+        with_packets: whether the archive keeps raw packets.
 
     Raises:
         ArchiveWriteError: the file exists, the disk refuses, or the metadata cannot stand.
@@ -253,56 +292,36 @@ class ArchiveWriter:
         durable: bool = True,
         packets: bool = False,
     ) -> None:
-        self._path = Path(path)
-        self._period = period
-        self._n_joints = len(joint_names)
-        self._encoder = CycleEncoder(joint_names, period)
+        self.path = Path(path)
+        self.period = period
+        self.with_packets = packets
+        self._joint_names = tuple(joint_names)
         self._cycles_per_chunk = max(1, round(FLUSH_PERIOD / period))
         self._pending: list[tuple[Rows, Array]] = []
-        self._packet_encoder = PacketEncoder(period) if packets else None
         self._pending_packets: list[Rows] = []
         self._first: int | None = None
-        self._last: int | None = None
         self._newest = 0
         self._lost = 0
-        own = {"joint_names": list(joint_names), "period": period}
         self._file = ArchiveFile(
-            self._path,
-            channels=[
-                *self._encoder.channels,
-                EVENT_CHANNEL,
-                *([PacketEncoder.channel] if packets else []),
-            ],
-            metadata=checked_metadata(self._path, metadata, own),
+            self.path,
+            joint_names=joint_names,
+            topics=(CYCLE, MEASURED, COMMANDED, EVENTS, *([PACKETS] if packets else [])),
+            metadata=metadata,
+            period=period,
             attachments=attachments or {},
             durable=durable,
         )
 
     @property
-    def path(self) -> Path:
-        """The file being written."""
-        return self._path
-
-    @property
-    def period(self) -> float:
-        """Cycle time of the controller [s]."""
-        return self._period
-
-    @property
     def chunk_ends_in(self) -> float:
         """The controller's time until the chunk in progress is full and written [s]."""
-        begun = self._newest + 1 - (self._newest + 1 if self._first is None else self._first)
-        return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self._period
+        begun = 0 if self._first is None else self._newest + 1 - self._first
+        return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self.period
 
     @property
     def slowest_flush(self) -> float:
         """Longest time that the disk took for what was handed to it at once [s]."""
         return self._file.slowest_flush
-
-    @property
-    def with_packets(self) -> bool:
-        """Whether the archive keeps raw packets."""
-        return self._packet_encoder is not None
 
     @property
     def closed(self) -> bool:
@@ -322,24 +341,36 @@ class ArchiveWriter:
                 in which case nothing of these records is written.
         """
         if self._file.closed:
-            raise ArchiveWriteError(self._path, "the archive is closed")
+            raise ArchiveWriteError(self.path, "the archive is closed")
         if not len(records):
             return
-        shape = (len(records), self._n_joints)
+        shape = (len(records), len(self._joint_names))
         torques = np.full(shape, np.nan) if torque is None else np.asarray(torque, np.float64)
         if torques.shape != shape or records["position"].shape != shape:
             raise ValueError(
                 f"records are {records['position'].shape}, torques {torques.shape}, "
                 f"expected {shape}"
             )
-        self._check_growth(records["cycle"])
+        cycles = records["cycle"]
+        before = int(cycles[0]) - 1 if self._first is None else self._newest
+        falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
+        if falling.size:
+            at = int(falling[0])
+            last = int(cycles[at - 1]) if at else before
+            raise ArchiveWriteError(
+                self.path,
+                f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive "
+                "grow",
+                field="cycle",
+                remedy="begin another archive for another session with the controller",
+            )
         if self._first is None:
-            self._first = int(records["cycle"][0])
-        self._newest = int(records["cycle"][-1])
+            self._first = int(cycles[0])
+        self._newest = int(cycles[-1])
         self._lost += int(records["gap"].sum())
         self._pending.append((records, torques))
         oldest = int(self._pending[0][0]["cycle"][0])
-        if self._slot(oldest) != self._slot(self._newest) or self._ends_slot(self._newest):
+        if self._slot(oldest) != self._slot(self._newest + 1):
             self._emit(everything=False)
 
     def add_packets(self, packets: Rows) -> None:
@@ -355,7 +386,7 @@ class ArchiveWriter:
         Raises:
             ValueError: the archive was opened without packets.
         """
-        if self._packet_encoder is None:
+        if not self.with_packets:
             raise ValueError("this archive was opened without packets")
         if len(packets):
             self._pending_packets.append(packets)
@@ -378,9 +409,8 @@ class ArchiveWriter:
             level: severity.
             data: the same for a program, anything JSON can hold.
         """
-        if cycle is None:
-            cycle = self._newest
-        self._file.add_event(ArchivedEvent(cycle * self._period, name, text, level, data or {}))
+        time = (self._newest if cycle is None else cycle) * self.period
+        self._file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
     def flush(self) -> None:
         """Write out what is pending, chunk or not; for links that have fallen silent."""
@@ -402,15 +432,15 @@ class ArchiveWriter:
             return
         self._emit(everything=True)
         self._emit_packets(None if self._first is None else self._newest)
+        counts = self._file.counts
         cycles = {
-            "samples": self._file.counts[CYCLE],
-            "events": self._file.counts[EVENTS],
+            "samples": counts[CYCLE],
+            "events": counts[EVENTS],
             "lost_packets": self._lost,
+            **({"packets": counts[PACKETS]} if self.with_packets else {}),
         }
-        if self._packet_encoder is not None:
-            cycles["packets"] = self._file.counts[PACKETS]
-        if self._first is not None and self._last is not None:
-            cycles |= {"first_cycle": self._first, "last_cycle": self._last}
+        if self._first is not None:
+            cycles |= {"first_cycle": self._first, "last_cycle": self._newest}
         texts = {key: str(value) for key, value in cycles.items()}
         self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
 
@@ -423,37 +453,9 @@ class ArchiveWriter:
         else:
             self.close("interrupted", reason=f"{type(error).__name__}: {error}")
 
-    def _check_growth(self, cycles: NDArray[np.int64]) -> None:
-        """Check that cycles follow one another, and those written before."""
-        before = int(cycles[0]) - 1 if self._first is None else self._newest
-        falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
-        if falling.size:
-            at = int(falling[0])
-            last = int(cycles[at - 1]) if at else before
-            raise ArchiveWriteError(
-                self._path,
-                f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive "
-                "grow",
-                field="cycle",
-                remedy="begin another archive for another session with the controller",
-            )
-
     def _slot(self, cycle: int) -> int:
+        """The chunk that a cycle belongs to."""
         return (cycle - (self._first or 0)) // self._cycles_per_chunk
-
-    def _ends_slot(self, cycle: int) -> bool:
-        return self._slot(cycle + 1) != self._slot(cycle)
-
-    def _emit_packets(self, last: int | None) -> None:
-        """Add the packets up to the cycle `last`, None for all, to the chunk in progress."""
-        if self._packet_encoder is None or not self._pending_packets:
-            return
-        packets = np.concatenate(self._pending_packets)
-        count = len(packets)
-        if last is not None:
-            count = int(np.searchsorted(packets["cycle"], last, side="right"))
-        self._file.add(self._packet_encoder.encode(packets[:count]))
-        self._pending_packets = [packets[count:]] if count < len(packets) else []
 
     def _emit(self, *, everything: bool) -> None:
         """Write the pending records slot by slot; the slot still open only if all is wanted."""
@@ -463,45 +465,27 @@ class ArchiveWriter:
         torque = np.concatenate([part for _, part in self._pending])
         slots = (records["cycle"] - (self._first or 0)) // self._cycles_per_chunk
         cuts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist(), len(records)]
-        if not everything and not self._ends_slot(int(records["cycle"][-1])):
+        if not everything and self._slot(self._newest + 1) == slots[-1]:
             cuts.pop()
         for start, stop in pairwise(cuts):
-            self._file.add(self._encoder.encode(records[start:stop], torque[start:stop]))
-            self._last = int(records["cycle"][stop - 1])
-            self._emit_packets(self._last)
+            part = records[start:stop]
+            batch = cycle_messages(self._joint_names, self.period, part, torque[start:stop])
+            self._file.add(batch)
+            self._emit_packets(int(part["cycle"][-1]))
             self._file.flush()
         rest = cuts[-1]
         self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []
 
-
-def checked_metadata(
-    path: Path, metadata: Mapping[str, str], own: Mapping[str, object]
-) -> dict[str, str]:
-    """Join the caller's entries with our own, and with what the file name says.
-
-    Raises:
-        ArchiveWriteError: no kind or an unknown one, or a contradiction between entries and file
-            name.
-    """
-    name = ArchiveName.parse(path)
-    named = name.metadata() if name else {}
-    entries = {**named, **{key: str(value) for key, value in metadata.items()}}
-    for key, value in named.items():
-        if entries[key] != value:
-            raise ArchiveWriteError(
-                path, f"{key} is {entries[key]!r}, but the file name says {value!r}", field=key
-            )
-    if entries.get("kind") not in KINDS:
-        raise ArchiveWriteError(
-            path,
-            f"{entries.get('kind')!r} is no kind of archive",
-            field="kind",
-            remedy=f"use {', '.join(KINDS)}",
-        )
-    return {**entries, **{key: json.dumps(value) for key, value in own.items()}}
-
-
-_SAMPLES_PER_CHUNK = 1000  # samples
+    def _emit_packets(self, last: int | None) -> None:
+        """Add the packets up to the cycle `last`, None for all, to the chunk in progress."""
+        if not self._pending_packets:
+            return
+        packets = np.concatenate(self._pending_packets)
+        count = len(packets)
+        if last is not None:
+            count = int(np.searchsorted(packets["cycle"], last, side="right"))
+        self._file.add(packet_messages(self.period, packets[:count]))
+        self._pending_packets = [packets[count:]] if count < len(packets) else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,31 +532,29 @@ def write_samples(
         ArchiveWriteError: the file exists, the disk refuses, or a stamp cannot be stored.
     """
     path = Path(path)
-    if samples.stamp.size and not 0 <= samples.stamp.min() <= samples.stamp.max() < 2**31 * 10**9:
+    stamp, current = samples.stamp, samples.motor_current
+    if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
         raise ArchiveWriteError(
             path, "a stamp lies outside 0 .. 2^31 s", remedy="shift the recording's clock"
         )
-    encoder = SampleEncoder(
-        joint_names,
-        velocity=samples.velocity is not None,
-        torque=samples.torque is not None,
-        motor_current=samples.motor_current is not None,
-    )
-    own: dict[str, object] = {"joint_names": list(joint_names)}
-    if period is not None:
-        own["period"] = period
+    recorded = {
+        "position": samples.position, "velocity": samples.velocity, "effort": samples.torque
+    }  # fmt: skip
+    states = {name: values for name, values in recorded.items() if values is not None}
     file = ArchiveFile(
         path,
-        channels=[*encoder.channels, EVENT_CHANNEL],
-        metadata=checked_metadata(path, {**metadata, "kind": "imported"}, own),
+        joint_names=joint_names,
+        topics=(MEASURED, *([] if current is None else [MOTOR_CURRENT]), EVENTS),
+        metadata={**metadata, "kind": "imported"},
+        period=period,
         attachments=attachments or {},
         durable=durable,
     )
-    for start in range(0, len(samples.stamp), _SAMPLES_PER_CHUNK):
+    for start in range(0, len(stamp), _SAMPLES_PER_CHUNK):
         part = slice(start, start + _SAMPLES_PER_CHUNK)
-        values = (samples.position, samples.velocity, samples.torque, samples.motor_current)
-        quantities = [None if one is None else one[part] for one in values]
-        file.add(encoder.encode(samples.stamp[part], *quantities))
+        values = {name: column[part] for name, column in states.items()}
+        currents = None if current is None else current[part]
+        file.add(sample_messages(joint_names, stamp[part], values, currents))
         file.flush()
-    file.finish({"outcome": "completed", "samples": str(len(samples.stamp)), "events": "0"})
+    file.finish({"outcome": "completed", "samples": str(len(stamp)), "events": "0"})
     return path

@@ -405,8 +405,10 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
     rows = records(300)
     whole = schema._CYCLE
     monkeypatch.setattr(schema, "_CYCLE", whole[: whole.index("uint16[8] age")])
+    schema.profile.cache_clear()
     path = write(tmp_path / NAME, rows)
     monkeypatch.undo()
+    schema.profile.cache_clear()
     archive = open_archive(path)
     assert archive.complete
     assert "age" not in archive.columns

@@ -28,8 +28,8 @@ from hil.archive.container import Record
 from hil.archive.header import ArchiveHeader, HeaderError, chunk_list
 from hil.archive.overview import overview
 from hil.archive.repair import repair
-from hil.archive.schema import EVENT_CHANNEL, SampleEncoder
-from hil.archive.writer import ArchiveFile, checked_metadata
+from hil.archive.schema import sample_messages
+from hil.archive.writer import ArchiveFile
 from hil.cli import app
 from hil.errors import ArchiveError
 from hil.identify.sources import cell_of, gather_sources
@@ -341,19 +341,19 @@ class TestAnnouncements:
 def imported(tmp_path) -> Imported:
     """An imported recording of 60 samples in three chunks: joints and currents, no cycles."""
     path = tmp_path / IMPORTED
-    encoder = SampleEncoder(["a", "b"], velocity=False, torque=False, motor_current=True)
-    entries = checked_metadata(path, {"kind": "imported"}, {"joint_names": ["a", "b"]})
     file = ArchiveFile(
         path,
-        channels=[*encoder.channels, EVENT_CHANNEL],
-        metadata=entries,
+        joint_names=["a", "b"],
+        topics=(schema.MEASURED, schema.MOTOR_CURRENT, schema.EVENTS),
+        metadata={"kind": "imported"},
+        period=None,
         attachments={},
         durable=False,
     )
     for start in range(0, 60, 20):
         stamps = np.arange(start, start + 20, dtype=np.int64) * 10**9
         values = np.arange(2.0 * start, 2.0 * start + 40).reshape(20, 2)
-        file.add(encoder.encode(stamps, values, None, None, -values))
+        file.add(sample_messages(["a", "b"], stamps, {"position": values}, -values))
         file.flush()
     file.finish({"outcome": "completed", "reason": "", "samples": "60", "events": "0"})
     with path.open("rb") as stream:
