@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from socket import SOCK_SEQPACKET, socket
 from types import FrameType
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +50,6 @@ RECENT: Final = 5000
 _PACKETS_PER_CYCLE = 2
 
 
-class Session(NamedTuple):
-    """What belongs to one session with the controller; its init packet is not news any more."""
-
-    records: Records
-    events: list[ExchangeEvent]
-    packets: Records
-
-
 @dataclass
 class Recent:
     """The newest records, events and raw packets; the oldest go as others come."""
@@ -70,37 +62,38 @@ class Recent:
         self, records: Records, events: Sequence[ExchangeEvent], packets: Records | None = None
     ) -> None:
         """Take in what has come; `packets` None where they are not recorded."""
-        _keep_newest(self._records, records, RECENT)
         self._events = [*self._events, *events][-RECENT:]
-        if packets is not None:
-            _keep_newest(self._packets, packets, _PACKETS_PER_CYCLE * RECENT)
+        for parts, rows, count in (
+            (self._records, records, RECENT),
+            (self._packets, packets, _PACKETS_PER_CYCLE * RECENT),
+        ):
+            if rows is not None and len(rows):
+                parts.append(rows)
+            while sum(map(len, parts[1:])) >= count:  # a part goes that has none of the newest
+                parts.pop(0)
 
-    def take_session(self) -> Session:
-        """What belongs to the session that began last; none of it is stored here."""
-        records, events, packets = self._records, self._events, self._packets
-        self._records, self._events, self._packets = [], [], []
+    def take_session(self) -> tuple[Records, list[ExchangeEvent], Records]:
+        """Records, events and raw packets of the session that began last; they are removed here.
+
+        Its init packet is not among the events: it is not news any more.
+        """
+        events = self._events
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
-        return Session(
-            _after_restart(records, np.dtype(np.void(0).dtype), least=1),
+        session = (
+            _after_restart(self._records, np.dtype(np.void(0).dtype), least=1),
             events[inits[-1] + 1 :] if inits else events,
             # Several packets may belong to one cycle.
-            _after_restart(packets, PACKET_DTYPE, least=0),
+            _after_restart(self._packets, PACKET_DTYPE, least=0),
         )
-
-
-def _keep_newest(parts: list[Records], rows: Records, count: int) -> None:
-    """Append rows; parts go that hold none of the newest `count`."""
-    if len(rows):
-        parts.append(rows)
-    while sum(map(len, parts[1:])) >= count:
-        parts.pop(0)
+        self._records, self._events, self._packets = [], [], []
+        return session
 
 
 def _after_restart(parts: list[Records], dtype: np.dtype[np.void], *, least: int) -> Records:
     """The rows since the cycles last began anew: since they grew by less than `least`."""
+    rows = np.concatenate(parts) if parts else np.zeros(0, dtype)
     if not parts:
-        return np.zeros(0, dtype)
-    rows = np.concatenate(parts)
+        return rows
     restarts = np.flatnonzero(np.diff(rows["cycle"]) < least)
     return rows[int(restarts[-1]) + 1 :] if restarts.size else rows
 
@@ -256,14 +249,14 @@ class ArchiveProcess:
             self._take()
             self._close("interrupted", "another archive was begun")
         self._idle()
-        recent = self._recent.take_session()
+        records, events, packets = self._recent.take_session()
         overflow, control = self._ring.overflow, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
-                recorder.take_packets(recent.packets)
-                recorder.take(recent.records, recent.events)
+                recorder.take_packets(packets)
+                recorder.take(records, events)
         except Exception as error:
             self._fail(command.job, error)
             return
@@ -299,7 +292,9 @@ class ArchiveProcess:
             self._take_packets(job)
             job.recorder.take(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
-                self._believe_the_count(job.recorder)
+                # The motion has ended, and the event that says so was overwritten.
+                outcome = _OUTCOMES[Ended(self._control.ended_outcome)]
+                job.recorder.witness(outcome, self._control.ended_interval)
             if len(records):
                 job.heard, job.flushed = now, False
             elif not job.flushed and now - job.heard > SILENCE:
@@ -326,18 +321,14 @@ class ArchiveProcess:
         waited = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
         if job.until_ended and ended is not None and (job.recorder.over or waited or gone):
             self._close(ended.outcome, ended.reason)
-        elif gone and job.until_ended and self._control.program_accepted == job.accepted:
-            who = "exchange process" if self._commands is not None else "supervising program"
-            self._close("void", f"nothing was sent: the {who} ended")
         elif gone and job.until_ended:
-            self._close("lost", "the exchange process ended")
+            who = "exchange process" if self._commands is not None else "supervising program"
+            if self._control.program_accepted == job.accepted:
+                self._close("void", f"nothing was sent: the {who} ended")
+            else:
+                self._close("lost", "the exchange process ended")
         elif gone and self._commands is None:
             self._close("stopped", "the supervising program ended")
-
-    def _believe_the_count(self, recorder: Recorder) -> None:
-        """The motion has ended, and the event that says so was overwritten."""
-        outcome = _OUTCOMES[Ended(self._control.ended_outcome)]
-        recorder.witness(outcome, self._control.ended_interval)
 
     def _look_after_exchange(self) -> None:
         """Note in the archive that the exchange stands still, and that it goes on again."""
@@ -400,10 +391,9 @@ class ArchiveProcess:
         """The arm comes to rest first: that needs nothing but this one field."""
         self._control.archive_state = ArchiveState.FAILED
         self._job = None
+        path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
         if isinstance(error, ArchiveError):
             path, problem, remedy = str(error.path), error.problem, error.remedy
-        else:
-            path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
         cause = error if isinstance(error, OSError) else error.__cause__
         number_of_cause = cause.errno if isinstance(cause, OSError) else None
         self._answer(Failed(number, path, problem, remedy, number_of_cause))
@@ -417,9 +407,8 @@ class ArchiveProcess:
             self._commands = None
 
     def _exchange_gone(self) -> bool:
-        if self._control.finished:
-            return True
-        return bool(select.select([self._exchange], [], [], 0.0)[0])
+        gone = self._control.finished or select.select([self._exchange], [], [], 0.0)[0]
+        return bool(gone)
 
 
 _OUTCOMES: dict[Ended, Outcome] = {

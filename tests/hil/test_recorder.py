@@ -179,4 +179,4 @@ def test_only_the_session_that_began_last_counts_and_is_given_once() -> None:
     assert kept["cycle"].tolist() == [0, 1, 2]
     assert kept_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
     assert not events
-    assert not len(recent.take_session().records)
+    assert not len(recent.take_session()[0])
