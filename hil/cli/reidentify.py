@@ -30,8 +30,7 @@ from hil.cli.identify_options import (
     VelocityOption,
     options_from,
 )
-from hil.compare.findings import findings, summary
-from hil.compare.trend import ArmTrend, Trends, trends
+from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
 from hil.files import make_folder, writing_to
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter

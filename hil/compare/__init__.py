@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .comparison import Comparison, compare_campaigns
-from .gather import gather
+from .comparison import Comparison, compare_campaigns, gather
 
 __all__ = ["Comparison", "compare_campaigns", "gather"]

@@ -1,22 +1,29 @@
-"""What changed from one campaign of an arm to another: numbers and sentences, from estimates."""
+"""Campaigns of one arm, from their archives, and what changed from one to another."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hil.batch import run
 from hil.batch.estimates import errors, relative_error
-from hil.batch.types import LevelEstimate
+from hil.batch.factors import cell_in, opened
+from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
+from hil.batch.workers import Workers
+from hil.cell import Cell
+from hil.errors import InputError
+from hil.identify.options import Options
+from hil.progress import Reporter
 from hil.results import Frozen
 from identification import RobotModel
 
-from .findings import Finding, payload_findings
-from .gather import Gathered
-from .payload import PayloadTrend, freedom_of, payload_trend
+from .payload import Finding, Level, PayloadTrend, freedom_of, payload_findings, payload_trend
 from .spread import Difference, Known, difference, holm, known
 from .trend import (
     FALSE_ALARMS,
@@ -29,6 +36,143 @@ from .trend import (
     typical_speed,
 )
 
+_TWO: Final = "name two campaigns or more of one arm"
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Campaigns of one arm.
+
+    Attributes:
+        arm: whose they are.
+        campaigns: in order of time; in the order given where not all have one.
+        repetitions: of each campaign, in order.
+        dated: whether the order is that of time.
+        broken: what could not be used.
+        simulated: whether no robot moved.
+    """
+
+    arm: Arm
+    campaigns: tuple[LevelEstimate, ...]
+    repetitions: tuple[tuple[LevelEstimate, ...], ...]
+    dated: bool
+    broken: tuple[Broken, ...]
+    simulated: bool = False
+
+
+def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathered:
+    """Identify the campaigns below some places, and check that they can be compared.
+
+    By least squares, which draw no change towards anything.
+
+    Args:
+        places: campaign folders, or folders with campaigns below; the `results.json` of a campaign
+            stands for its folder.
+        workers: read the archives.
+        reporter: of progress.
+
+    Raises:
+        InputError: there is one campaign only, or campaigns are of different arms.
+    """
+    roots = [_folder(place) for place in places]
+    refs: list[ArchiveRef] = []
+
+    def check(found: Sequence[ArchiveRef]) -> None:
+        _require_campaigns_of_one_arm(found)
+        refs.extend(found)
+
+    plan = run.Plan(Options(estimator="wls"))
+    result = run.reidentify(roots, plan, workers, reporter, check=check)
+    campaigns = list(result.campaigns)
+    if len(campaigns) < 2:
+        why = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        only = campaigns[0].campaign if campaigns else None
+        raise InputError(only, f"is the only campaign that can be estimated{why}", remedy=_TWO)
+    absolute = [_absolute(root) for root in roots]
+
+    def named(one: LevelEstimate) -> tuple[int, str]:
+        """Sorts campaigns as their places were named."""
+        own = _absolute(one.campaign)
+        found = [k for k, root in enumerate(absolute) if f"{own}/".startswith(f"{root}/")]
+        return (found[0] if found else len(absolute), own)
+
+    dated = all(one.when for one in campaigns)
+    campaigns.sort(key=named)
+    if dated:
+        campaigns.sort(key=lambda one: one.when)
+    return Gathered(
+        arm=result.arms[campaigns[0].arm],
+        campaigns=tuple(campaigns),
+        repetitions=tuple(
+            tuple(
+                rep
+                for rep in result.repetitions
+                if (rep.campaign, rep.setup) == (one.campaign, one.setup)
+            )
+            for one in campaigns
+        ),
+        dated=dated,
+        broken=result.broken,
+        simulated=refs[0].simulated,  # as all of one arm
+    )
+
+
+def _folder(place: str) -> str:
+    if "://" in place or Path(place).name != "results.json":
+        return place
+    return str(Path(place).parent)
+
+
+def _absolute(place: str) -> str:
+    return place if "://" in place else Path(place).resolve().as_posix()
+
+
+def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
+    """Friction and mass of another arm are another arm's, and one campaign has nothing beside it.
+
+    Raises:
+        InputError: names two campaigns and what their arms differ in, or the only one.
+    """
+    of = {ref.key: ref for ref in found if ref.use == "excitation"}
+    if not of:
+        return  # and that is refused
+    first = next(iter(of.values()))
+    for one in of.values():
+        if one.arm != first.arm:
+            here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
+            raise InputError(
+                one.campaign,
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): "
+                f"{apart(here.cell, there.cell)}",
+                remedy="compare campaigns of one arm",
+            )
+    if len(of) < 2:
+        raise InputError(first.campaign, "is the only campaign that was named", remedy=_TWO)
+
+
+def _cell(ref: ArchiveRef) -> Cell:
+    with opened(ref) as archive:
+        return cell_in(archive)
+
+
+def apart(one: Cell, other: Cell) -> str:
+    """What two arms differ in, in words."""
+    here, there = one.file, other.file
+    robots = (table.robot.model_dump(exclude={"payload"}) for table in (here, there))
+    differ = [
+        words
+        for words, apart in (
+            ("robot.urdf", one.urdf != other.urdf),
+            ("[robot]", next(robots) != next(robots)),
+            ("[drive_train]", here.drive_train != there.drive_train),
+        )
+        if apart
+    ]
+    if not differ:
+        return "one of them is a simulation, or their controllers state other drives"
+    return f"they differ in {' and '.join(differ)}"
+
+
 Array = NDArray[np.float64]
 Numbers = list[float | None]
 """Null for what is not known."""
@@ -37,8 +181,6 @@ CONFIDENCE: Final = 0.95
 """Of intervals, each by itself."""
 OTHER_SPEED: Final = 1.2
 """Ratio of typical speeds from which two campaigns count as having moved differently."""
-PREDICTS_WORSE: Final = 1.1
-"""Ratio of prediction errors from which a model is said to predict worse."""
 _SHARE: Final = FALSE_ALARMS / 2.0  # of comparisons, each for friction and for what it carries
 _LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
 
@@ -185,8 +327,8 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
             other_inertia=list(payload.other),
             mass=_numbers(payload.mass),
             mass_std=_numbers(payload.mass_std),
-            p_value=[None if one is None else _number(one.p_value) for one in payload.changes],
-            effect=[None if one is None else _number(one.effect) for one in payload.changes],
+            p_value=[None if one is None else one.p_value for one in payload.changes],
+            effect=[None if one is None else one.effect for one in payload.changes],
         ),
         parameters=_parameters(model, gathered),
         prediction=prediction,
@@ -194,22 +336,20 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
 
 
 def _axes(model: RobotModel, gathered: Gathered) -> list[AxisChange]:
-    campaigns = gathered.campaigns
+    campaigns, n = gathered.campaigns, model.n_joints
     speed = typical_speed(model, campaigns)
     weights = friction_weights(model, speed)
     pooled = [friction_in(one, weights) for one in campaigns]
     single = [
-        np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), len(weights))
+        np.array([friction_in(one, weights)[0] for one in own]).reshape(len(own), n)
         for own in gathered.repetitions
     ]
     rows = [
         [
-            known(
-                value[j], std[j] ** 2 if np.isfinite(std[j]) else np.inf, freedom_of(one), rep[:, j]
-            )
-            for one, (value, std), rep in zip(campaigns, pooled, single, strict=True)
+            known(value[j], std[j] ** 2, freedom_of(one), own[:, j])
+            for one, (value, std), own in zip(campaigns, pooled, single, strict=True)
         ]
-        for j in range(model.n_joints)
+        for j in range(n)
     ]
     apart, adjusted = _differences(rows)
     tests = int(np.isfinite(adjusted).sum())
@@ -228,10 +368,10 @@ def _axes(model: RobotModel, gathered: Gathered) -> list[AxisChange]:
             AxisChange(
                 joint=joint,
                 unit="N·m" if turns else "N",
-                speed=_number(speed[j]),
+                speed=_numbers(speed[j]),
                 speed_unit="rad/s" if turns else "m/s",
-                friction=[_number(one.value) for one in rows[j]],
-                std=[_number(one.std) for one in rows[j]],
+                friction=_numbers([one.value for one in rows[j]]),
+                std=_numbers([one.std for one in rows[j]]),
                 repetitions=[_numbers(own[:, j]) for own in single],
                 change=[None, *change],
                 interval=[None, *([*ends] for ends in zip(low, high, strict=True))],
@@ -262,10 +402,10 @@ def _parameters(model: RobotModel, gathered: Gathered) -> list[ParameterChange]:
             name=model.parameter_names[k],
             unit=model.units[k],
             friction=k >= model.base.rank,
-            value=[_number(one.value) for one in rows[k]],
-            std=[_number(one.std) for one in rows[k]],
-            change=[None, *(_number(one.value) for one in apart[k])],
-            change_std=[None, *(_number(one.std) for one in apart[k])],
+            value=_numbers([one.value for one in rows[k]]),
+            std=_numbers([one.std for one in rows[k]]),
+            change=[None, *_numbers([one.value for one in apart[k]])],
+            change_std=[None, *_numbers([one.std for one in apart[k]])],
             p_value=[None, *_numbers(adjusted[k])],
             changed=[False, *(adjusted[k] < FALSE_ALARMS).tolist()],
         )
@@ -296,29 +436,20 @@ def _prediction(campaigns: Sequence[LevelEstimate], n_joints: int) -> Prediction
     return Prediction(overall=_numbers(overall), joints=_numbers(joints))
 
 
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def _numbers(values: ArrayLike) -> Any:
-    """Nested lists of numbers (...), None for what is not finite."""
-    found = np.array(values, dtype=object)
-    found[~np.isfinite(np.asarray(values, dtype=np.float64))] = None
+    """A number, or nested lists of numbers (...), None for what is not finite."""
+    numbers = np.asarray(values, dtype=np.float64)
+    found = numbers.astype(object)
+    found[~np.isfinite(numbers)] = None
     return found.tolist()
-
-
-# Warnings
 
 
 def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:
     """What a reader must know: lost archives, few repetitions, other motions."""
     campaigns = gathered.campaigns
     called = short_names([one.campaign for one in campaigns])
-    lost = short_names([one.path for one in gathered.broken])
-    found = [
-        f"{name} could not be used: {one.reason}"
-        for name, one in zip(lost, gathered.broken, strict=True)
-    ]
+    lost = zip(short_names([one.path for one in gathered.broken]), gathered.broken, strict=True)
+    found = [f"{name} could not be used: {one.reason}" for name, one in lost]
     single = [name for name, own in zip(called, gathered.repetitions, strict=True) if len(own) < 2]
     if single:
         found.append(
@@ -337,12 +468,8 @@ def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:
                 f"{name} moved differently from {called[0]} (typical speed of "
                 f"{', '.join(fast)}): what the model leaves out can then look like a change"
             )
-    found += [
-        f"{name}: {warning}"
-        for name, one in zip(called, campaigns, strict=True)
-        for warning in one.warnings
-    ]
-    return found
+    each = zip(called, campaigns, strict=True)
+    return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
 
 
 # Sentences
@@ -374,58 +501,42 @@ def _caveat(count: int) -> str:
 
 
 def _findings(
-    names: list[str],
-    axes: Sequence[AxisChange],
-    payload: PayloadTrend,
-    prediction: Prediction,
+    names: list[str], axes: Sequence[AxisChange], payload: PayloadTrend, prediction: Prediction
 ) -> list[Finding]:
-    changes = [
-        _axis_finding(axis, k, names)
-        for axis in axes
-        for k in range(1, len(names))
-        if axis.changed[k]
-    ]
+    """What changed first, then what did not, or by little, or is not known."""
+    found = [_axis_finding(axis, k, names) for axis in axes for k in range(1, len(names))]
     for one in payload_findings(payload, names):
-        level: Literal["changed", "same"] = "same" if one.level == "quiet" else "changed"
-        changes.append(Finding(level, one.words, one.next_step))
-    same = [*_slight(axes, names), *_unchanged(axes), *_load(payload)]
-    same += _predictions(prediction, names)
-    changes += [Finding("same", words) for words in same]
-    return sorted(changes, key=lambda one: one.level)  # stable: "changed" comes first
+        level: Level = "same" if one.level == "quiet" else "changed"
+        found.append(Finding(level, one.words, one.next_step))
+    same = [*_unchanged(axes), *_predictions(prediction, names)]
+    if payload.untested:
+        same.append(f"Whether it carries the same was not tested: {payload.untested}.")
+    elif not any(payload.changed) and not any(payload.other):
+        same.append("The payload has not changed significantly.")
+    every = [one for one in found if one is not None] + [Finding("same", words) for words in same]
+    return sorted(every, key=lambda one: one.level)  # stable: "changed" comes first
 
 
-def _axis_finding(axis: AxisChange, k: int, names: list[str]) -> Finding:
+def _axis_finding(axis: AxisChange, k: int, names: list[str]) -> Finding | None:
+    """A difference of friction that is more than chance; less than a change where it is slight."""
     change, interval = axis.change[k], axis.interval[k]
-    assert change is not None and interval is not None, "what has changed is known"
+    if not (axis.changed[k] or axis.slight[k]) or change is None or interval is None:
+        return None
     low, high = (f"{100.0 * (end or 0.0):+.1f}" for end in interval)
     at = "" if axis.speed is None else f" at {axis.speed:.2g} {axis.speed_unit}"
-    higher = change > 0.0
-    return Finding(
-        "changed",
-        f"{axis.joint}: friction{at} is {100.0 * abs(change):.0f} % "
-        f"{'higher' if higher else 'lower'} in {names[k]} than in {names[0]}, "
+    words = (
+        f"{axis.joint}: friction{at} is {100.0 * abs(change):.{0 if axis.changed[k] else 1}f} % "
+        f"{'higher' if change > 0.0 else 'lower'} in {names[k]} than in {names[0]}, "
         f"{axis.friction[k]:.3g} against {axis.friction[0]:.3g} {axis.unit} "
-        f"(95 %: {low} to {high} %).",
-        "Check this axis' gear, brake and lubrication; was it colder?"
-        if higher
-        else "Was it warmer, or has gear or lubricant been changed?",
+        f"(95 %: {low} to {high} %)"
     )
-
-
-def _slight(axes: Sequence[AxisChange], names: list[str]) -> list[str]:
-    """What differs by more than chance, and by less than counts as a change."""
-    sentences = []
-    for k in range(1, len(names)):
-        some = [axis for axis in axes if axis.slight[k]]
-        if some:
-            sizes = [100.0 * (axis.change[k] or 0.0) for axis in some]
-            low, high = (f"{pick(sizes):+.1f}" for pick in (min, max))
-            sentences.append(
-                f"Friction of {_joined([axis.joint for axis in some])} has changed by"
-                f" {low if low == high else f'{low} to {high}'} % from {names[0]} to {names[k]}:"
-                f" more than chance, and less than the {_LEAST} that count as a change."
-            )
-    return sentences
+    if axis.slight[k]:
+        less = f"more than chance, and less than the {_LEAST} that count as a change"
+        return Finding("same", f"{words}: {less}.")
+    step = "Check this axis' gear, brake and lubrication; was it colder?"
+    if change < 0.0:
+        step = "Was it warmer, or has gear or lubricant been changed?"
+    return Finding("changed", f"{words}.", step)
 
 
 def _unchanged(axes: Sequence[AxisChange]) -> list[str]:
@@ -449,14 +560,6 @@ def _unchanged(axes: Sequence[AxisChange]) -> list[str]:
     return sentences
 
 
-def _load(payload: PayloadTrend) -> list[str]:
-    if payload.untested:
-        return [f"Whether it carries the same was not tested: {payload.untested}."]
-    if any(payload.changed) or any(payload.other):
-        return []
-    return ["The payload has not changed significantly."]
-
-
 def _predictions(prediction: Prediction, names: list[str]) -> list[str]:
     """How the first model does on the motions of the others, beside their own models."""
     sentences = []
@@ -464,15 +567,10 @@ def _predictions(prediction: Prediction, names: list[str]) -> list[str]:
         own, first = prediction.overall[k][k], prediction.overall[0][k]
         if first is None or not own:
             continue
-        ratio = first / own
-        how = (
-            f"with {ratio:.2g} times the error of that campaign's own model"
-            if ratio > PREDICTS_WORSE
-            else "as well as that campaign's own model"
-        )
         sentences.append(
-            f"The model of {names[0]} predicts the validation motions of {names[k]} "
-            f"{how}: {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque."
+            f"The model of {names[0]} predicts the validation motions of {names[k]} with"
+            f" {first / own:.2g} times the error of that campaign's own model:"
+            f" {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque."
         )
     return sentences
 

@@ -23,8 +23,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from dataclasses import dataclass
+from itertools import compress, pairwise
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,7 @@ LEAST_EFFECT: Final = 0.10
 PAYLOAD_LIKE: Final = 0.5
 """Share of a change of the inertial parameters that a payload has to explain to be one."""
 
+Level = Literal["alarm", "past", "quiet", "changed", "same"]
 Verdict = Literal["agrees", "statement only", "either", "differs", "untested"]
 
 _MASS_PLACE: Final = LINK_SYMBOLS.index("m")
@@ -59,6 +61,30 @@ _FEWEST_CHANGES: Final = 4
 # A covariance of fewer blocks than coordinates cannot be tested.
 _FEWEST_SPARE: Final = 2
 _NORMAL: Final = float(student.ppf(0.975, 1e6))
+_CERTAIN: Final = 2.0
+_VERDICTS: Final[dict[Verdict, str]] = {
+    "agrees": "the torques agree",
+    "statement only": "by its torques it carries the same as before: only the statement is new",
+    "either": "the torques do not show whether it was carried before as well",
+    "differs": "the torques do not agree",
+    "untested": "whether the torques agree was not tested",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know about an arm.
+
+    Attributes:
+        level: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing; in a
+            comparison "changed", or "same" for what did not, or by little, or is not known.
+        words: a sentence.
+        next_step: what to do about it; "" for nothing.
+    """
+
+    level: Level
+    words: str
+    next_step: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +117,7 @@ class Projection:
         return np.asarray(self.directions.T @ self.metric)
 
 
-@dataclass(frozen=True, eq=False)
-class State:
+class State(NamedTuple):
     """A campaign as the test sees it.
 
     Attributes:
@@ -131,11 +156,6 @@ class Change:
     moment: Array
     moment_std: Array
 
-    @property
-    def like_a_payload(self) -> bool:
-        """Whether a body on the last link explains enough of the change to be the cause."""
-        return self.share >= PAYLOAD_LIKE
-
 
 def projection(
     model: RobotModel, known: NDArray[np.bool_], information: Array, rows: int
@@ -150,7 +170,9 @@ def projection(
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]
-    scale = np.array([_usual(model.standard_names[k]) for k in last])
+    usual = {"m": _MASS, "c": _MOMENT, "I": _INERTIA}  # by "m", "mc" and "I" of the names
+    names = [model.standard_names[k] for k in last]
+    scale = np.array([usual["c" if name.startswith("mc") else name[0]] for name in names])
     grouping = model.base.grouping[np.ix_(places, last)] * scale
     if not grouping.any():
         return None
@@ -177,12 +199,9 @@ def state(onto: Projection, values: Array, covariance: Array, freedom: float) ->
 
 def pooled(states: Sequence[State]) -> State:
     """Mean of campaigns between which nothing changed."""
-    count = len(states)
-    return State(
-        values=np.mean([one.values for one in states], axis=0),
-        covariance=np.sum([one.covariance for one in states], axis=0) / count**2,
-        freedom=float(np.sum([one.freedom for one in states])),
-    )
+    values, covariances, freedoms = zip(*states, strict=True)
+    covariance = np.sum(covariances, axis=0) / len(states) ** 2
+    return State(np.mean(values, axis=0), covariance, float(np.sum(freedoms)))
 
 
 def compare(onto: Projection, before: State, after: State, scatter: float = 1.0) -> Change | None:
@@ -238,8 +257,7 @@ def own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float
 # From campaign to campaign
 
 
-@dataclass(frozen=True)
-class Statement:
+class Statement(NamedTuple):
     """A campaign that states another payload than the one before.
 
     Attributes:
@@ -257,7 +275,7 @@ class Statement:
 
 @dataclass(frozen=True, eq=False)
 class PayloadTrend:
-    """What the last link carries beside what it carried in the first campaign.
+    """What the last link carries beside what it carried in the first of c campaigns.
 
     Attributes:
         changes: of the parameters of each campaign against those before it since the last change;
@@ -292,67 +310,50 @@ def payload_trend(
     onto = _projection(model, campaigns)
     if isinstance(onto, str):
         return _untested(campaigns, onto)
-    bare = [
-        state(
-            onto, one.values, np.nan_to_num(np.asarray(one.covariance), posinf=0.0), freedom_of(one)
-        )
-        for one in campaigns
-    ]
     stated = [_stated(model, one.payload)[onto.places] for one in campaigns]
-    laden = [replace(b, values=b.values + body) for b, body in zip(bare, stated, strict=True)]
-    alike = [
-        (bare[k - 1], bare[k])
-        for k in range(1, len(bare))
-        if campaigns[k - 1].payload == campaigns[k].payload
-    ]
-    scatter = own_scatter(onto, alike)
-
-    def between(before: Sequence[State], after: State) -> Change | None:
-        return compare(onto, pooled(before), after, scatter)
+    bare, laden = list[State](), list[State]()
+    for one, load in zip(campaigns, stated, strict=True):
+        covariance = np.nan_to_num(np.asarray(one.covariance), posinf=0.0)
+        own = state(onto, one.values, covariance, freedom_of(one))
+        bare.append(own)
+        laden.append(own._replace(values=own.values + load))
+    same = [one.payload == other.payload for one, other in pairwise(campaigns)]
+    scatter = own_scatter(onto, list(compress(pairwise(bare), same)))
 
     def different(change: Change | None) -> bool:
         return change is not None and change.p_value < share and change.effect >= LEAST_EFFECT
 
-    changes: list[Change | None] = [None]
-    statements: list[Statement | None] = [None]
+    changes, statements = list[Change | None]([None]), list[Statement | None]([None])
     changed, other = [False], [False]
     first = 0  # campaign since which nothing has changed
     for k in range(1, len(campaigns)):
-        change = between(bare[first:k], bare[k])
-        differs, like = different(change), change is not None and change.like_a_payload
-        before, after = campaigns[k - 1].payload, campaigns[k].payload
-        statement = None
-        if before != after:
+        history = pooled(bare[first:k])
+        change = compare(onto, history, bare[k], scatter)
+        differs, statement = different(change), None
+        like = change is not None and change.share >= PAYLOAD_LIKE
+        if not same[k - 1]:
             # As if what was stated before were stated now.
-            put_back = replace(bare[k], values=bare[k].values + stated[k] - stated[k - 1])
-            restated = not different(between(bare[first:k], put_back))
-            verdict = _verdict(change, different=differs, restated=restated)
-            statement = Statement(before, after, verdict)
+            put_back = bare[k]._replace(values=bare[k].values + stated[k] - stated[k - 1])
+            restated = not different(compare(onto, history, put_back, scatter))
+            verdict: Verdict = "differs" if differs else "agrees"
+            if restated:
+                verdict = "statement only" if differs else "either"
+            verdict = "untested" if change is None else verdict
+            statement = Statement(campaigns[k - 1].payload, campaigns[k].payload, verdict)
         found = differs and (statement is None or statement.verdict == "differs")
         changes.append(change)
         changed.append(found and like)
         other.append(found and not like)
         statements.append(statement)
         first = k if differs else first
-    if len(changes) > 1 and not any(changes):
+    if not any(changes):
         return _untested(campaigns, "the campaigns are too short to be compared jointly")
     beside = [compare(onto, laden[0], one, scatter) for one in laden[1:]]
+    masses = [(math.nan, math.nan) if one is None else (one.mass, one.mass_std) for one in beside]
+    mass, mass_std = np.array([(0.0, 0.0), *masses]).T
     return PayloadTrend(
-        changes=tuple(changes),
-        changed=tuple(changed),
-        other=tuple(other),
-        statements=tuple(statements),
-        mass=np.array([0.0, *(np.nan if one is None else one.mass for one in beside)]),
-        mass_std=np.array([0.0, *(np.nan if one is None else one.mass_std for one in beside)]),
+        tuple(changes), tuple(changed), tuple(other), tuple(statements), mass, mass_std
     )
-
-
-def _verdict(change: Change | None, *, different: bool, restated: bool) -> Verdict:
-    if change is None:
-        return "untested"
-    if not different:
-        return "either" if restated else "agrees"
-    return "statement only" if restated else "differs"
 
 
 def _stated(model: RobotModel, payload: Payload | None) -> Array:
@@ -377,14 +378,11 @@ def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projec
 
 
 def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:
-    count = len(campaigns)
+    count, stated = len(campaigns), [one.payload for one in campaigns]
     no, unknown = (False,) * count, np.full(count, np.nan)
-    stated = [one.payload for one in campaigns]
-    statements = [
-        None if k == 0 or stated[k] == stated[k - 1] else Statement(stated[k - 1], now, "untested")
-        for k, now in enumerate(stated)
-    ]
-    return PayloadTrend((None,) * count, no, no, tuple(statements), unknown, unknown, why)
+    pairs = (Statement(*pair, "untested") for pair in pairwise(stated))
+    statements = (None, *(None if one.before == one.after else one for one in pairs))
+    return PayloadTrend((None,) * count, no, no, statements, unknown, unknown, why)
 
 
 def freedom_of(level: LevelEstimate) -> float:
@@ -395,8 +393,54 @@ def freedom_of(level: LevelEstimate) -> float:
     return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
 
 
-def _usual(name: str) -> float:
-    """Size of a standard parameter of what people put on arms, in its unit."""
-    if name.startswith("mc"):
-        return _MOMENT
-    return _INERTIA if name.startswith("I") else _MASS
+def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Finding]:
+    """What was found of what an arm carries, campaign by campaign."""
+    found = []
+    for k, (change, statement) in enumerate(zip(payload.changes, payload.statements, strict=True)):
+        level: Level = "alarm" if k == len(payload.changes) - 1 else "past"
+        if statement is not None:
+            after, before = _load(statement.after), _load(statement.before)
+            words = (
+                f"From {names[k]} on the cell states {after} instead of {before};"
+                f" {_VERDICTS[statement.verdict]}."
+            )
+            step = "Weigh the payload and measure its centre, then correct the cell file."
+            wrong = statement.verdict == "differs"
+            found.append(Finding(level, words, step) if wrong else Finding("quiet", words))
+        where = f"between {names[k - 1]} and {names[k]}"
+        if change is not None and payload.changed[k]:
+            beside = "" if statement is None else ", beside what is stated,"
+            words = f"The payload{beside} has changed {where}: {_what(change)}."
+            step = "State the payload in the cell file, or check the tool and its fastening."
+            found.append(Finding(level, words, step))
+        elif change is not None and payload.other[k]:
+            words = (
+                f"Inertial parameters have changed {where}, but not as by something put on the"
+                f" last link: that explains {100.0 * change.share:.0f} % of the change."
+            )
+            step = "Check the torque constants and the calibration, and what links before it carry."
+            found.append(Finding(level, words, step))
+    return found
+
+
+def _load(payload: Payload | None) -> str:
+    mass = 0.0 if payload is None else payload.mass
+    return f"a payload of {mass:g} kg" if mass else "nothing"
+
+
+def _what(change: Change) -> str:
+    """Mass if it can be seen, and how far from the last joint it sits if that is known."""
+    if not math.isfinite(change.mass):
+        moment = float(np.linalg.norm(np.nan_to_num(change.moment)))
+        return f"first moment by {moment:.2g} kg·m, while its mass cannot be seen by this arm"
+    if abs(change.mass) < _CERTAIN * change.mass_std:
+        return (
+            f"its mass not significantly ({change.mass:+.2g} ± {change.mass_std:.1g} kg),"
+            " but its centre or inertia"
+        )
+    verb = "put on" if change.mass > 0 else "removed"
+    text = f"{abs(change.mass):.2f} ± {change.mass_std:.2g} kg {verb}"
+    if np.isfinite(change.moment).all():
+        centre = ", ".join(f"{1e3 * c / change.mass:.0f}" for c in change.moment)
+        text += f", centred at ({centre}) mm of the last joint"
+    return text

@@ -20,7 +20,8 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from itertools import groupby
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,10 @@ from scipy.stats import t as student
 
 from hil.batch.types import BatchResult, Broken, LevelEstimate
 from hil.reading import instant
+from hil.terminal_text import plural
 from identification import RobotModel
 
-from .payload import PayloadTrend, payload_trend
+from .payload import Finding, Level, PayloadTrend, payload_findings, payload_trend
 
 Array = NDArray[np.float64]
 
@@ -48,27 +50,27 @@ LEAST_ERROR: Final = 0.10
 
 _RULES: Final = 3
 _DAY: Final = 86400.0
+_MONTH, _YEAR = 365.25 / 12.0, 365.25  # days
 _QN_NORMAL: Final = 2.2219
 _CONFIDENCE: Final = 0.95  # of the interval of a drift
 # Speed [rad/s, m/s] where the data cannot say how fast an axis went: it has no viscous friction.
 _ANY_SPEED: Final = 0.5
+_SHIFTS: Final = 2  # of a figure that are described one by one
+_NAMED: Final = 5
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(NamedTuple):
     """Where a value would be, judged by those before it.
 
     Attributes:
         centre: median of the earlier values.
         low: lower limit, -inf or 0 where only a rise counts.
         high: upper limit.
-        history: number of earlier values used.
     """
 
     centre: float
     low: float
     high: float
-    history: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +100,11 @@ class Watched:
         return np.asarray(np.array(self.levels) == (known[-1] if known else 0))
 
 
-@dataclass(frozen=True)
-class Drift:
-    """A slope in time.
+class Drift(NamedTuple):
+    """A slope per unit of time.
 
     Attributes:
-        slope: per unit of time.
-        low: lower end of its 95 % interval.
-        high: upper end.
+        slope: with the ends `low` and `high` of its 95 % interval.
         p_value: of no drift, two-sided.
         span: time from the first value to the last.
     """
@@ -143,27 +142,17 @@ class AxisTrend:
     drifts: bool
 
     @property
+    def size(self) -> float:
+        """Median friction; infinite where none is known."""
+        known = self.friction.values[np.isfinite(self.friction.values)]
+        return (abs(float(np.median(known))) if known.size else 0.0) or math.inf
+
+    @property
     def relative_drift(self) -> float | None:
         """Drift over its whole time, as a share of the median friction; None if not known."""
-        known = self.friction.values[np.isfinite(self.friction.values)]
-        size = abs(float(np.median(known))) if known.size else 0.0
-        return self.drift.slope * self.drift.span / size if self.drift and size else None
-
-
-@dataclass(frozen=True, eq=False)
-class ParameterTrend:
-    """A parameter over c campaigns.
-
-    Attributes:
-        values: (c,).
-        half: half of the 95 % interval (c,); infinite where the data do not determine it.
-    """
-
-    name: str
-    unit: str
-    is_friction: bool
-    values: Array
-    half: Array
+        if self.drift is None or math.isinf(self.size):
+            return None
+        return self.drift.slope * self.drift.span / self.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +161,7 @@ class ArmTrend:
 
     Attributes:
         name: of the arm.
-        campaigns: folders, in order of time.
-        when: of each, ISO 8601, "" where unknown.
+        campaigns: in order of time.
         time: (c,) [days since the first]; number of the campaign where no time is known.
         dated: whether times are known. If not, campaigns are in the order of their names.
         labels: see `campaign_names`.
@@ -183,12 +171,10 @@ class ArmTrend:
     """
 
     name: str
-    campaigns: tuple[str, ...]
-    when: tuple[str, ...]
+    campaigns: tuple[LevelEstimate, ...]
     time: Array
     dated: bool
     axes: tuple[AxisTrend, ...]
-    parameters: tuple[ParameterTrend, ...]
     payload: PayloadTrend
     labels: tuple[str, ...]
     names: tuple[str, ...]
@@ -238,21 +224,10 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
     within = {id(one) for one in ordered}
     return ArmTrend(
         name=name,
-        campaigns=tuple(one.campaign for one in ordered),
-        when=tuple(one.when for one in ordered),
+        campaigns=tuple(ordered),
         time=time,
         dated=bool(known),
         axes=_axes(model, ordered, time),
-        parameters=tuple(
-            ParameterTrend(
-                name=model.parameter_names[k],
-                unit=model.units[k],
-                is_friction=k >= model.base.rank,
-                values=np.array([one.values[k] for one in ordered]),
-                half=np.array([one.interval_factor * one.std[k] for one in ordered]),
-            )
-            for k in range(model.n_parameters)
-        ),
         payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
         labels=tuple(campaign_names(ordered)),
         names=tuple(campaign_names(ordered, days=bool(known))),
@@ -284,13 +259,13 @@ def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) ->
 def short_names(folders: Sequence[str]) -> list[str]:
     """The end of each folder's path that no other one of them ends with: mostly its last part."""
     paths = [folder.rstrip("/") for folder in folders]
-    return [_short(path, [f"/{other}" for other in paths if other != path]) for path in paths]
 
+    def short(path: str) -> str:
+        others, parts = [f"/{other}" for other in paths if other != path], path.split("/")
+        ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
+        return next((e for e in ends if not any(o.endswith(f"/{e}") for o in others)), path)
 
-def _short(path: str, others: Sequence[str]) -> str:
-    parts = path.split("/")
-    ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
-    return next((end for end in ends if not any(o.endswith(f"/{end}") for o in others)), path)
+    return [short(path) for path in paths]
 
 
 # Friction and torque error of the axes
@@ -315,28 +290,19 @@ def friction_weights(model: RobotModel, speed: Array) -> Array:
     return weights
 
 
-def friction_of(values: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
-    """Friction of each axis and its standard deviation, each (n,) [N·m, N].
+def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
+    """Friction of each axis by one estimate and its standard deviation, each (n,) [N·m, N].
 
     NaN for an axis without friction, or with a coefficient that the data do not determine.
-
-    Args:
-        values: parameters (p,).
-        covariance: (p, p), infinite variances of what is undetermined.
-        weights: (n, p), see :func:`friction_weights`.
+    `weights` (n, p) are those of :func:`friction_weights`.
     """
+    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
     known = np.isfinite(np.diag(covariance))
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
     variance = np.einsum("ji,ik,jk->j", weights, finite, weights)
     whole = weights.any(axis=1) & ~weights[:, ~known].any(axis=1)
-    value = np.where(whole, weights @ values, np.nan)
+    value = np.where(whole, weights @ level.values, np.nan)
     return value, np.where(whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-
-
-def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
-    """Friction of each axis by one estimate, see :func:`friction_of`."""
-    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
-    return friction_of(level.values, covariance, weights)
 
 
 def typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
@@ -390,8 +356,7 @@ def _error(values: Array, share: float) -> Watched:
     least = float(np.log1p(LEAST_ERROR))
     judged = chart(logarithm, np.zeros(len(values)), share, least=least, rise_only=True)
     limits = tuple(
-        band and replace(band, centre=math.exp(band.centre), low=0.0, high=math.exp(band.high))
-        for band in judged.limits
+        band and Limits(math.exp(band.centre), 0.0, math.exp(band.high)) for band in judged.limits
     )
     return replace(judged, values=values, limits=limits)
 
@@ -400,12 +365,7 @@ def _error(values: Array, share: float) -> Watched:
 
 
 def chart(
-    values: Array,
-    stds: Array,
-    share: float,
-    *,
-    least: float = 0.0,
-    rise_only: bool = False,
+    values: Array, stds: Array, share: float, *, least: float = 0.0, rise_only: bool = False
 ) -> Watched:
     """Judge each value by those before it that did not depart themselves.
 
@@ -422,17 +382,14 @@ def chart(
     departs, levels = [False] * len(values), [-1] * len(values)
     for k, value in enumerate(values):
         expected = known.limits(now, float(stds[k]))
-        if not math.isfinite(value):
-            found.append(expected)
-            continue
-        home = known.home(k, now, least, rise_only=rise_only)
+        home = known.home(k, now, least, rise_only=rise_only) if math.isfinite(value) else None
         if home is not None:
             now, levels[k], away = home, home, []
-            found.append(known.limits(home, float(stds[k])))
+            expected = known.limits(home, float(stds[k]))
             known.members[home].append(k)
-            continue
-        assert expected is not None
         found.append(expected)
+        if home is not None or expected is None or not math.isfinite(value):
+            continue
         departs[k] = True
         if away and (value > expected.centre) != (values[away[-1]] > expected.centre):
             away = []
@@ -444,12 +401,11 @@ def chart(
                 levels[one] = now
             away = []
     if rise_only:
-        found = [band and replace(band, low=-math.inf) for band in found]
+        found = [band and band._replace(low=-math.inf) for band in found]
     return Watched(values, stds, tuple(found), tuple(departs), tuple(levels))
 
 
-@dataclass(frozen=True, eq=False)
-class Levels:
+class Levels(NamedTuple):
     """Levels of a history, which scatter alike.
 
     Attributes:
@@ -484,7 +440,7 @@ class Levels:
         one = scale**2 + max(0.0, std**2 - typical**2)
         spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
         reach = float(student.isf(self.share / 2.0, 0.6 * spare - 0.5)) * spread
-        return Limits(centre, centre - reach, centre + reach, len(own))
+        return Limits(centre, centre - reach, centre + reach)
 
     def home(self, k: int, now: int, least: float, *, rise_only: bool) -> int | None:
         """The level that a value belongs to: the present one rather than those before it."""
@@ -522,3 +478,174 @@ def drift(time: Array, values: Array) -> Drift | None:
     slope, _, low, high = theilslopes(own, at, _CONFIDENCE)
     p_value = float(kendalltau(at, own).pvalue)
     return Drift(float(slope), float(low), float(high), p_value, float(np.ptp(at)))
+
+
+# What it means, in sentences
+
+
+def findings(arm: ArmTrend) -> tuple[Finding, ...]:
+    """What was found of an arm, what concerns its last campaign first; never empty."""
+    found = payload_findings(arm.payload, arm.names)
+    for axis in arm.axes:
+        found += _shift_findings(arm, axis, axis.friction, "friction")
+        found += _shift_findings(arm, axis, axis.error, "torque error")
+        found += _drift_findings(arm, axis)
+    if all(one.level == "quiet" for one in found):
+        found.insert(0, _nothing(arm))
+    order: list[Level] = ["alarm", "past", "quiet"]
+    return (*sorted(found, key=lambda one: order.index(one.level)), *_order_findings(arm))
+
+
+def summary(arm: ArmTrend) -> str:
+    """One line: what the last campaign shows of the arm."""
+    levels, count = [one.level for one in findings(arm)], len(arm.campaigns)
+    alarms, past = levels.count("alarm"), levels.count("past")
+    if alarms:
+        return f"{plural(alarms, 'thing')} to look into"
+    if count < 2:
+        return "one campaign, nothing to compare it with"
+    if past:
+        return f"no new change; {past} earlier {'one' if past == 1 else 'ones'}"
+    return (
+        "as before"
+        if count > FEWEST
+        else "no change found, but too few campaigns to judge the axes"
+    )
+
+
+class Shift(NamedTuple):
+    """Campaigns in a row that are elsewhere than those before them.
+
+    Attributes:
+        returns: whether at a level that was left before.
+        first: number of the first of these campaigns.
+        last: of the last.
+        before: median of those before.
+        value: median of these.
+        is_level: whether they made a level by which later ones are judged.
+        lasts: whether no later campaign is elsewhere.
+    """
+
+    returns: bool
+    first: int
+    last: int
+    before: float
+    value: float
+    is_level: bool
+    lasts: bool
+
+
+def shifts(watched: Watched) -> list[Shift]:
+    """All shifts of a figure, in order of time."""
+
+    def place(k: int) -> tuple[int, bool]:
+        """The level of a campaign, and if it has none its side of the history."""
+        level, band = watched.levels[k], watched.limits[k]
+        return level, level < 0 and band is not None and bool(watched.values[k] > band.centre)
+
+    known = [k for k, value in enumerate(watched.values) if np.isfinite(value)]
+    runs = [(level, list(own)) for (level, _), own in groupby(known, place)]
+    found = []
+    for number, (level, own) in enumerate(runs[1:], start=1):
+        fresh = level < 0 or level not in {earlier for earlier, _ in runs[:number]}
+        band, value = watched.limits[own[0]], float(np.median(watched.values[own]))
+        left = float(np.median(watched.values[runs[number - 1][1]]))
+        before = band.centre if fresh and band is not None else left
+        lasts = number == len(runs) - 1
+        found.append(Shift(not fresh, own[0], own[-1], before, value, level >= 0, lasts))
+    return found
+
+
+_STEPS: Final = {
+    ("friction", "above"): "Check this axis' gear, brake and lubrication; was it colder than"
+    " before?",
+    ("friction", "below"): "Was it warmer than before, or has gear or lubricant been changed?",
+    ("friction", "returned"): "Repaired, greased, or equally warm again?",
+    ("torque error", "above"): "Look at the residual of this axis in hil identify on that campaign:"
+    " backlash, a rubbing hose or another motion make it.",
+}
+
+
+def _shift_findings(arm: ArmTrend, axis: AxisTrend, watched: Watched, what: str) -> list[Finding]:
+    """The last shifts of a figure, and how many there were before."""
+    every = shifts(watched)
+    at = ""
+    if what == "friction" and math.isfinite(axis.speed):
+        at = f" at {axis.speed:.2g} {axis.speed_unit}"
+    found = []
+    for shift in every[-_SHIFTS:]:
+        first, last = arm.names[shift.first], arm.names[shift.last]
+        when = f"since {first}" if shift.lasts else f"from {first} to {last}"
+        when = f"in {first}" if shift.first == shift.last else when
+        rise = shift.value > shift.before
+        change = abs(shift.value - shift.before) / (abs(shift.before) or math.inf)
+        side = "returned" if shift.returns else "above" if rise else "below"
+        how = "has returned to an earlier level" if shift.returns else "departs from its history"
+        words = (
+            f"{axis.joint} {how}: {what}{at} is {100.0 * change:.0f} %"
+            f" {'above' if rise else 'below'} what it was, {shift.value:.3g} against"
+            f" {shift.before:.3g} {axis.unit}, {when}."
+        )
+        # What has risen stays a thing to look into until it returns, however long ago it was.
+        alarming = not shift.returns and (rise or not shift.is_level)
+        level: Level = "alarm" if shift.lasts and alarming else "past"
+        found.append(Finding(level, words, _STEPS.get((what, side), "")))
+    if len(every) > _SHIFTS:
+        earlier = plural(len(every) - _SHIFTS, "earlier change")
+        words = f"{axis.joint} had {earlier} of its {what}: see the figures."
+        found.append(Finding("past", words))
+    return found
+
+
+def _drift_findings(arm: ArmTrend, axis: AxisTrend) -> list[Finding]:
+    slope, total = axis.drift, axis.relative_drift
+    if slope is None or total is None or not axis.drifts:
+        return []
+    unit, scale = _per(arm, slope.span)
+    per, low, high = (100.0 * one * scale / axis.size for one in slope[:3])
+    first = int(np.flatnonzero(axis.friction.at_last_level)[0])
+    words = (
+        f"Friction of {axis.joint} {'rises' if per > 0 else 'falls'} steadily: {per:+.2g} % {unit}"
+        f" (95 %: {low:+.2g} to {high:+.2g}), {100.0 * total:+.0f} % since {arm.names[first]}."
+    )
+    return [Finding("alarm", words, "Wear, lubricant that ages, or campaigns run ever warmer.")]
+
+
+def _per(arm: ArmTrend, span: float) -> tuple[str, float]:
+    """A unit of time in which the slope is a number that people can judge."""
+    if not arm.dated:
+        return "per campaign", 1.0
+    if span < 14.0:
+        return "per day", 1.0
+    return ("per month", _MONTH) if span < 2.0 * _YEAR else ("per year", _YEAR)
+
+
+def _nothing(arm: ArmTrend) -> Finding:
+    count, untested = len(arm.campaigns), arm.payload.untested
+    if count < 2:
+        return Finding("quiet", "There is one campaign, and nothing to compare it with.")
+    carried = f"Its payload was not tested: {untested}." if untested else "Its payload is the same."
+    axes = "Friction and torque error of every axis are within the limits of those before"
+    if count <= FEWEST:
+        axes = f"Its axes are judged from the campaign on that has {FEWEST} before it"
+    return Finding("quiet", f"No change was found in {count} campaigns. {carried} {axes}.")
+
+
+def _order_findings(arm: ArmTrend) -> list[Finding]:
+    """What a reader must know of the order of campaigns."""
+    if arm.undated:
+        names = [one.rstrip("/").rsplit("/", 1)[-1] for one in arm.undated]
+        names[_NAMED:] = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+        words = (
+            f"{plural(len(arm.undated), 'further campaign')} ({', '.join(names)}) without a time of"
+            " recording: left out here, since nobody knows where they belong."
+        )
+        return [Finding("quiet", words)]
+    if arm.dated or len(arm.campaigns) < 2:
+        return []
+    words = (
+        "No campaign has a time of recording: they are used in the order of their folders'"
+        f" names, from {arm.names[0]} to {arm.names[-1]}."
+        " If that is not the order of time, before and after mean nothing here."
+    )
+    return [Finding("quiet", words)]

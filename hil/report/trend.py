@@ -8,12 +8,10 @@ from typing import Any, Final
 
 import matplotlib.dates as mdates
 import numpy as np
-from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from hil.compare.findings import findings, summary
 from hil.compare.payload import LEAST_EFFECT, Verdict
 from hil.compare.trend import (
     FALSE_ALARMS,
@@ -22,9 +20,10 @@ from hil.compare.trend import (
     LEAST_FRICTION,
     ArmTrend,
     AxisTrend,
-    ParameterTrend,
     Trends,
     Watched,
+    findings,
+    summary,
 )
 from hil.files import write_atomically
 from hil.reading import instant
@@ -94,19 +93,25 @@ def _part(arm: ArmTrend, key: str) -> dict[str, Any]:
         "line": summary(arm),
         "findings": found,
         "span": _span(arm),
-        "friction": friction_trend_panels(arm, key),
-        "error": error_trend_panels(arm, key),
+        "friction": [
+            _axis_panel(arm, axis, axis.friction, f"{key}f{j}", "friction", SECOND)
+            for j, axis in enumerate(arm.axes)
+            if np.isfinite(axis.friction.values).any()
+        ],
+        "error": [
+            _axis_panel(arm, axis, axis.error, f"{key}e{j}", "torque error", FIRST)
+            for j, axis in enumerate(arm.axes)
+            if np.isfinite(axis.error.values).any()
+        ],
         "payload": payload_panels(arm, key),
-        "inertial": parameter_trend_panels(arm, [p for p in arm.parameters if not p.is_friction]),
-        "coefficients": parameter_trend_panels(arm, [p for p in arm.parameters if p.is_friction]),
-        "parameters": [_parameter(one) for one in arm.parameters],
+        "parameters": _parameters(arm),
     }
 
 
 def _span(arm: ArmTrend) -> str:
     if not arm.dated:
         return "in the order of their names, since no time of recording is known"
-    first, last = arm.when[0][:10], arm.when[-1][:10]
+    first, last = (arm.campaigns[k].when[:10] for k in (0, -1))
     return first if first == last else f"{first} to {last}"
 
 
@@ -131,95 +136,29 @@ def expected(watched: Watched) -> str:
     return f"{numbers.significant(band.low)} to {numbers.significant(band.high)}"
 
 
-def _parameter(one: ParameterTrend) -> tuple[str, str, Sequence[str]]:
-    """Name, unit, and first, last, half interval, lowest and highest value."""
-    known = np.isfinite(one.half)
-    values = one.values[known]
-    if not len(values):
-        return one.name, one.unit, [numbers.MISSING] * 5
-    half = float(one.half[known][-1])
-    first, last, lowest, highest = (
-        numbers.beside(float(value), half / _INTERVAL)
-        for value in (values[0], values[-1], values.min(), values.max())
-    )
-    return one.name, one.unit, [first, last, numbers.significant(half, 2), lowest, highest]
+def _parameters(arm: ArmTrend) -> list[tuple[str, str, Sequence[str]]]:
+    """Name, unit, and first, last, half interval, lowest and highest value of each parameter."""
+    first = arm.campaigns[0]
+    values = np.array([one.values for one in arm.campaigns]).T
+    half = np.array([one.interval_factor * one.std for one in arm.campaigns]).T
+    rows: list[tuple[str, str, Sequence[str]]] = []
+    for name, unit, own, width in zip(first.names, first.units, values, half, strict=True):
+        known, texts = np.isfinite(width), [numbers.MISSING] * 5
+        if known.any():
+            some, last = own[known], float(width[known][-1])
+            ends = (some[0], some[-1], some.min(), some.max())
+            shown = [numbers.beside(float(value), last / _INTERVAL) for value in ends]
+            texts = [*shown[:2], numbers.significant(last, 2), *shown[2:]]
+        rows.append((name, unit, texts))
+    return rows
 
 
 Array = NDArray[np.float64]
-
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 200.0, 84.0, 8.0, 8.0, 8.0, 18.0
-_TEXT: Final = 10.5
-
-
-def sparkline(
-    at: Array, values: Array, half: Array, *, colour: str, ends: Sequence[str], alt: str
-) -> Markup:
-    """Points with bars as inline SVG, their median, and both ends in words.
-
-    Args:
-        at: horizontal place (c,), rising.
-        values: (c,), NaN where there is none; one at least is finite.
-        half: half length of the bars (c,).
-        colour: variable of the style sheet.
-        ends: what stands below the first and the last place.
-        alt: what it shows.
-    """
-    known = np.isfinite(values)
-    low, high = float((values - half)[known].min()), float((values + half)[known].max())
-    if not high > low:
-        low, high = low - 0.5, high + 0.5
-    span = float(at[-1] - at[0]) or 1.0
-    inner, tall = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
-    x = _LEFT + inner * ((at - at[0]) / span if at[-1] > at[0] else np.full(len(at), 0.5))
-    y, top, bottom = (
-        _TOP + tall * (high - line) / (high - low)
-        for line in (values, values + half, values - half)
-    )
-    bars = "".join(f"M{x[k]:.1f} {top[k]:.1f}V{bottom[k]:.1f}" for k in np.flatnonzero(known))
-    dots = "".join(
-        f'<circle cx="{x[k]:.1f}" cy="{y[k]:.1f}" r="2.4"/>' for k in np.flatnonzero(known)
-    )
-    middle = float(np.median(values[known]))
-    level = _TOP + tall * (high - middle) / (high - low)
-    words = "".join(
-        f'<text x="{place:g}" y="{_HEIGHT - 4:g}" text-anchor="{anchor}" font-size="{_TEXT}"'
-        f' style="fill:var(--muted)">{escape(text)}</text>'
-        for place, anchor, text in ((_LEFT, "start", ends[0]), (_WIDTH - _RIGHT, "end", ends[-1]))
-    )
-    reach = f"{numbers.significant(low)} and {numbers.significant(high)}"
-    described = f"{alt} Intervals lie within {reach}."
-    median = f"M{_LEFT:g} {level:.1f}H{_WIDTH - _RIGHT:g}"
-    return Markup(
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" role="img"'
-        f' aria-label="{escape(described)}">'
-        f'<path d="{median}" style="stroke:var(--line);fill:none"/>'
-        f'<path d="{bars}" style="stroke:var({colour});stroke-width:1.1;fill:none"/>'
-        f'<g style="fill:var({colour})">{dots}</g>{words}</svg>'
-    )
-
 
 _TICKS = 4
 _DAY = 86400.0
 # Half a 95 % interval, in standard deviations.
 _INTERVAL: Final = 1.96
-
-
-def friction_trend_panels(arm: ArmTrend, key: str) -> list[Panel]:
-    """Friction of each axis with intervals, and where the campaigns before let expect it."""
-    return [
-        _axis_panel(arm, axis, axis.friction, f"{key}f{j}", "friction", SECOND)
-        for j, axis in enumerate(arm.axes)
-        if np.isfinite(axis.friction.values).any()
-    ]
-
-
-def error_trend_panels(arm: ArmTrend, key: str) -> list[Panel]:
-    """Torque error of each axis, and the highest that the campaigns before let expect."""
-    return [
-        _axis_panel(arm, axis, axis.error, f"{key}e{j}", "torque error", FIRST)
-        for j, axis in enumerate(arm.axes)
-        if np.isfinite(axis.error.values).any()
-    ]
 
 
 def payload_panels(arm: ArmTrend, key: str) -> list[Panel]:
@@ -240,32 +179,6 @@ def payload_panels(arm: ArmTrend, key: str) -> list[Panel]:
             f"{numbers.significant(float(payload.mass[-1]), 2)} kg in the last; {note}."
         )
         return [to_panel(figure, key=f"{key}p", title="Mass put on", note=note, alt=alt)]
-
-
-def parameter_trend_panels(arm: ArmTrend, parameters: Sequence[ParameterTrend]) -> list[Panel]:
-    """Each parameter with its 95 % intervals."""
-    panels = []
-    ends = [arm.when[k][:10] if arm.dated else f"{arm.time[k]:g}" for k in (0, -1)]
-    for parameter in parameters:
-        known = np.isfinite(parameter.half)
-        if not known.any():
-            continue
-        values = np.where(known, parameter.values, np.nan)
-        last = int(np.flatnonzero(known)[-1])
-        std = float(parameter.half[last]) / _INTERVAL
-        note = f"{numbers.beside(float(values[last]), std)} ± {numbers.significant(std, 2)}"
-        alt = f"{parameter.name} over {len(values)} campaigns; last {note} {parameter.unit}."
-        svg = sparkline(
-            arm.time,
-            values,
-            np.where(known, parameter.half, 0.0),
-            colour="--second" if parameter.is_friction else "--first",
-            ends=ends,
-            alt=alt,
-        )
-        title = f"{label(parameter.name)} [{parameter.unit.replace(' ', '·')}]"
-        panels.append(Panel(title=title, note=note, svg=svg, width=200.0))
-    return panels
 
 
 def _axis_panel(
@@ -388,7 +301,7 @@ def _framed(axes: Axes, arm: ArmTrend, unit: str) -> None:
 
 def _when(arm: ArmTrend) -> list[float]:
     """Where campaigns stand: days of matplotlib, or their numbers."""
-    first = instant(arm.when[0]) if arm.dated else None
+    first = instant(arm.campaigns[0].when) if arm.dated else None
     if first is None:
         return [float(t) for t in arm.time]
     start = first.timestamp() / _DAY

@@ -19,7 +19,7 @@ from hil.batch.cache import arm_digest
 from hil.batch.workers import LocalWorkers
 from hil.campaign import CampaignFolderError
 from hil.cell import Cell
-from hil.compare.gather import apart
+from hil.compare.comparison import apart
 from hil.compare.trend import short_names
 from hil.design import preset
 from hil.errors import InputError
