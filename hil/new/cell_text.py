@@ -26,7 +26,7 @@ from hil.cell.text import urdf_limits, with_values
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.motion_checks import collision_checker
-from hil.reading import remedy_of, text_of
+from hil.reading import named_text, text_of
 from identification.errors import ModelError
 from identification.excitation.constraints import clearance
 from identification.model.kinematics import Chain, chain_from_urdf
@@ -34,6 +34,8 @@ from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
 
 from .known import ASSUMED, Known, assumed_for_design, from_urdf
+
+Array = NDArray[np.float64]
 
 
 @contextmanager
@@ -59,21 +61,11 @@ _OF_MOVING_JOINTS: Final = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Mimic:
-    """What a joint follows.
+def mimics(urdf: str) -> dict[str, tuple[str, float]]:
+    """Joints that follow another one, by name: which, and their offset [rad or m] from it.
 
-    Attributes:
-        joint: the one that leads it.
-        offset: its own position [rad or m] where that stands at zero.
+    An offset that is no number counts as 0.
     """
-
-    joint: str
-    offset: float
-
-
-def mimics(urdf: str) -> dict[str, Mimic]:
-    """Joints that follow another one, by name; an offset that is no number counts as 0."""
     found = {}
     for joint in urdf_tree(urdf).findall("joint"):
         mimic = joint.find("mimic")
@@ -82,7 +74,7 @@ def mimics(urdf: str) -> dict[str, Mimic]:
                 offset = float(mimic.get("offset", "0"))
             except ValueError:
                 offset = 0.0
-            found[joint.get("name", "")] = Mimic(mimic.get("joint", "?"), offset)
+            found[joint.get("name", "")] = mimic.get("joint", "?"), offset
     return found
 
 
@@ -121,11 +113,11 @@ def _fix(joint: ET.Element, position: float) -> None:
             joint.remove(element)
 
 
-def _three(text: str | None, default: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _three(text: str | None, default: str) -> Array:
     return np.array([float(part) for part in (text or default).split()])
 
 
-def _text(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> str:
+def _text(values: Array) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
@@ -168,7 +160,94 @@ class NewCell:
 
     def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
         """The cell file as it would stand at `path`, and the fields that are unknown in it."""
-        return _Writing(self, path.resolve()).written()
+        path = path.resolve()
+        values, origin = self.known.values, self.known.origin
+        written: set[str] = set()
+        unknown: list[str] = []
+
+        def line(name: str, default: Any = None) -> str:
+            """One field: what is known, else the default, else `"?"`."""
+            written.add(name)
+            key = name.partition(".")[2]
+            value = values.get(name, default)
+            if value is None:
+                value = UNKNOWN if name in _ONE_FOR_ALL else [UNKNOWN] * len(self.joint_names)
+            if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
+                unknown.append(name)
+                where = textwrap.fill(
+                    WHERE.get(name, ""), 96, initial_indent="# -> ", subsequent_indent="#    "
+                )
+                key = f"{where}\n{key}" if where else key
+            comment = f"  # {origin[name]}" if name in origin else ""
+            return f"{key} = {toml_value(value)}{comment}"
+
+        def rest(table: str) -> str:
+            """Fields of a table that were said somewhere and have no line of their own."""
+            return "".join(
+                f"{toml_key(name.partition('.')[2])} = {toml_value(value)}\n"
+                for name, value in values.items()
+                if name.startswith(f"{table}.") and name not in written
+            )
+
+        own = {"cell", "robot", "limits", "campaign", "workspace", "nominal", "drive_train"}
+        tables = {name.partition(".")[0] for name in values}
+        urdf = self.urdf_beside(path) if self.urdf is not None else self.urdf_path.resolve()
+        origins = ", ".join(dict.fromkeys(origin.values()))
+        environment = Environment(
+            loader=PackageLoader("hil.new", "."),
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            autoescape=False,  # a TOML file
+            keep_trailing_newline=True,
+        )
+        text = environment.get_template("cell.toml.j2").render(
+            name=self.name,
+            sources=f"Its figures are {origins}." if origins else "",
+            joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
+            urdf=os.path.relpath(urdf, path.parent),
+            mesh_folders=self._mesh_folders(path.parent),
+            assumed=self._assumed(),
+            design_only=self.design_only,
+            suggested=self._suggested(),
+            wrist=UNKNOWN if len(self.joint_names) >= WRIST_AXES else 0.0,
+            others=sorted(tables - own - {"controller"}),
+            line=line,
+            rest=rest,
+        )
+        return text.rstrip("\n") + "\n", tuple(unknown)
+
+    def _assumed(self) -> list[str]:
+        """Fields that are written though nobody said what stands there."""
+        names = [name for name in _ASSUMED if name not in self.known.values]
+        if self.design_only:
+            names = [name for name in names if not name.startswith("controller.")]
+        found = [name for name, origin in self.known.origin.items() if origin == ASSUMED]
+        return [*names, *(name for name in found if not name.startswith("campaign."))]
+
+    def _mesh_folders(self, folder: Path) -> list[str] | None:
+        """Folders in which the paths of collision meshes begin; None where none is needed."""
+        if not self.collision:
+            return None
+        found: dict[str, None] = {}
+        for mesh in self.collision:
+            relative = mesh.removeprefix("package://")
+            above = self.urdf_path.resolve().parents
+            place = next((place for place in above if (place / relative).is_file()), None)
+            if place is None:
+                return [UNKNOWN]
+            found[os.path.relpath(place, folder)] = None
+        return list(found)
+
+    def _suggested(self) -> list[str] | None:
+        """Lines of acceleration and jerk to begin with, where every speed is known."""
+        speeds = self.known.values.get("limits.velocity_deg", [UNKNOWN])
+        if "limits.jerk_deg" in self.known.values or UNKNOWN in speeds:
+            return None
+        return [
+            f"{name} = {toml_value([round(speed / seconds, _ROUND) for speed in speeds])}"
+            for name, seconds in (("acceleration_deg", 0.3), ("jerk_deg", 0.03))
+        ]
 
     def with_known(self, known: Known) -> NewCell:
         """The same arm, with other things known of it."""
@@ -218,13 +297,7 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     Raises:
         InputError: it cannot be read, or is no URDF of an open chain.
     """
-    try:
-        text = text_of(path)
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        remedy = remedy_of(error, "name a URDF")
-        raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
-    return _cell_of(path, text, fixed)
+    return _cell_of(path, named_text(path, "name a URDF"), fixed)
 
 
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
@@ -242,20 +315,25 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
         for name, turns in zip(chain.joint_names, chain.revolute, strict=True)
         if not turns and name not in fixed
     ]
-    following = {name: led for name, led in mimics(text).items() if name in chain.joint_names}
-    at = {name: led.offset for name, led in following.items() if name not in sliding}
-    positions = {**_nearest_to_zero(text, sliding), **at, **fixed}
+    limits = urdf_limits(text, chain.joint_names)
+    nearest = np.clip(0.0, limits.lower, limits.upper)  # to zero
+    positions = {name: float(nearest[chain.joint_names.index(name)]) for name in sliding}
+    following = {
+        name: led
+        for name, led in mimics(text).items()
+        if name in chain.joint_names and name not in sliding
+    }
+    positions |= {name: offset for name, (_, offset) in following.items()} | {**fixed}
     notes = tuple(
         f"{name} slides, and is fixed at {positions[name]:g} m in the cell's copy of the URDF; "
         f"--fix {name}=… for another position"
         for name in sliding
     )
     notes += tuple(
-        f"{name} follows {led.joint} (<mimic>), which no model here does: it is fixed at "
+        f"{name} follows {leader} (<mimic>), which no model here does: it is fixed at "
         f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
         "position. If it is part of a linkage that carries the arm, this model is not of your arm"
-        for name, led in following.items()
-        if name not in sliding
+        for name, (leader, _) in following.items()
     )
     used = with_fixed(text, positions) if positions else text
     moving = _chain(path, used).joint_names
@@ -284,125 +362,10 @@ def _chain(path: Path, urdf: str) -> Chain:
         raise InputError(path, str(error), remedy="correct the URDF") from error
 
 
-def _nearest_to_zero(urdf: str, names: list[str]) -> dict[str, float]:
-    limits = urdf_limits(urdf, names) if names else None
-    return {
-        name: float(min(max(0.0, limits.lower[k]), limits.upper[k]))
-        for k, name in enumerate(names)
-        if limits is not None
-    }
-
-
 def _robot_name(urdf: str) -> str:
     found = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
     return found[1].strip()[:80] if found else ""
 
-
-class _Writing:
-    """Fills the template for one place of the file."""
-
-    def __init__(self, new: NewCell, path: Path) -> None:
-        self._new, self._folder, self._path = new, path.parent, path
-        self._values, self._origin = dict(new.known.values), new.known.origin
-        self._written: set[str] = set()
-        self._unknown: list[str] = []
-
-    def written(self) -> tuple[str, tuple[str, ...]]:
-        new = self._new
-        tables = {name.partition(".")[0] for name in self._values}
-        own = {"cell", "robot", "limits", "campaign", "workspace", "nominal", "drive_train"}
-        urdf = new.urdf_beside(self._path) if new.urdf is not None else new.urdf_path.resolve()
-        environment = Environment(
-            loader=PackageLoader("hil.new", "."),
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-            autoescape=False,  # a TOML file
-            keep_trailing_newline=True,
-        )
-        text = environment.get_template("cell.toml.j2").render(
-            name=new.name,
-            sources=self._sources(),
-            joints=", ".join(f"{k} {name}" for k, name in enumerate(new.joint_names, 1)),
-            urdf=os.path.relpath(urdf, self._folder),
-            mesh_folders=self._mesh_folders(),
-            assumed=self._assumed(),
-            design_only=new.design_only,
-            suggested=self._suggested(),
-            wrist=UNKNOWN if len(new.joint_names) >= WRIST_AXES else 0.0,
-            others=sorted(tables - own - {"controller"}),
-            line=self._line,
-            rest=self._rest,
-        )
-        return text.rstrip("\n") + "\n", tuple(self._unknown)
-
-    def _assumed(self) -> list[str]:
-        """Fields that are written though nobody said what stands there."""
-        names = [name for name in _ASSUMED if name not in self._values]
-        if self._new.design_only:
-            names = [name for name in names if not name.startswith("controller.")]
-        found = [name for name, origin in self._origin.items() if origin == ASSUMED]
-        return [*names, *(name for name in found if not name.startswith("campaign."))]
-
-    def _sources(self) -> str:
-        origins = list(dict.fromkeys(self._origin.values()))
-        return f"Its figures are {', '.join(origins)}." if origins else ""
-
-    def _line(self, name: str, default: Any = None) -> str:
-        """One field: what is known, else the default, else `"?"`."""
-        self._written.add(name)
-        key = name.partition(".")[2]
-        value = self._values.get(name, default)
-        if value is None:
-            alone = name in _ONE_FOR_ALL
-            value = UNKNOWN if alone else [UNKNOWN] * len(self._new.joint_names)
-        if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
-            self._unknown.append(name)
-            where = textwrap.fill(
-                WHERE.get(name, ""), 96, initial_indent="# -> ", subsequent_indent="#    "
-            )
-            key = f"{where}\n{key}" if where else key
-        origin = f"  # {self._origin[name]}" if name in self._origin else ""
-        return f"{key} = {toml_value(value)}{origin}"
-
-    def _rest(self, table: str) -> str:
-        """Fields of a table that were said somewhere and have no line of their own."""
-        names = [
-            name
-            for name in self._values
-            if name.startswith(f"{table}.") and name not in self._written
-        ]
-        lines = "\n".join(
-            f"{toml_key(name.partition('.')[2])} = {toml_value(self._values[name])}"
-            for name in names
-        )
-        return f"{lines}\n" if lines else ""
-
-    def _mesh_folders(self) -> list[str] | str | None:
-        """Folders in which the paths of collision meshes begin; None where none is needed."""
-        if not self._new.collision:
-            return None
-        places = [*self._new.urdf_path.resolve().parents]
-        folders: dict[str, None] = {}
-        for mesh in self._new.collision:
-            relative = mesh.removeprefix("package://")
-            found = next((place for place in places if (place / relative).is_file()), None)
-            if found is None:
-                return [UNKNOWN]
-            folders[os.path.relpath(found, self._folder)] = None
-        return list(folders)
-
-    def _suggested(self) -> list[str] | None:
-        """Lines of acceleration and jerk to begin with, where every speed is known."""
-        speeds = self._values.get("limits.velocity_deg", [UNKNOWN])
-        if "limits.jerk_deg" in self._values or UNKNOWN in speeds:
-            return None
-        acceleration = [round(speed / 0.3, _ROUND) for speed in speeds]
-        jerk = [round(speed / 0.03, _ROUND) for speed in speeds]
-        return [f"acceleration_deg = {toml_value(acceleration)}", f"jerk_deg = {toml_value(jerk)}"]
-
-
-Array = NDArray[np.float64]
 
 _TURNED: Final = 3
 """Joints away from their home at most."""
