@@ -11,8 +11,8 @@ import typer
 
 from hil.archive.check import ASPECTS, Check, check_archive
 from hil.archive.overview import Overview, overview
-from hil.archive.repair import Repair, repaired_name
 from hil.archive.repair import repair as repair_archive
+from hil.archive.repair import repaired_name
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import ArchiveError, InputError
@@ -88,7 +88,16 @@ def repair(
         _say_error(file, error, as_json=as_json)
         raise typer.Exit(FAILED) from error
     if as_json:
-        print_json(_repair_dict(done))
+        print_json(
+            {
+                "file": str(done.path),
+                "output": None if done.output is None else str(done.output),
+                "whole": done.whole,
+                "losses": list(done.losses),
+                "samples": done.samples,
+                "samples_lost": done.samples_lost,
+            }
+        )
         raise typer.Exit(LOST if done.losses else 0)
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
@@ -98,17 +107,6 @@ def repair(
         saved = _saved(done.samples, done.samples_lost)
         typer.echo(_shown([f"wrote {done.output}: {saved}"]))
     raise typer.Exit(LOST if done.losses else 0)
-
-
-def _repair_dict(done: Repair) -> dict[str, object]:
-    return {
-        "file": str(done.path),
-        "output": None if done.output is None else str(done.output),
-        "whole": done.whole,
-        "losses": list(done.losses),
-        "samples": done.samples,
-        "samples_lost": done.samples_lost,
-    }
 
 
 def _saved(samples: int, lost: int | None) -> str:

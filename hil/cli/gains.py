@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_module
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -26,7 +26,7 @@ def gains(
     centre: str = "0,0,0",
     inertia: str = "0,0,0,0,0,0",
     frame: str | None = None,
-    method: str = "weighted",
+    method: GainMethod = "weighted",
     delay: float | None = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -48,11 +48,6 @@ def gains(
         method: weighted or total (least squares with errors in the currents).
         delay: Time in s by which currents lag positions; the cell's if left out.
     """
-    methods: dict[str, GainMethod] = {"weighted": "weighted", "total": "total"}
-    if method not in methods:
-        raise InputError(
-            None, f"{method!r} is unknown", field="--method", remedy=f"use {', '.join(methods)}"
-        )
     if delay is not None and not abs(delay) <= LONGEST_DELAY:
         raise InputError(
             None, f"{delay} is no delay", field="--delay", remedy=f"give s, at most {LONGEST_DELAY}"
@@ -65,7 +60,7 @@ def gains(
         archives,
         dict.fromkeys(loaded or [], payload) if payload is not None else {},
         make_reporter(quiet=quiet or json),
-        method=methods[method],
+        method=method,
         delay=delay,
     )
     typer.echo(json_module.dumps(_as_json(found), indent=1) if json else _as_toml(found))
@@ -117,36 +112,39 @@ def _as_toml(found: GainsFound) -> str:
         f"# N·m/A ({side}), 95 % intervals, {gains.method} least squares",
         "torque_constant = [",
     ]
-    for motor, name in enumerate(gains.motor_names):
-        reason = gains.reasons[motor]
-        if reason is None:
-            half = gains.interval_factor * gains.std[motor]
-            lines.append(f"    {gains.values[motor]:.6g},  # {name} ± {half:.2g}")
-        else:
-            # Keeps its place in the list; a cell or map that it is pasted into refuses it by name.
-            lines.append(f"    nan,  # {name}: not determined; {reason}")
+    # What is not determined has its place in the list; a cell or map refuses it by name.
+    lines += [
+        f"    {one['torque_constant']:.6g},  # {one['name']} ± {one['half_interval']:.2g}"
+        if one["not_determined"] is None
+        else f"    nan,  # {one['name']}: not determined; {one['not_determined']}"
+        for one in _motors(found)
+    ]
     return "\n".join([*lines, "]"])
 
 
-def _as_json(found: GainsFound) -> dict[str, object]:
+def _motors(found: GainsFound) -> list[dict[str, Any]]:
+    """Name, constant, spread and half of the interval [N·m/A], or why there are none."""
     gains = found.gains
+    return [
+        {
+            "name": name,
+            "torque_constant": float(value) if determined else None,
+            "std": float(std) if determined else None,
+            "half_interval": float(gains.interval_factor * std) if determined else None,
+            "not_determined": reason,
+        }
+        for name, value, std, determined, reason in zip(
+            gains.motor_names, gains.values, gains.std, gains.determined, gains.reasons, strict=True
+        )
+    ]
+
+
+def _as_json(found: GainsFound) -> dict[str, object]:
+    loads = {name: None if load is None else load.mass for name, load in found.loads.items()}
     return {
-        "motors": [
-            {
-                "name": name,
-                "torque_constant": float(gains.values[m]) if gains.determined[m] else None,
-                "std": float(gains.std[m]) if gains.determined[m] else None,
-                "half_interval": (
-                    float(gains.interval_factor * gains.std[m]) if gains.determined[m] else None
-                ),
-                "not_determined": gains.reasons[m],
-            }
-            for m, name in enumerate(gains.motor_names)
-        ],
+        "motors": _motors(found),
         "unit": "N·m/A",
         "side": "motor" if found.motor_side else "joint",
-        "method": gains.method,
-        "payload_kg": {
-            name: None if load is None else load.mass for name, load in found.loads.items()
-        },
+        "method": found.gains.method,
+        "payload_kg": loads,
     }

@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.events import MotionEnded
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
 from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
 from hil.campaign.operator import MotionProgress, OperatorRequest
@@ -84,7 +83,13 @@ def move(
     with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
         link.connection.say = partial(say, err=True)
         if yes and not link.only_simulated:
-            _require_slow(cell, speed)
+            most = 100.0 * cell.campaign.approach_speed
+            if speed is not None and speed > most:
+                raise UnsafeError(
+                    f"--speed {speed:g} with --yes is faster than the cell's approach_speed "
+                    f"({most:g} %), and nobody confirms the way; nothing was sent: leave out "
+                    "--yes, or go slower."
+                )
         with stop_on_interrupt() as stop:
             here = link.connect(stop)
         target = turned(cell, here, joint or "", by or 0.0) if wanted is None else wanted
@@ -102,10 +107,29 @@ def move(
         if not json:
             typer.echo(printable(_described(way, cell, link)))
         _confirm(cell, link, yes=yes, json=json)
-        with _archive(campaign, output) as (path, ended_as):
-            ended, stopped = _sent(way, cell, link, path, quiet=json)
-            ended_as.append(ended)
-        figures = _figures(ended, path, way, cell, link)
+        name = None
+        if campaign is None or output is not None:
+            path = archive_path(output or Path("runs/move"), "move")
+        else:
+            make_folder(campaign.folder.archives)
+            name = campaign.folder.next_name("move", 0).filename
+            path = campaign.folder.archives / name
+        reporter = make_reporter(quiet=json)
+        with stop_on_interrupt() as stop, reporter.task("moving (s)", way.duration) as task:
+            durable = cell.controller.transport != "simulated"
+            watch = _Shown(task)
+            ended = send(way, cell, link, path, stop=stop, watch=watch, durable=durable)
+            stopped = stop.requested
+        if campaign is not None and name is not None:
+            campaign.folder.add(name, ended.outcome)
+        figures: dict[str, object] = {
+            "archive": str(path),
+            "outcome": ended.outcome,
+            "reason": ended.reason,
+            "simulated": link.only_simulated,
+            "duration": way.duration,
+            "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
+        }
         said = f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}"
         if not json:
             typer.echo(printable(said))
@@ -121,24 +145,6 @@ def move(
     if ended.outcome != "completed":
         why = f"the move ended {ended.outcome}: {ended.reason}; {path} is whole."
         raise ControllerFault(why).beside(figures)
-
-
-def _sent(
-    way: Way, cell: Cell, link: MotionLink, path: Path, *, quiet: bool
-) -> tuple[MotionEnded, bool]:
-    """How the motion ended, and whether a person asked for its end."""
-    reporter = make_reporter(quiet=quiet)
-    with stop_on_interrupt() as stop, reporter.task("moving (s)", way.duration) as task:
-        ended = send(
-            way,
-            cell,
-            link,
-            path,
-            stop=stop,
-            watch=_Shown(task),
-            durable=cell.controller.transport != "simulated",
-        )
-        return ended, stop.requested
 
 
 class _Shown:
@@ -159,23 +165,6 @@ class _Shown:
 
 
 @contextmanager
-def _archive(
-    campaign: Campaign | None, output: Path | None
-) -> Iterator[tuple[Path, list[MotionEnded]]]:
-    """Where the move is archived; a campaign's manifest learns of it once it has ended."""
-    ended: list[MotionEnded] = []
-    if campaign is None or output is not None:
-        yield archive_path(output or Path("runs/move"), "move"), ended
-        return
-    folder = campaign.folder
-    make_folder(folder.archives)
-    name = folder.next_name("move", 0)
-    yield folder.archives / name.filename, ended
-    if ended:
-        folder.add(name.filename, ended[0].outcome)
-
-
-@contextmanager
 def _reserved(campaign: Campaign | None) -> Iterator[None]:
     """Keep runs out of a campaign's folder from before the controller is connected.
 
@@ -188,20 +177,6 @@ def _reserved(campaign: Campaign | None) -> Iterator[None]:
     with campaign.folder.locked():
         campaign.folder.require_unchanged()
         yield
-
-
-def _require_slow(cell: Cell, speed: float | None) -> None:
-    """With --yes nobody has seen the way: it is not gone faster than the cell's approaches.
-
-    Raises:
-        UnsafeError: it would be.
-    """
-    most = 100.0 * cell.campaign.approach_speed
-    if speed is not None and speed > most:
-        raise UnsafeError(
-            f"--speed {speed:g} with --yes is faster than the cell's approach_speed ({most:g} %), "
-            "and nobody confirms the way; nothing was sent: leave out --yes, or go slower."
-        )
 
 
 def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
@@ -248,19 +223,6 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     below = narrower_thresholds(cell, link.connection)
     lines += [f"the smaller following-error threshold counts, {note}" for note in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
-
-
-def _figures(
-    ended: MotionEnded, path: Path, way: Way, cell: Cell, link: MotionLink
-) -> dict[str, object]:
-    return {
-        "archive": str(path),
-        "outcome": ended.outcome,
-        "reason": ended.reason,
-        "simulated": link.only_simulated,
-        "duration": way.duration,
-        "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
-    }
 
 
 def _tell(text: str, figures: dict[str, object], *, json: bool) -> None:

@@ -118,25 +118,15 @@ def _share(error: float) -> str:
     return "-" if math.isnan(error) else f"{error:.1%}"
 
 
-def written_line(written: Sequence[Path]) -> str:
-    """What was written, and where."""
-    return f"written to {written[0].parent}: {', '.join(path.name for path in written)}"
-
-
-def broken_lines(broken: Sequence[Broken]) -> Iterator[str]:
-    """What could not be used, one by one."""
-    for one in broken[:_MOST_LINES]:
-        yield f"{one.path} could not be used: {one.reason}"
-    if len(broken) > _MOST_LINES:
-        yield f"and {len(broken) - _MOST_LINES} more: see --output and --json"
-
-
 def skipped_line(skipped: Sequence[Broken]) -> str:
     """How many archives were left alone, by reason; "" for none."""
     if not skipped:
         return ""
     counts = Counter(_kind(one.reason) for one in skipped)
-    reasons = "; ".join(_times(reason, count) for reason, count in counts.most_common())
+    reasons = "; ".join(
+        f"{count}: {reason}" if " " in reason else plural(count, reason)
+        for reason, count in counts.most_common()
+    )
     return f"left alone, as not meant to be fitted: {reasons}"
 
 
@@ -145,25 +135,6 @@ def _kind(reason: str) -> str:
     short = re.sub(r"^is an? (?=\w+$)", "", reason)
     short = re.sub(r"\S*(/|\.mcap)\S*", "another", short)
     return re.sub(r"^attempt \d+ ", "a later attempt ", short)
-
-
-def _times(reason: str, count: int) -> str:
-    if " " in reason:
-        return f"{count}: {reason}"
-    return f"{count} {reason}{'' if count == 1 else 's'}"
-
-
-def last_line(result: BatchResult) -> str:
-    """What was used, and what was not."""
-    counts = (
-        plural(len(result.repetitions), "repetition"),
-        plural(len(result.campaigns), "campaign"),
-        plural(len(result.arms), "arm"),
-    )
-    return (
-        f"{counts[0]} in {counts[1]} of {counts[2]}; {plural(result.read, 'archive')} read,"
-        f" {result.cached} known, {len(result.skipped)} left alone, {len(result.broken)} broken"
-    )
 
 
 def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:
@@ -320,9 +291,17 @@ def _say(
     for line in alarm_lines(found) if quiet else result_lines(result, found):
         typer.echo(printable(line))
     if written:
-        reporter.say(written_line(written))
-    for line in broken_lines(result.broken):
-        typer.echo(printable(line), err=True)
+        names = ", ".join(path.name for path in written)
+        reporter.say(f"written to {written[0].parent}: {names}")
+    for one in result.broken[:_MOST_LINES]:
+        typer.echo(printable(f"{one.path} could not be used: {one.reason}"), err=True)
+    if (more := len(result.broken) - _MOST_LINES) > 0:
+        typer.echo(f"and {more} more: see --output and --json", err=True)
     if result.skipped and not quiet:
         typer.echo(printable(skipped_line(result.skipped)))
-    typer.echo(printable(last_line(result)))
+    typer.echo(
+        f"{plural(len(result.repetitions), 'repetition')} in "
+        f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
+        f"{plural(result.read, 'archive')} read, {result.cached} known, "
+        f"{len(result.skipped)} left alone, {len(result.broken)} broken"
+    )

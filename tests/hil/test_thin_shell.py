@@ -74,8 +74,7 @@ def computed(loop: ast.AST) -> Iterator[str]:
 
 
 FIGURES = {
-    "gains.py": {"computes gains.interval_factor * gains.std[motor] in a loop",
-                 "computes gains.interval_factor * gains.std[m] in a loop"},
+    "gains.py": {"computes gains.interval_factor * std in a loop"},
     "plan.py": {"computes getattr(extrema, q) / getattr(plan.limits, q) in a loop"},
 }  # fmt: skip
 """Figures that are made while they are told: an interval of a spread, a share of a limit."""
