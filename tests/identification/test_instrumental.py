@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.errors import IdentificationError, ShapeError
-from identification.estimators import instrument_motion
+from identification.estimators import instrumental
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
     estimate_instrumental,
@@ -457,7 +457,7 @@ def test_a_lag_that_is_known_is_not_sought_again(
 ) -> None:
     samples = executed(model, truth, 0)
     found = planned_motion(samples, PLAN.position)
-    monkeypatch.setattr(instrument_motion, "tracking_lag", lambda *_: pytest.fail("sought"))
+    monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
     again = planned_motion(samples, PLAN.position, lag=found.lag)
     np.testing.assert_array_equal(again.motion.position, found.motion.position)
     np.testing.assert_array_equal(again.usable, found.usable)
