@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 
 from hil.archive.live import LiveView
 from hil.cell import Cell
-from hil.design.folder import DESIGN_FILES
+from hil.design.run import DESIGN_FILES
 from hil.errors import InputError, OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks

@@ -22,10 +22,9 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, margins, weakest
-from hil.design.compare import References, references
 from hil.design.earlier import known_from
-from hil.design.folder import DesignFolder, require_same
-from hil.design.run import Designed, run_design
+from hil.design.result import References, references
+from hil.design.run import Designed, DesignFolder, require_same, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.plots import save
@@ -255,7 +254,7 @@ def design(
         if json:
             print_json(found)
         else:
-            excitation, n = done.result.excitation, done.result.n_parameters
+            excitation, n = done.result.excitation, done.result.search.n_parameters
             criteria = excitation.criteria
             typer.echo(
                 printable(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -28,7 +28,7 @@ from identification.excitation.collision.scene import NEAR
 from identification.model.motion import Motion
 from planner import Trajectory
 
-from .settings import ConstraintTable, DesignSettings
+from .settings import DesignSettings
 
 Array = NDArray[np.float64]
 
@@ -116,40 +116,34 @@ def _link(shape: str) -> str:
     return shape.rpartition("_")[0] or shape
 
 
+_POSTURE: Final = "let the joints swing about another posture ([sines] offset)"
+_SLOWER_SINES: Final = (
+    "ask for lower frequencies ([sines] slowest, fastest) or another posture to swing about "
+    "([sines] offset)"
+)
+_SLOWER: Final = "allow slower motions ([via_points] slowest, [constraints] max_duration)"
+_MOTORS: Final = "or check current limits and uncertainty of the cell"
 _VIA_POINTS: Final = {
-    "collision": (
-        "let via points lie nearer the middle of their ranges ([via_points] range_share), take "
-        "fewer of them, or check floor, walls, margin and home of the cell"
-    ),
-    "current": (
-        "allow slower motions ([via_points] slowest, [constraints] max_duration), or check "
-        "current limits and uncertainty of the cell"
-    ),
-    "torque": "allow slower motions ([via_points] slowest, [constraints] max_duration)",
+    "collision": "let via points lie nearer the middle of their ranges ([via_points] range_share), "
+    "take fewer of them, or check floor, walls, margin and home of the cell",
+    "current": f"{_SLOWER}, {_MOTORS}",
+    "torque": _SLOWER,
     "planning": "ask for another fly, or for fewer via points",
+    "too long": "allow more time ([constraints] max_duration), take fewer via points, or raise "
+    "[via_points] slowest",
+    "too short": "ask for less time ([constraints] min_duration), take more via points, or lower "
+    "[via_points] slowest",
 }
 _SINES: Final = {
-    "collision": (
-        "let the joints swing about another posture ([sines] offset), or check floor, walls and "
-        "margin of the cell"
-    ),
-    "current": (
-        "ask for lower frequencies ([sines] slowest, fastest) or another posture to swing about "
-        "([sines] offset), or check current limits and uncertainty of the cell"
-    ),
-    "torque": (
-        "ask for lower frequencies ([sines] slowest, fastest) or another posture to swing about "
-        "([sines] offset)"
-    ),
+    "collision": f"{_POSTURE}, or check floor, walls and margin of the cell",
+    "current": f"{_SLOWER_SINES}, {_MOTORS}",
+    "torque": _SLOWER_SINES,
     "joint limit": "take longer ramps or lower frequencies ([sines] ramp, fastest)",
 }
-_UNEXCITING: Final = "or judge by fewer parameters ([objective] parameters)"
 # Fewer motions than this are no search: the next ones may well be feasible.
 _FEW: Final = 500
 # What is more often too long or too short than this is not mended by chance.
 _FAR: Final = 1.5
-# Durations between this share of the longest one and the longest one are hard to hit.
-_NARROW: Final = 0.9
 
 
 class NoExcitationError(UnsafeError):
@@ -204,59 +198,28 @@ def _advice(
     error: NoFeasibleMotionError, settings: DesignSettings, always: str | None
 ) -> Iterator[str]:
     """Yield what could be changed about each kind that forbids more than half of the motions."""
-    unexciting = 2 * error.unexciting > error.tried
-    bridged = True
-    for kind in _ruling(error, alone=not unexciting):
-        if kind == "duration":
-            far, advice = _duration(error.nearest[kind], settings.constraints)
-            bridged = not far
-            yield advice
+    known = _VIA_POINTS if settings.sines is None else _SINES
+    unexciting, chance = 2 * error.unexciting > error.tried, True
+    kinds = sorted(error.rejected, key=lambda kind: -error.rejected[kind])
+    ruling = [kind for kind in kinds if 2 * error.rejected[kind] > error.tried]
+    for kind in ruling or ([] if unexciting else kinds[:1]):
+        if kind == "duration":  # only motions through via points have one that is not known before
+            mildest, asked = error.nearest[kind], settings.constraints
+            long = mildest.value > mildest.bound
+            least = min(mildest.value, mildest.bound)
+            chance = max(mildest.value, mildest.bound) < _FAR * least
+            yield (
+                f"the {'shortest' if long else 'longest'} motion tried lasts {mildest.value:.3g} s,"
+                f" where {asked.min_duration:g} to {asked.max_duration:g} s are asked for: "
+                + known["too long" if long else "too short"]
+            )
         elif kind == "collision" and always is not None:
             yield always
-            bridged = False
-        else:
-            known = _VIA_POINTS if settings.sines is None else _SINES
-            if kind in known:
-                yield known[kind]
+            chance = False
+        elif kind in known:
+            yield known[kind]
     if unexciting:
         more = "via points" if settings.sines is None else "harmonics, or a longer motion,"
-        yield f"take more {more} {_UNEXCITING}"
-    if bridged and 0 < error.tried < _FEW:
+        yield f"take more {more} or judge by fewer parameters ([objective] parameters)"
+    if chance and 0 < error.tried < _FEW:
         yield f"search longer, {error.tried} motions are few ([search] population, generations)"
-
-
-def _ruling(error: NoFeasibleMotionError, *, alone: bool) -> Sequence[str]:
-    """Return the kinds that forbid more than half, or the one that forbids most."""
-    kinds = sorted(error.rejected, key=lambda kind: -error.rejected[kind])
-    most = [kind for kind in kinds if 2 * error.rejected[kind] > error.tried]
-    return most or (kinds[:1] if alone else [])
-
-
-def _duration(mildest: Violation, asked: ConstraintTable) -> tuple[bool, str]:
-    """Return whether durations are far from what is asked for, and what to do.
-
-    Only motions through via points have one that is not known before.
-    """
-    too_long = mildest.value > mildest.bound
-    ratio = mildest.value / mildest.bound if too_long else mildest.bound / mildest.value
-    if ratio < _FAR and asked.min_duration > _NARROW * asked.max_duration:
-        return False, (
-            f"leave more room between {asked.min_duration:g} and {asked.max_duration:g} s "
-            "([constraints] min_duration, max_duration)"
-        )
-    if too_long:
-        which, what = "shortest", "long"
-        advice = (
-            "allow more time ([constraints] max_duration), take fewer via points, or raise "
-            "[via_points] slowest"
-        )
-    else:
-        which, what = "longest", "short"
-        advice = (
-            "ask for less time ([constraints] min_duration), take more via points, or lower "
-            "[via_points] slowest"
-        )
-    if ratio < _FAR:
-        return False, advice
-    times = f"{ratio:.0f}" if ratio >= 10.0 else f"{ratio:.1f}"
-    return True, f"the {which} motion tried is {times} times too {what}: {advice}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, NoReturn
+from typing import Any, Final
 
 import numpy as np
 import scipy
@@ -116,21 +116,18 @@ def _require_beginning(
         where, posture, elsewhere = "at home", genome.home, "home_deg in [campaign]"
     else:
         return
-    frame = AngleFrame.of(cell)
+    still, reason = np.zeros_like(posture[None]), ""
     contact = None if checker is None else clearance(checker, posture[None])
-    if checker is not None and contact is not None:
-        remedy = always_so(contact, checker) or f"correct [workspace] or {elsewhere}"
-        _refuse_beginning(cell, where, violation_text(contact, frame), remedy)
-    still = np.zeros_like(posture[None])
     too_much = currents.check(Motion(np.zeros(1), posture[None], still, still)) if currents else []
-    if too_much:
+    if checker is not None and contact is not None:
+        reason = violation_text(contact, AngleFrame.of(cell))
+        remedy = always_so(contact, checker) or f"correct [workspace] or {elsewhere}"
+    elif too_much:
         worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
+        reason = f"at rest there, {violation_text(worst, AngleFrame.of(cell))}"
         remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
-        _refuse_beginning(cell, where, f"at rest there, {violation_text(worst, frame)}", remedy)
-
-
-def _refuse_beginning(cell: Cell, where: str, reason: str, remedy: str) -> NoReturn:
-    raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
+    if reason:
+        raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
 
 
 def search_settings(settings: DesignSettings) -> SearchSettings:
@@ -207,17 +204,15 @@ def _angles_of(cell: Cell, field: str, values: list[float] | str) -> Array:
 def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) -> Objective:
     if settings.objective.parameters == "payload":
         return _payload_objective(cell, known)
-    parameters = _essential(cell, settings, known)
-    if known is None:
-        return Objective(cell.model, parameters=parameters)
-    return Objective(
-        cell.model,
-        parameters=parameters,
-        joint_weights=known.joint_weights,
-        earlier=known.gram,
-        earlier_samples=known.samples,
-        repetitions=known.repetitions,
-    )
+    earlier: dict[str, Any] = {}
+    if known is not None:
+        earlier = {
+            "joint_weights": known.joint_weights,
+            "earlier": known.gram,
+            "earlier_samples": known.samples,
+            "repetitions": known.repetitions,
+        }
+    return Objective(cell.model, parameters=_essential(cell, settings, known), **earlier)
 
 
 def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
@@ -245,38 +240,31 @@ def _essential(
     cell: Cell, settings: DesignSettings, known: Knowledge | None
 ) -> NDArray[np.intp] | None:
     """Return which parameters count, None for all."""
-    objective, names = settings.objective, cell.model.parameter_names
-    if objective.max_relative_std is not None:
-        return _known_well(objective.max_relative_std, known)
-    if objective.parameters == "all":
+    names, named = cell.model.parameter_names, settings.objective.named
+    percent = settings.objective.max_relative_std
+    if percent is None and named is None:
         return None
-    chosen = []
-    for name in objective.parameters:
-        if name not in names or objective.parameters.count(name) > 1:
-            wrong = "no parameter of this robot" if name not in names else "named twice"
+    if percent is not None:
+        field = f"objective.max_relative_std = {percent:g}"
+        if known is None:
+            problem, remedy = "needs an earlier estimate", "name archives with --earlier"
+            raise SettingsError(None, problem, field=field, remedy=remedy)
+        chosen = np.flatnonzero(known.relative_std <= percent / 100.0)
+        if len(chosen) < 2:
+            best = 100.0 * np.sort(known.relative_std)[1]
             raise SettingsError(
                 None,
-                f"is {wrong}",
+                f"leaves {len(chosen)} parameters, and a design needs two",
+                field=field,
+                remedy=f"at {best:.3g} % two would be left",
+            )
+        return np.asarray(chosen, dtype=np.intp)
+    for name in named or ():
+        if name not in names or (named or []).count(name) > 1:
+            raise SettingsError(
+                None,
+                f"is {'named twice' if name in names else 'no parameter of this robot'}",
                 field=f"objective.parameters = {name!r}",
                 remedy=f"known are: {', '.join(names)}",
             )
-        chosen.append(names.index(name))
-    return np.array(sorted(chosen), dtype=np.intp)
-
-
-def _known_well(percent: float, known: Knowledge | None) -> NDArray[np.intp]:
-    field = f"objective.max_relative_std = {percent:g}"
-    if known is None:
-        raise SettingsError(
-            None, "needs an earlier estimate", field=field, remedy="name archives with --earlier"
-        )
-    chosen = np.flatnonzero(known.relative_std <= percent / 100.0)
-    if len(chosen) < 2:
-        best = 100.0 * np.sort(known.relative_std)[1]
-        raise SettingsError(
-            None,
-            f"leaves {len(chosen)} parameters, and a design needs two",
-            field=field,
-            remedy=f"at {best:.3g} % two would be left",
-        )
-    return np.asarray(chosen, dtype=np.intp)
+    return np.array(sorted(names.index(name) for name in named or ()), dtype=np.intp)

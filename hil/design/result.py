@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,46 @@ Positive = Annotated[int, Field(ge=1)]
 Index = Annotated[float, Field(ge=0.0)]
 """Of coupling."""
 Condition = Annotated[float, Field(ge=1.0)]
+
+VERSION: Final = 1
+RESULT: Final = "excitation.toml"
+DECISIVE: Final = ("urdf", "robot", "limits")
+"""What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
+them what they are: whether the motion may be sent is checked before it is, in the cell as it is
+then."""
+
+_DIGITS: Final = 16
+# Planned on another machine a motion may differ in its last digits, at so many instants by no more.
+_SAME: Final = 1e-9  # rad
+_INSTANTS: Final = 9
+_REMEDY: Final = "design it again (`hil design`)"
+_HEAD: Final = """\
+# An excitation that `hil design` found. Names that end in _deg hold degrees, degrees/s,
+# degrees/s^2, degrees/s^3 of the URDF's angles. `hil demo --excitation` runs it. Do not change
+# anything here: the seal at the end would break.
+"""
+_FRONT: Final = (
+    "Motions of which none is better than another in both, by rising coupling index, as the\n"
+    "search sampled them. "
+)
+_CHOSEN: Final = "chosen, counting from 0, is the motion of this file."
+_POLISHED: Final = (
+    "The motion of this file is none of them: a polish made it from one, see polished_from."
+)
+_COMMENTS: Final = {
+    "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
+    "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has none.",
+    "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
+    "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
+    "criteria by\nthe millisecond.",
+    "settings": "As the search was asked; `hil design --settings` takes them from this file.",
+    "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
+    "on.",
+    "plan": "The motion: planning these moves gives it to the last bit.",
+    "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
+    "earlier": "Archives whose information was added.",
+    "seal": "What the lines above and the motion are recognised by.",
+}
 
 
 class _Table(BaseModel):
@@ -83,12 +123,6 @@ class FrontTable(_Table):
             raise ValueError("its lists are not equally long")
         return self
 
-    @property
-    def points(self) -> Array:
-        """log10 det, coupling index and duration [s] of each point (k, 3)."""
-        columns = (self.log10_det, self.coupling_index, self.duration)
-        return np.array(columns, dtype=np.float64).T
-
 
 class Origin(_Table):
     """`[polished_from]`: the point that a polish began with, and its criteria at 1 ms."""
@@ -96,12 +130,6 @@ class Origin(_Table):
     point: Whole
     log10_det: float
     coupling_index: Index
-
-    @classmethod
-    def of(cls, design: Design) -> Self:
-        """Return the origin of a design."""
-        one = design.origin_criteria
-        return cls(point=design.origin, log10_det=one.log10_det, coupling_index=one.coupling_index)
 
 
 class _Figures(_Table):
@@ -113,54 +141,42 @@ class _Figures(_Table):
     polished_from: Origin | None = None
 
 
-_DIGITS = 16
-# What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
-# them what they are: whether the motion may be sent is checked before it is, in the cell as it is
-# then.
-DECISIVE = ("urdf", "robot", "limits")
-
-
 def fingerprint(cell: Cell) -> dict[str, str]:
     """Return a digest of each part of a cell that a design may depend on, by the part's name.
 
     Tables are compared by content, so that comments, order and spelling of numbers do not count.
     The limits are those in URDF angles.
     """
-    limits = cell.joint_limits
-    home = cell.file.campaign
+    file, limits, home = cell.file, cell.joint_limits, cell.file.campaign
+    tables: dict[str, BaseModel | None] = {
+        "robot": file.robot,
+        "drive_train": file.drive_train,
+        "nominal": file.nominal,
+        "workspace": file.workspace,
+    }
+    documents = {k: None if v is None else v.model_dump(mode="json") for k, v in tables.items()}
     parts: dict[str, Any] = {
         "urdf": cell.urdf,
-        "robot": _document(cell.file.robot),
-        "limits": {
-            name: getattr(limits, name).tolist()
-            for name in ("lower", "upper", "velocity", "acceleration", "jerk")
-        },
+        "robot": documents["robot"],
+        "limits": {name: getattr(limits, name).tolist() for name in _ANGLES},
         "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
-        "drive_train": _document(cell.file.drive_train),
-        "nominal": _document(cell.file.nominal),
-        "workspace": _document(cell.file.workspace),
+        **documents,
         "home": None if home is None else home.home_deg,
     }
     return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
 
 
-def _document(table: BaseModel | None) -> Any:
-    return None if table is None else table.model_dump(mode="json")
+_ANGLES: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
-_ANGLES = ("lower", "upper", "velocity", "acceleration", "jerk")
-
-
-def motion_data(
+def _motion_data(
     excitation: Excitation, joint_names: Sequence[str], limits: JointLimits
 ) -> dict[str, Any]:
     """Return the table `plan` (as a plan file has it, without the motion) or `sines`."""
     trajectory = excitation.trajectory
     if isinstance(trajectory, FourierSeries):
         data = {"joints": list(joint_names)} | trajectory.to_dict()
-        for name in ("offset", "amplitude"):
-            data[name] = Angles(data[name])
-        return {"sines": data}
+        return {"sines": data | {name: Angles(data[name]) for name in ("offset", "amplitude")}}
     moves, points = excitation.moves, excitation.via_points
     if moves is None or points is None:
         raise ValueError("a motion in pieces without its moves cannot be written down")
@@ -171,7 +187,7 @@ def motion_data(
     return {"plan": plan}
 
 
-def motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
+def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
     """Return the trajectory, and what it was planned from, as arguments of an `Excitation`.
 
     Args:
@@ -189,58 +205,17 @@ def motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, An
     if fly is None or speed is None:
         raise ValueError("the moves lack fly or speed")
     points = np.array([file.start, *(move.target for move in file.moves)])
-    planned = in_child(file.plan)  # the solver can take its process with it
     return {
-        "trajectory": planned.trajectory,
+        "trajectory": in_child(file.plan).trajectory,  # the solver can take its process with it
         "via_points": points,
         "speed": np.broadcast_to(np.asarray(speed, dtype=np.float64), points[0].shape).copy(),
         "fly": fly,
     }
 
 
-def joints_of(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the joints that a motion is for."""
-    return tuple(data["sines" if "sines" in data else "plan"]["joints"])
-
-
-def motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
+def _motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
     """Return what two motions share only if they are the same to the last bit."""
     return digest(json.dumps(trajectory.to_dict()))
-
-
-VERSION: Final = 1
-RESULT: Final = "excitation.toml"
-
-_FRONT = (
-    "Motions of which none is better than another in both, by rising coupling index, as the\n"
-    "search sampled them. "
-)
-_CHOSEN = "chosen, counting from 0, is the motion of this file."
-_POLISHED = "The motion of this file is none of them: a polish made it from one, see polished_from."
-
-# Planned on another machine a motion may differ in its last digits, at so many instants by no more.
-_SAME = 1e-9  # rad
-_INSTANTS = 9
-_REMEDY = "design it again (`hil design`)"
-_HEAD = """\
-# An excitation that `hil design` found. Names that end in _deg hold degrees, degrees/s,
-# degrees/s^2, degrees/s^3 of the URDF's angles. `hil demo --excitation` runs it. Do not change
-# anything here: the seal at the end would break.
-"""
-_COMMENTS = {
-    "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
-    "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has none.",
-    "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
-    "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
-    "criteria by\nthe millisecond.",
-    "settings": "As the search was asked; `hil design --settings` takes them from this file.",
-    "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
-    "on.",
-    "plan": "The motion: planning these moves gives it to the last bit.",
-    "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
-    "earlier": "Archives whose information was added.",
-    "seal": "What the lines above and the motion are recognised by.",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,13 +228,10 @@ class DesignResult:
         joint_names: the motion's joints.
         settings: of the design.
         excitation: the motion and its criteria.
-        generations: how many generations were finished.
         complete: whether the search came to its end.
-        n_parameters: how many parameters were judged.
-        parameters: their names, None for all of the model's.
-        front: log10 det, coupling index and duration [s] of each point of the front, (k, 3).
-        chosen: which point of the front the motion is; None where a polish found a better one.
-        polished_from: the point that it grew from then, else None.
+        search: how the motion was found.
+        front: points of which none is better than another in both criteria.
+        polished_from: the point that the motion grew from, if it is none of them.
         versions: of the software.
         archives: name and SHA-256 of the earlier archives it adds to.
     """
@@ -269,12 +241,9 @@ class DesignResult:
     joint_names: tuple[str, ...]
     settings: DesignSettings
     excitation: Excitation
-    generations: int
     complete: bool
-    n_parameters: int
-    parameters: tuple[str, ...] | None
-    front: Array
-    chosen: int | None
+    search: SearchTable
+    front: FrontTable
     polished_from: Origin | None
     versions: Mapping[str, str]
     archives: tuple[tuple[str, str], ...] = ()
@@ -289,22 +258,38 @@ class DesignResult:
         archives: tuple[tuple[str, str], ...] = (),
     ) -> Self:
         """Return the record of a design."""
-        names = objective.model.parameter_names
-        chosen = objective.parameters
-        front = design.front
+        names, judged, front = objective.model.parameter_names, objective.parameters, design.front
+        excitation, grown = design.excitation, design.origin_criteria
         return cls(
             cell_name=cell.name,
             cell_parts=fingerprint(cell),
             joint_names=cell.joint_names,
             settings=settings,
-            excitation=design.excitation,
-            generations=len(design.history),
+            excitation=excitation,
             complete=design.complete,
-            n_parameters=objective.n_parameters,
-            parameters=None if chosen is None else tuple(names[k] for k in chosen),
-            front=np.column_stack((front.log10_det, front.coupling_index, front.duration)),
-            chosen=design.chosen,
-            polished_from=None if design.chosen is not None else Origin.of(design),
+            # As it is: what could not be read back is refused where it is read.
+            search=SearchTable.model_construct(
+                method=excitation.method,
+                seed=excitation.seed,
+                tried=excitation.tried,
+                generations=len(design.history),
+                n_parameters=objective.n_parameters,
+                parameters=None if judged is None else [names[k] for k in judged],
+                infeasible={name: int(n) for name, n in excitation.rejected.items()},
+            ),
+            front=FrontTable.model_construct(
+                chosen=design.chosen,
+                log10_det=np.asarray(front.log10_det).tolist(),
+                coupling_index=np.asarray(front.coupling_index).tolist(),
+                duration=np.asarray(front.duration).tolist(),
+            ),
+            polished_from=None
+            if design.chosen is not None
+            else Origin(
+                point=design.origin,
+                log10_det=grown.log10_det,
+                coupling_index=grown.coupling_index,
+            ),
             versions=software(),
             archives=archives,
         )
@@ -320,7 +305,7 @@ class DesignResult:
         trajectory = self.excitation.trajectory
         seal = {
             "sha256": _seal(text),
-            "motion_sha256": motion_digest(trajectory),
+            "motion_sha256": _motion_digest(trajectory),
             "positions": Angles(_positions(trajectory).tolist()),
         }
         try:
@@ -350,10 +335,9 @@ class DesignResult:
             ) from error
         try:
             data = from_text(text)
-            if data.get("format") != RESULT_FORMAT:
-                raise ValueError(f"format is {data.get('format')!r:.60}")
-            if data.get("version") != VERSION:
-                raise ValueError(f"version is {data.get('version')!r:.60}, this reads {VERSION}")
+            for key, known in (("format", RESULT_FORMAT), ("version", VERSION)):
+                if data.get(key) != known:
+                    raise ValueError(f"{key} is {data.get(key)!r:.60}, this reads {known!r}")
             seal = data.pop("seal")
             digest, motion = seal["sha256"], seal["motion_sha256"]
             positions = np.array(seal["positions"], dtype=np.float64)
@@ -369,24 +353,25 @@ class DesignResult:
             name, *inner = first["loc"] or ("front",)
             rest = (f".{part}" if isinstance(part, str) else f"[{part}]" for part in inner)
             problem = f"is {first['input']!r:.60}, not a figure: {first['msg'].lower()}"
-            field = f"{name}{''.join(rest)}"
-            raise InputError(path, problem, field=field, remedy=_REMEDY) from error
+            raise InputError(
+                path, problem, field=f"{name}{''.join(rest)}", remedy=_REMEDY
+            ) from error
         except (PlannerError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise InputError(
                 path, f"is not a designed excitation ({error})", remedy=_REMEDY
             ) from error
-        if motion_digest(result.excitation.trajectory) != motion:
+        if _motion_digest(result.excitation.trajectory) != motion:
             result._require_alike(path, positions)
         return result
 
-    def require_cell(self, cell: Cell, path: Path) -> None:
+    def require_cell(self, cell: Cell, path: Path, parts: Sequence[str] = DECISIVE) -> None:
         """Refuse a cell whose robot or limits are not those that the motion was designed for.
 
         Raises:
             InputError: names the two cells and what differs.
         """
         now = fingerprint(cell)
-        different = [part for part in DECISIVE if now[part] != self.cell_parts.get(part)]
+        different = [part for part in parts if now[part] != self.cell_parts.get(part)]
         if different:
             raise InputError(
                 path,
@@ -398,10 +383,9 @@ class DesignResult:
 
     def _require_alike(self, path: Path, positions: Array) -> None:
         """Refuse a motion that is another than the one that was written down."""
-        again = _positions(self.excitation.trajectory)
+        again, now = _positions(self.excitation.trajectory), software()
         if positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME):
             return
-        now = software()
         other = [
             f"{k} {v} (here {now.get(k)})" for k, v in self.versions.items() if now.get(k) != v
         ]
@@ -413,40 +397,27 @@ class DesignResult:
         )
 
     def _data(self, cell: Cell) -> dict[str, Any]:
-        excitation = self.excitation
-        criteria = asdict(excitation.criteria)
+        excitation, optional = self.excitation, dict[str, Any]()
+        if self.polished_from is not None:
+            optional["polished_from"] = self.polished_from.model_dump()
+        optional["settings"] = self.settings.to_dict()
+        if self.archives:
+            optional["earlier"] = {"archives": [list(one) for one in self.archives]}
+        bounds = {
+            "coupling_index_max": coupling_index_max(self.search.n_parameters),
+            "duration": float(excitation.trajectory.duration),
+        }
         return {
             "format": RESULT_FORMAT,
             "version": VERSION,
             "complete": self.complete,
-            "criteria": criteria
-            | {
-                "coupling_index_max": coupling_index_max(self.n_parameters),
-                "duration": float(excitation.trajectory.duration),
-            },
-            "search": {
-                "method": excitation.method,
-                "seed": excitation.seed,
-                "tried": excitation.tried,
-                "generations": self.generations,
-                "n_parameters": self.n_parameters,
-                "parameters": None if self.parameters is None else list(self.parameters),
-                "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
-            },
-            "front": {
-                "chosen": self.chosen,
-                "log10_det": self.front[:, 0].tolist(),
-                "coupling_index": self.front[:, 1].tolist(),
-                "duration": self.front[:, 2].tolist(),
-            },
-            **({"polished_from": self.polished_from.model_dump()} if self.polished_from else {}),
-            "settings": self.settings.to_dict(),
-            **(
-                {"earlier": {"archives": [list(a) for a in self.archives]}} if self.archives else {}
-            ),
+            "criteria": asdict(excitation.criteria) | bounds,
+            "search": self.search.model_dump(),
+            "front": self.front.model_dump(),
+            **optional,
             "cell": {"name": self.cell_name, **self.cell_parts},
             "software": dict(self.versions),
-            **motion_data(excitation, self.joint_names, cell.joint_limits),
+            **_motion_data(excitation, self.joint_names, cell.joint_limits),
         }
 
     @classmethod
@@ -462,25 +433,21 @@ class DesignResult:
             seed=search.seed,
             tried=search.tried,
             rejected=search.infeasible,
-            **motion_from_data(data, None if via is None else via.fly),
+            **_motion_from_data(data, None if via is None else via.fly),
         )
+        earlier = data.get("earlier", {}).get("archives", ())
         return cls(
             cell_name=data["cell"]["name"],
             cell_parts={name: part for name, part in data["cell"].items() if name != "name"},
-            joint_names=joints_of(data),
+            joint_names=tuple(data["sines" if "sines" in data else "plan"]["joints"]),
             settings=settings,
             excitation=excitation,
-            generations=search.generations,
             complete=data["complete"],
-            n_parameters=search.n_parameters,
-            parameters=None if search.parameters is None else tuple(search.parameters),
-            front=figures.front.points,
-            chosen=figures.front.chosen,
+            search=search,
+            front=figures.front,
             polished_from=figures.polished_from,
             versions=data["software"],
-            archives=tuple(
-                (name, digest) for name, digest in data.get("earlier", {}).get("archives", ())
-            ),
+            archives=tuple((name, digest) for name, digest in earlier),
         )
 
 
@@ -511,3 +478,79 @@ def _seal(text: str) -> str:
     data = tomllib.loads(text, parse_float=str)
     data.pop("seal", None)
     return json_digest(data)
+
+
+# Earlier designs beside a new one
+
+
+class References(NamedTuple):
+    """Designs to compare with.
+
+    Attributes:
+        measures: (log10 det, coupling index) of each, by name.
+        kinematic: names of those that were searched without looking at everything.
+    """
+
+    measures: dict[str, tuple[float, float]]
+    kinematic: frozenset[str]
+
+
+def references(
+    paths: Sequence[Path], cell: Cell, settings: DesignSettings, *, together: bool
+) -> References:
+    """Return earlier designs whose numbers mean what those of a new one are going to mean.
+
+    Args:
+        paths: their files or folders.
+        cell: of the new design.
+        settings: of the new design.
+        together: whether it adds to earlier archives.
+
+    Raises:
+        InputError: a file cannot be read, or its numbers must not be compared.
+    """
+    option = "--compare"
+    if paths and together:
+        raise InputError(
+            None,
+            "would be compared with what --earlier adds up, weighted, over all archives",
+            field=option,
+            remedy="leave out one of the two",
+        )
+    measures: dict[str, tuple[float, float]] = {}
+    kinematic = set()
+    for path in paths:
+        result = DesignResult.load(path)
+        result.require_cell(cell, path, ("urdf", "robot"))
+        if result.archives:
+            raise InputError(
+                path,
+                "was designed with --earlier: its numbers are of all archives together, weighted, "
+                "not of its motion alone",
+                field=option,
+                remedy="name designs made without --earlier",
+            )
+        every = ["payload"], [*cell.model.parameter_names]
+        ours, theirs = (
+            set(every[0] if asked == "payload" else every[1] if named is None else named)
+            for asked, named in (
+                (settings.objective.parameters, settings.objective.named),
+                (result.settings.objective.parameters, result.search.parameters),
+            )
+        )
+        if ours != theirs:
+            raise InputError(
+                path,
+                f"was judged by {len(theirs)} parameters, this design by {len(ours)}, of which "
+                f"{len(ours & theirs)} are the same",
+                field=option,
+                remedy="name designs with the same [objective]",
+            )
+        method = result.excitation.method
+        name = f"method {method.upper()}" if len(method) == 1 else method
+        name = f"{name} ({path})" if name in measures else name
+        criteria = result.excitation.criteria
+        measures[name] = criteria.log10_det, criteria.coupling_index
+        if result.settings.unchecked:
+            kinematic.add(name)
+    return References(measures, frozenset(kinematic))

@@ -1,17 +1,20 @@
-"""A design from beginning to end: search, check once more, write down."""
+"""A design in its folder from beginning to end: search, check once more, write down."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import BinaryIO, Final
+from pathlib import Path
+from typing import BinaryIO, Final, cast
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
+from hil.files import exclusive_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter, Task
+from hil.reading import opened
 from identification.excitation import (
     Design,
     ForeignJournalError,
@@ -26,12 +29,149 @@ from identification.excitation import (
     sampled,
     search,
 )
+from planner.toml_text import to_text
 
 from .advice import exhausted, forbidden, no_excitation
-from .folder import DesignFolder, require_same
 from .problem import Knowledge, problem_of, search_settings
-from .result import DesignResult
-from .settings import DesignSettings
+from .result import RESULT, DesignResult
+from .settings import DesignSettings, SettingsError, load_settings
+
+PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
+DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
+"""What a design leaves; a campaign of its motion may lie beside it."""
+
+_HEAD = "# The settings of the search in this folder; `hil design --resume` goes on with them.\n"
+
+
+@dataclass(frozen=True)
+class DesignFolder:
+    """Paths below one folder."""
+
+    root: Path
+
+    @property
+    def result(self) -> Path:
+        """The motion, its criteria, and all that it came from."""
+        return self.root / RESULT
+
+    @property
+    def picture(self) -> Path:
+        """The same for the eye."""
+        return self.root / PICTURE
+
+    @property
+    def settings(self) -> Path:
+        """What was asked for."""
+        return self.root / SETTINGS
+
+    @property
+    def journal(self) -> Path:
+        """What was scored so far."""
+        return self.root / JOURNAL
+
+    def held(self) -> AbstractContextManager[None]:
+        """Make the folder, and keep every other search out of it until this is left."""
+        return exclusive_folder(self.root, "search", "-o")
+
+    def begin(self, settings: DesignSettings, *, force: bool) -> None:
+        """Make room for a new design, and write down what is asked for; the folder is held.
+
+        Raises:
+            InputError: there is a design already and it is not to be replaced, or the folder
+                cannot be written to.
+        """
+        ours = [path for path in (self.result, self.journal) if path.exists()]
+        if self._begun():
+            ours.append(self.settings)
+        elif self.settings.exists():
+            raise InputError(
+                self.settings,
+                "is in the way: the settings of the design are to be written there",
+                remedy="name another folder (-o), or move the file",
+            )
+        if ours and not force:
+            raise InputError(
+                self.root,
+                f"holds a design already ({ours[0].name})",
+                remedy="go on with it (--resume), name another folder (-o), or add --force",
+            )
+        with self._written():
+            for path in (self.result, self.picture, self.journal, self.settings):
+                path.unlink(missing_ok=True)
+            write_atomically(self.settings, _HEAD + "\n" + to_text(settings.to_dict(), {}))
+
+    def interrupted(self) -> DesignSettings:
+        """Return the settings of the design in this folder.
+
+        Raises:
+            InputError: there is none.
+        """
+        if not self._begun():
+            raise InputError(
+                self.root,
+                "holds no design to go on with",
+                remedy="begin one without --resume, or name its folder (-o)",
+            )
+        return load_settings(self.settings)
+
+    def _begun(self) -> bool:
+        """Return whether the settings in the folder are those of a design, not a person's own."""
+        try:
+            with opened(self.settings) as file:
+                return file.read(len(_HEAD)) == _HEAD.encode()
+        except OSError:
+            return False
+
+    @contextmanager
+    def opened_journal(self) -> Iterator[BinaryIO]:
+        """Open the journal, a new one if there is none; the folder is held.
+
+        Raises:
+            InputError: the disk refuses.
+        """
+        with self._written():
+            # Without a buffer nothing is left that closing the file would fail to write.
+            if self.journal.exists():
+                opened(self.journal).close()  # which refuses what is no file
+            file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
+        with file:
+            yield cast(BinaryIO, file)
+
+    @contextmanager
+    def _written(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(
+                self.root,
+                f"cannot be written to ({error.strerror})",
+                remedy="make room, or name another folder (-o)",
+            ) from error
+
+
+def require_same(asked: DesignSettings, there: DesignSettings, path: Path) -> None:
+    """Refuse to go on with a search under other settings than those it began with.
+
+    Raises:
+        SettingsError: names the first field that differs.
+    """
+    ours, theirs = (
+        {
+            f"{name}.{key}" if key else name: entry
+            for name, table in settings.to_dict().items()
+            for key, entry in (table.items() if isinstance(table, dict) else [("", table)])
+        }
+        for settings in (asked, there)
+    )
+    for field in sorted(ours.keys() | theirs.keys()):
+        if ours.get(field) != theirs.get(field):
+            raise SettingsError(
+                path,
+                f"was {theirs.get(field)!r} when the search began",
+                field=f"{field} = {ours.get(field)!r}",
+                remedy="resume it without other settings, or begin anew in another folder (-o)",
+            )
+
 
 _TITLE: Final = "designing (motions)"
 
@@ -73,15 +213,8 @@ def run_search(
         InputError: the journal is of another search, or cannot be read or begun.
         SettingsError, CellError: settings and cell do not fit together.
     """
-    return _searched(
-        problem_of(cell, settings, known),
-        settings,
-        AngleFrame.of(cell),
-        reporter,
-        workers=workers,
-        journal=journal,
-        stop=stop,
-    )
+    problem = problem_of(cell, settings, known)
+    return _searched(problem, cell, settings, reporter, workers, journal, stop)
 
 
 def run_design(
@@ -117,16 +250,12 @@ def run_design(
         else:
             folder.begin(settings, force=force)
         with folder.opened_journal() as journal:
-            design = _searched(
-                problem,
-                settings,
-                AngleFrame.of(cell),
-                reporter,
-                workers=workers,
-                journal=journal,
-                stop=stop,
-            )
-        _check_once_more(problem, design, AngleFrame.of(cell))
+            design = _searched(problem, cell, settings, reporter, workers, journal, stop)
+        trajectory = design.excitation.trajectory  # as it is going to be run
+        broken = problem.constraints.violations(trajectory, sampled(trajectory))
+        if broken:
+            reason = violation_text(broken[0], AngleFrame.of(cell))
+            raise UnsafeError(f"the motion found does not pass its last check: {reason}")
         archives = () if known is None else known.archives
         result = DesignResult.of(cell, settings, design, problem.objective, archives)
         result.save(folder.result, cell)
@@ -137,25 +266,24 @@ def run_design(
 
 def _searched(
     problem: Problem,
+    cell: Cell,
     asked: DesignSettings,
-    frame: AngleFrame,
     reporter: Reporter,
-    *,
     workers: int,
     journal: BinaryIO | None,
     stop: Callable[[], bool],
 ) -> Design:
     settings, checker = search_settings(asked), problem.constraints.checker
-    not_checked = None if checker is None else checker.exceptions
-    if not_checked is not None:
-        reporter.say(not_checked)
+    frame = AngleFrame.of(cell)
+    if checker is not None and checker.exceptions is not None:
+        reporter.say(checker.exceptions)
     with ExitStack() as stack:
         task = stack.enter_context(reporter.task(_TITLE, most_evaluations(settings)))
         bar = _Bar(task, reporter)
         population = stack.enter_context(Population(problem, workers))
         if journal is not None:
-            bar.journal = run_journal = _journal(journal, problem, settings, reporter)
-            stack.callback(run_journal.close)
+            bar.journal = _journal(journal, problem, settings, reporter)
+            stack.callback(bar.journal.close)
         try:
             design = search(
                 population,
@@ -258,12 +386,3 @@ def _journal(
             f"{journal.damaged} bytes of the journal are damaged; what they held is scored anew"
         )
     return journal
-
-
-def _check_once_more(problem: Problem, design: Design, frame: AngleFrame) -> None:
-    """Refuse to write down a motion that, as it is going to be run, breaks a constraint."""
-    trajectory = design.excitation.trajectory
-    found = problem.constraints.violations(trajectory, sampled(trajectory))
-    if found:
-        reason = violation_text(found[0], frame)
-        raise UnsafeError(f"the motion found does not pass its last check: {reason}")

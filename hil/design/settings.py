@@ -38,7 +38,7 @@ Share = Annotated[Number, Field(ge=0, le=1)]
 Eta = Annotated[Number, Field(ge=1, le=1000)]
 AboveZero = Annotated[Number, Field(gt=0)]
 Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
-_MOTIONS = ("via_points", "sines")
+_MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
 RESULT_FORMAT: Final = "designed excitation"
 """What the file that a design leaves calls itself; the settings are a table in it."""
 PAYLOAD_DURATION: Final = 10.0
@@ -197,6 +197,11 @@ class ObjectiveTable(_Table):
         "a larger share of their value are left out; needs --earlier",
     )
 
+    @property
+    def named(self) -> list[str] | None:
+        """Names of the parameters, None where they are not named one by one."""
+        return None if isinstance(self.parameters, str) else self.parameters
+
     @field_validator("parameters")
     @classmethod
     def _two_at_least(cls, parameters: str | list[str]) -> str | list[str]:
@@ -244,16 +249,11 @@ class DesignSettings(_Table):
         """Sines last as long as they are asked to: what is not allowed needs no search."""
         if self.sines is None:
             return self
-        length, constraints = self.sines.length, self.constraints
-        if length > constraints.max_duration:
+        length, asked = self.sines.length, self.constraints
+        if not asked.min_duration <= length <= asked.max_duration:
             raise ValueError(
-                f"[sines] length = {length:g} s is longer than [constraints] max_duration = "
-                f"{constraints.max_duration:g} s; shorten the one or raise the other"
-            )
-        if length < constraints.min_duration:
-            raise ValueError(
-                f"[sines] length = {length:g} s is shorter than [constraints] min_duration = "
-                f"{constraints.min_duration:g} s; lengthen the one or lower the other"
+                f"[sines] length = {length:g} s is not between [constraints] min_duration = "
+                f"{asked.min_duration:g} s and max_duration = {asked.max_duration:g} s; change one"
             )
         return self
 
@@ -343,26 +343,23 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
             remedy=f"known are: {', '.join(METHODS)}",
         )
     base = tomllib.loads(preset_text(method))
-    if any(name in raw for name in _MOTIONS):
-        base = {name: table for name, table in base.items() if name not in _MOTIONS}
-        if "via_points" in raw and method == "a":
-            base["via_points"] = tomllib.loads(preset_text("b"))["via_points"]
-        elif "via_points" in raw:
-            base["via_points"] = tomllib.loads(preset_text(method))["via_points"]
-        if "sines" in raw:
-            base["sines"] = tomllib.loads(preset_text("a"))["sines"]
+    given = [name for name in _MOTIONS if name in raw]
+    if given:  # a motion of another kind than the method's is as in the paper's method with it
+        base = {
+            name: table for name, table in base.items() if name not in _MOTIONS or name in given
+        }
+        for name in given:
+            base.setdefault(name, tomllib.loads(preset_text(_MOTIONS[name]))[name])
     return _validated(path, _merged(base, raw))
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    result = dict(base)
-    for name, value in changes.items():
-        old = result.get(name)
-        if isinstance(old, Mapping) and isinstance(value, Mapping):
-            result[name] = {**old, **value}
-        else:
-            result[name] = value
-    return result
+    both = {
+        name: {**base[name], **value}
+        for name, value in changes.items()
+        if isinstance(base.get(name), Mapping) and isinstance(value, Mapping)
+    }
+    return {**base, **changes, **both}
 
 
 def _validated(path: Path | None, raw: Mapping[str, Any]) -> DesignSettings:

@@ -18,8 +18,7 @@ from hil.campaign.quick_design import plan_around
 from hil.cell import Cell
 from hil.design import DesignResult, DesignSettings, preset, problem_of
 from hil.design.advice import NoExcitationError
-from hil.design.folder import DesignFolder
-from hil.design.run import run_design
+from hil.design.run import DesignFolder, run_design
 from hil.errors import ControllerFault, HilError
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent

@@ -9,9 +9,8 @@ import pytest
 
 from hil.cell import Cell
 from hil.design import DesignResult, preset
-from hil.design.compare import references
-from hil.design.folder import DesignFolder
-from hil.design.run import run_design
+from hil.design.result import references
+from hil.design.run import DesignFolder, run_design
 from hil.errors import InputError
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
@@ -58,7 +57,7 @@ def test_another_robot_is_refused(cell, result, written):
         cell.urdf,
         cell.path,
     )
-    words = r"excitation\.toml: --compare: is of another robot: the robot of its cell .* is not"
+    words = r"excitation\.toml: cell: was designed for the cell .*, whose robot is not that of"
     with pytest.raises(InputError, match=words):
         references([written(result)], heavier, preset("b"), together=False)
 
@@ -78,7 +77,9 @@ def test_other_parameters_are_not_drawn_beside_all(cell, result, written):
     words = r"excitation\.toml: --compare: was judged by 58 parameters, this design by 3, of which"
     with pytest.raises(InputError, match=words + " 3 are the same; .*same \\[objective\\]"):
         references([written(result)], cell, some, together=False)
-    subset = replace(result, parameters=tuple(names[:3]), n_parameters=3)
+    subset = replace(
+        result, search=result.search.model_copy(update={"parameters": names[:3], "n_parameters": 3})
+    )
     assert references([written(subset)], cell, some, together=False).measures
     others = preset("b").replaced(objective={"parameters": names[1:4]})
     with pytest.raises(InputError, match="by 3 parameters, this design by 3, of which 2 are"):

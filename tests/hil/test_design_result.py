@@ -8,9 +8,8 @@ import pytest
 
 from hil.cell import Cell
 from hil.design import DesignResult, load_design, preset, problem_of
-from hil.design.folder import DesignFolder
 from hil.design.result import _seal, fingerprint
-from hil.design.run import Designed, run_design
+from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
 from hil.progress import Silent
 from identification.excitation import Objective
@@ -54,13 +53,13 @@ def test_the_file_restores_everything_else(made):
     folder, done = made
     again = DesignResult.load(folder.result)
     front = done.design.front
-    np.testing.assert_array_equal(again.front[:, 0], front.log10_det)
-    np.testing.assert_array_equal(again.front[:, 1], front.coupling_index)
-    np.testing.assert_array_equal(again.front[:, 2], front.duration)
-    assert again.chosen == done.design.chosen
+    np.testing.assert_array_equal(again.front.log10_det, front.log10_det)
+    np.testing.assert_array_equal(again.front.coupling_index, front.coupling_index)
+    np.testing.assert_array_equal(again.front.duration, front.duration)
+    assert again.front.chosen == done.design.chosen
     assert again.settings == done.result.settings
-    assert again.complete and again.generations == 2
-    assert again.n_parameters == 58 and again.parameters is None
+    assert again.complete and again.search.generations == 2
+    assert again.search.n_parameters == 58 and again.search.parameters is None
     assert again.versions == done.result.versions
     assert {"hil", "ruckig", "pymoo", "cma", "numpy"} <= again.versions.keys()
 
@@ -231,7 +230,7 @@ def test_a_subset_of_parameters_is_named(cell, tmp_path):
     folder = DesignFolder(tmp_path / "few")
     done = run_design(folder, cell, settings, Silent(), workers=1)
     again = DesignResult.load(folder.result)
-    assert list(again.parameters or ()) == names and again.n_parameters == 12
+    assert again.search.parameters == names and again.search.n_parameters == 12
     objective = problem_of(cell, settings).objective
     assert objective.criteria(done.design.excitation.trajectory, 0.001) == (
         again.excitation.criteria
@@ -243,7 +242,7 @@ def test_a_polished_motion_is_told_with_what_it_grew_from(cell, tmp_path):
     folder = DesignFolder(tmp_path / "polished")
     design = run_design(folder, cell, settings, Silent(), workers=2).design
     again = DesignResult.load(folder.result)
-    assert again.chosen is None and again.polished_from is not None
+    assert again.front.chosen is None and again.polished_from is not None
     text = folder.result.read_text()
     assert "a polish made it from one, see polished_from" in text
     assert "chosen, counting" not in text

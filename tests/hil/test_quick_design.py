@@ -16,8 +16,7 @@ from hil.campaign import Campaign, CampaignPlan, design, plan_around
 from hil.campaign.quick_design import LEAST, quick_settings
 from hil.cell import Cell
 from hil.design import load_design, preset
-from hil.design.folder import DesignFolder
-from hil.design.run import run_design
+from hil.design.run import DesignFolder, run_design
 from hil.errors import HilError
 from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.progress import Silent
