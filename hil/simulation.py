@@ -287,17 +287,3 @@ def planted_values(cell: Cell) -> Array:
         third=truth.third,
         inertia_scale=truth.inertia_scale,
     )
-
-
-__all__ = [
-    "carrying",
-    "controller_settings",
-    "own_postures",
-    "planted_truth",
-    "planted_values",
-    "simulated_controller",
-    "simulated_drive",
-    "simulated_link",
-    "simulated_provenance",
-    "unmodelled_effects",
-]

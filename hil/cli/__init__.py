@@ -14,9 +14,10 @@ import os
 import re
 import sys
 from collections import UserDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -119,30 +120,33 @@ def _print(error: Exception, asked: bool) -> None:
 
 
 class LazyCommands(UserDict[str, Any]):
-    """Commands by name, each from the module of this package that has its name or the one given.
+    """Commands by name, each from the module of this package that is called like it.
 
-    A module has either a function of the command's name, or an `app` of several commands.
-
-    Args:
-        purposes: what each command is for, by its name, in the order of the help.
-        modules: of those whose module is called otherwise.
+    A module has either a function of the command's name, or an `app` of several commands; its
+    first line says what it is for.
     """
-
-    def __init__(self, purposes: Mapping[str, str], **modules: str) -> None:
-        self.purposes = purposes
-        super().__init__({name: modules.get(name, name) for name in purposes})
 
     def __getitem__(self, name: str) -> Any:
         """The command, imported if it was not yet."""
         known = super().__getitem__(name)
-        if isinstance(known, str):
-            known = self[name] = _command(name, known)
+        if known is None:
+            known = self[name] = _command(name)
         return known
 
+    def purpose(self, name: str) -> str:
+        """What a command is for; nothing is imported."""
+        source = Path(__file__).with_name(f"{_module(name)}.py").read_text("utf-8")
+        words = source.splitlines()[0].partition(": ")[2].removesuffix('"""')
+        return words[0].upper() + words[1:]
 
-def _command(name: str, module: str) -> Any:
+
+def _module(name: str) -> str:
+    return "imports" if name == "import" else name  # a word of Python
+
+
+def _command(name: str) -> Any:
     with leave_if_interrupted():
-        found = import_module(f"{__name__}.{module}")
+        found = import_module(f"{__name__}.{_module(name)}")
     alone = typer.Typer(callback=lambda: None, rich_markup_mode="markdown", add_completion=False)
     if hasattr(found, "app"):
         alone.add_typer(found.app, name=name)
@@ -177,69 +181,15 @@ def presented(command: Any) -> Any:
 
 
 COMMANDS = LazyCommands(
-    {
-        "demo": "Design, run, archive, identify and report, all on the simulated COMAU NS 16.",
-        "design": (
-            "Search the motion that excites and decouples the parameters of CELL. Nothing moves."
-        ),
-        "rehearse": (
-            "Run exactly the plan of CAMPAIGN on a simulated arm, and judge it. Nothing moves."
-        ),
-        "status": "Show which steps of CAMPAIGN are done, which is next, and what to type for it.",
-        "report": "Make the report of CAMPAIGN anew and print where it is.",
-        "replay": (
-            "Simulate held-out motions under their recorded torques: how far models go astray."
-        ),
-        "identify": (
-            "Estimate the dynamic parameters from archives, and say whether the result is good."
-        ),
-        "reidentify": (
-            "Identify every arm from all archives below some folders, campaign by campaign."
-        ),
-        "compare": (
-            "Compare campaigns of one arm: did the friction change, on which axis, what does "
-            "it carry?"
-        ),
-        "export": (
-            "Write the identified arm for a simulator, read it back, and say what the format "
-            "leaves out."
-        ),
-        "gains": (
-            "Find the torque constant of every motor, from recordings with and without a "
-            "known payload."
-        ),
-        "payload": (
-            "Weigh what the arm carries: mass, centre of mass and inertia with 95 % intervals."
-        ),
-        "plan": (
-            "Plan a motion through via points and say how each of them is passed. Nothing moves."
-        ),
-        "plot": (
-            "Draw what is in an archive: position, speed, current, torque, following error, events."
-        ),
-        "new": 'Write a commented cell file for an arm; what nobody has said is marked "?".',
-        "move": "Move the arm on a straight way in joint space, slowly, and archive it.",
-        "run": "Run what is missing of a campaign on its controller, then identify and report.",
-        "record": (
-            "Record while the controller's own program moves the arm. Nothing is commanded "
-            "from here."
-        ),
-        "simulate": (
-            "Be the controller: a simulated C4G with its arm, for a PC program on a real "
-            "network or bus."
-        ),
-        "study": (
-            "Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16."
-        ),
-        "doctor": (
-            "Measure whether this PC can answer a controller every 1 or 2 ms, and say what "
-            "to change."
-        ),
-        "import": "Turn other people's recordings into archives that `hil identify` reads.",
-        "archive": "Look into archives, check and repair them.",
-    },
-    **{"import": "imports"},
-)
+    dict.fromkeys(
+        (
+            "demo", "design", "rehearse", "status", "report", "replay", "identify", "reidentify",
+            "compare", "export", "gains", "payload", "plan", "plot", "new", "move", "run",
+            "record", "simulate", "study", "doctor", "import", "archive",
+        )
+    )
+)  # fmt: skip
+"""In the order of the help."""
 
 _JSON = "hil.cli.json"
 
@@ -253,8 +203,7 @@ class Group(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Show the commands by their purposes: none of them is imported for that."""
-        purposes = COMMANDS.purposes.items()
-        self.commands = {name: TyperCommand(name, help=text) for name, text in purposes}
+        self.commands = {name: TyperCommand(name, help=COMMANDS.purpose(name)) for name in COMMANDS}
         super().format_help(ctx, formatter)
         self.commands = COMMANDS
 

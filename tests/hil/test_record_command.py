@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from drivers.transports.faults import Corrupt, Lose
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Link, Progress, Stop
+from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
@@ -42,14 +44,29 @@ def own_motion_link(cell: Cell, *faults: Lose | Corrupt, accept_init: bool = Fal
     return Link.over(transport, cell, controller.finish, accept_init=accept_init)
 
 
+def recording_of(
+    cell: Cell, path: Path, *faults: Lose | Corrupt, kind: str = "excitation", **how: Any
+) -> Recorded:
+    """A recording of the controller's own motion."""
+    how = {"stop": Stop(), **how}
+    return record(own_motion_link(cell, *faults), cell, path, kind=kind, durable=False, **how)
+
+
+def after(cycles: int) -> dict[str, Any]:
+    """A person who ends the recording after so many cycles."""
+    stop = Stop()
+
+    def enough(progress: Progress) -> None:
+        stop.requested = progress.cycles >= cycles
+
+    return {"stop": stop, "watch": enough}
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
     """Forty seconds of the controller's own motion."""
     path = tmp_path_factory.mktemp("record") / NAME
-    done = record(
-        own_motion_link(cell), cell, path,
-        kind="excitation", stop=Stop(), duration=40.0, durable=False,
-    )  # fmt: skip
+    done = recording_of(cell, path, duration=40.0)
     assert (done.outcome, done.records, done.records_lost) == ("completed", 40_000, 0)
     return path
 
@@ -101,48 +118,27 @@ def test_recordings_are_numbered_in_a_folder_and_never_overwritten(tmp_path: Pat
 
 def test_a_file_of_any_name_knows_its_kind(tmp_path: Path, cell: Cell) -> None:
     path = archive_path(tmp_path / "monday.mcap", "standstill")
-    record(
-        own_motion_link(cell), cell, path,
-        kind="standstill", stop=Stop(), duration=0.2, durable=False,
-    )  # fmt: skip
+    recording_of(cell, path, kind="standstill", duration=0.2)
     assert open_archive(path).kind == "standstill"
 
 
 def test_the_operator_ends_a_recording_and_that_is_its_proper_end(
     tmp_path: Path, cell: Cell
 ) -> None:
-    stop = Stop()
-
-    def enough(progress: Progress) -> None:
-        stop.requested = progress.cycles >= 500
-
-    done = record(
-        own_motion_link(cell), cell, tmp_path / NAME,
-        kind="excitation", stop=stop, watch=enough, durable=False,
-    )  # fmt: skip
+    done = recording_of(cell, tmp_path / NAME, **after(500))
     assert (done.outcome, done.reason) == ("completed", "ended by the operator")
     assert done.records == open_archive(tmp_path / NAME).n_samples >= 500
 
 
 def test_a_recording_cut_short_says_so(tmp_path: Path, cell: Cell) -> None:
-    stop = Stop()
-
-    def enough(progress: Progress) -> None:
-        stop.requested = progress.cycles >= 500
-
-    done = record(
-        own_motion_link(cell), cell, tmp_path / NAME,
-        kind="excitation", stop=stop, duration=10.0, watch=enough, durable=False,
-    )  # fmt: skip
+    done = recording_of(cell, tmp_path / NAME, duration=10.0, **after(500))
     assert (done.outcome, done.reason) == ("stopped", "ended by the operator")
 
 
 def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> None:
-    link = own_motion_link(cell, Lose(600, "to_pc"))
-    record(link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False)
+    recording_of(cell, tmp_path / NAME, Lose(600, "to_pc"), duration=1.0)
     archive = open_archive(tmp_path / NAME)
-    steps = np.diff(archive.columns["cycle"])
-    assert sorted(set(steps.tolist())) == [1, 2]
+    assert {*np.diff(archive.columns["cycle"]).tolist()} == {1, 2}
     assert archive.columns["gap"].sum() == 1
     assert archive.outcome is not None
     assert archive.outcome.entries["lost_packets"] == "1"
@@ -229,7 +225,10 @@ def until_heard(recorder: subprocess.Popen[str]) -> str:
     return next(line for line in recorder.stdout if "heard" in line)
 
 
-HIL = (sys.executable, "-m", "hil")
+def recorder_of(cell: Path, *options: object) -> Any:
+    """`hil record` into a.mcap beside the cell."""
+    command = (sys.executable, "-m", "hil", "record", cell, "-o", cell.parent / "a.mcap")
+    return running(*command, *options)
 
 
 def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
@@ -260,9 +259,7 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     path, port = on_udp
     with (
         running(*own_motion(path, port)) as controller,
-        running(
-            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "1.5", "--json"
-        ) as recorder,
+        recorder_of(path, "--duration", "1.5", "--json") as recorder,
     ):
         assert recorder.stderr is not None
         assert "recording complete; still answering" in recorder.stderr.readline()
@@ -297,7 +294,7 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(
     archive = tmp_path / "a.mcap"
     with (
         running(*own_motion(path, port)),
-        running(*HIL, "record", path, "-o", archive) as recorder,
+        recorder_of(path) as recorder,
     ):
         wait_until_recorded(archive, recorder)
         recorder.send_signal(signal.SIGINT)
@@ -318,9 +315,7 @@ def test_an_arm_at_rest_is_left_after_a_second(tmp_path: Path, on_udp: tuple[Pat
     still = [word for word in options if word != "--own-motion"]
     with (
         running(*still),
-        running(
-            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "1.5", "--json"
-        ) as recorder,
+        recorder_of(path, "--duration", "1.5", "--json") as recorder,
     ):
         said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
@@ -334,9 +329,7 @@ def test_a_session_that_ends_before_the_duration_is_over_is_told(
     path, port = on_udp
     with (
         running(*own_motion(path, port, "--duration", "3")),
-        running(
-            *HIL, "record", path, "-o", tmp_path / "a.mcap", "--duration", "60", "--json"
-        ) as recorder,
+        recorder_of(path, "--duration", "60", "--json") as recorder,
     ):
         said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
@@ -368,7 +361,7 @@ def test_a_killed_exchange_ends_a_recording_as_lost(
     archive = tmp_path / "a.mcap"
     with (
         running(*own_motion(path, port)),
-        running(*HIL, "record", path, "-o", archive) as recorder,
+        recorder_of(path) as recorder,
     ):
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "drivers.exchange"), signal.SIGKILL)
@@ -389,7 +382,7 @@ def test_a_hanging_archive_process_is_ended_and_answers_go_on(
     archive = tmp_path / "a.mcap"
     with (
         running(*own_motion(path, port)) as controller,
-        running(*HIL, "record", path, "-o", archive) as recorder,
+        recorder_of(path) as recorder,
     ):
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
@@ -409,7 +402,7 @@ def test_a_controller_that_never_comes_is_waited_for_as_long_as_was_asked(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:
     path, _ = on_udp
-    with running(*HIL, "record", path, "-o", tmp_path / "a.mcap", "--wait", "0.5") as recorder:
+    with recorder_of(path, "--wait", "0.5") as recorder:
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
     assert "nothing heard from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
@@ -419,7 +412,7 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(
     tmp_path: Path, on_udp: tuple[Path, int]
 ) -> None:
     path, _ = on_udp
-    with running(*HIL, "record", path, "-o", tmp_path / "a.mcap") as recorder:
+    with recorder_of(path) as recorder:
         assert recorder.stdout is not None
         assert "waiting for the controller" in recorder.stdout.readline()
         assert "nothing heard from 127.0.0.1 (0 packets from elsewhere)" in until_heard(recorder)
@@ -433,7 +426,7 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(
 def test_a_simulated_cell_has_no_link_to_record_from(tmp_path: Path, cell: Cell) -> None:
     (tmp_path / "cell.toml").write_text(cell.text)
     (tmp_path / "ns16.urdf").write_text(cell.urdf)
-    with running(*HIL, "record", tmp_path / "cell.toml", "-o", tmp_path / "a.mcap") as recorder:
+    with recorder_of(tmp_path / "cell.toml") as recorder:
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 2
     assert "controller.transport" in errors
