@@ -1,14 +1,16 @@
-"""What pages name exists; the API reference names what packages export."""
+"""What pages and findings name exists; the API reference names what packages export."""
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from tests.docs.typed import PAGES, ROOT
+from tests.docs.typed import PAGES, ROOT, command_of
 
 NAME = re.compile(r"`((?:hil|drivers|planner|identification|sim_fixtures)(?:\.\w+)+)(?:\(\))?`")
 FILES = ("py", "toml", "urdf", "mcap", "md", "json", "html", "dbc", "csv", "dot")
@@ -100,3 +102,29 @@ def test_the_reference_of_the_drivers_has_every_name() -> None:
         r"^\.\. auto(?:class|exception|function|data):: (?:[\w.]+\.)?(\w+)$", text, re.M
     )
     assert sorted(documented) == sorted(drivers.__all__)
+
+
+FINDINGS = ROOT / "identification" / "validation" / "findings.py"
+COMMAND = re.compile(r"`hil ([^`]+)`")
+
+
+def sentences(module: Path) -> Iterator[str]:
+    """The strings of a module; a figure in one of them is an X."""
+    for node in ast.walk(ast.parse(module.read_text("utf-8"))):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(getattr(part, "value", "X")) for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_commands_that_findings_recommend_exist() -> None:
+    """With their options, which are named nowhere else."""
+    named = []
+    for text in sentences(FINDINGS):
+        assert not re.search(r"--\w", COMMAND.sub("", text))
+        named += COMMAND.findall(text)
+    assert named
+    for line in named:
+        command, words = command_of(line.split())
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in words if word.startswith("-")} <= known, line

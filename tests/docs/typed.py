@@ -47,15 +47,25 @@ def _of_block(page: Path, block: str) -> list[list[str]]:
     return [shlex.split(_REDIRECTION.sub("", line), comments=True) for line in lines]
 
 
-def parse(arguments: Sequence[str]) -> None:
-    """Let the command line read the arguments of `hil`, and do nothing.
+def command_of(words: Sequence[str]) -> tuple[Any, list[str]]:
+    """The command that words behind `hil` name, and the rest of them.
+
+    Raises:
+        AssertionError: there is none.
+    """
+    command: Any = typer.main.get_command(app)
+    rest = list(words)
+    while hasattr(command, "commands"):
+        assert rest and rest[0] in command.commands, f"hil {' '.join(words)}: no such command"
+        command = command.commands[rest.pop(0)]
+    return command, rest
+
+
+def parse(words: Sequence[str]) -> None:
+    """Let the command line read words behind `hil`, and do nothing.
 
     Raises:
         Exception: it does not understand them.
     """
-    command: Any = typer.main.get_command(app)
-    words = list(arguments)
-    while hasattr(command, "commands"):
-        assert words and words[0] in command.commands, f"hil {' '.join(arguments)}: no such command"
-        command = command.commands[words.pop(0)]
-    command.make_context(command.name, words)
+    command, rest = command_of(words)
+    command.make_context(command.name, rest)

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
@@ -55,19 +55,26 @@ def far_end_at(udp: str | None = None, can: str | None = None) -> Any:
 
 @contextmanager
 def running(*command: object) -> Iterator[subprocess.Popen[str]]:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         list(map(str, command)),
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )  # fmt: skip
-    watchdog = threading.Timer(40.0, process.kill)  # a reader of its output gets an end of file
+    with watched(process.kill):  # a reader of its output gets an end of file
+        yield process
+    process.communicate()
+
+
+@contextmanager
+def watched(kill: Callable[[], object]) -> Iterator[None]:
+    """Kill after this, and after 40 s in any case."""
+    watchdog = threading.Timer(40.0, kill)
     watchdog.start()
     try:
-        yield process
+        yield
     finally:
         watchdog.cancel()
-        process.kill()
-        process.communicate()
+        kill()
 
 
 class Forked:
@@ -111,15 +118,10 @@ def _be_hil(command: list[str], out: int) -> None:
 @contextmanager
 def hil(*command: object) -> Iterator[Forked]:
     forked = Forked(*command)
-    watchdog = threading.Timer(40.0, forked.process.kill)  # then its reader gets an end of file
-    watchdog.start()
-    try:
+    with watched(forked.process.kill):
         yield forked
-    finally:
-        watchdog.cancel()
-        forked.process.kill()
-        forked.process.join(10)
-        forked.stdout.close()
+    forked.process.join(10)
+    forked.stdout.close()
 
 
 def last_json(text: str) -> dict[str, Any]:
@@ -197,45 +199,37 @@ def test_axes_open_one_after_the_other_as_asked():
     assert [state for state in theirs["story"] if state in openings] == openings
 
 
-def test_505_switches_the_drive_off_and_targets_beside_it_are_ignored():
-    ours, theirs = session(
-        ["--cycle", "2", *PATIENT],
-        ["--send-505", "40", "--exit-after", "0", "--wrong-targets"],
-        until=[opened(), OFF],
-    )
-    story = theirs["story"]
-    after = story[story.index(opened()) + 1 :]
-    assert after == [OFF, ENDED]  # and it stays off: nobody pressed the button
-    assert ours["reason"] == "the PC asked for drive off (505)"
-    assert theirs["travel"] < 1.0
-
-
-def test_508_closes_the_axes_and_targets_beside_it_are_ignored():
-    ours, theirs = session(
-        ["--cycle", "2", "--intervals", "1", *PATIENT],
-        ["--send-508", "40", "--exit-after", "0", "--wrong-targets"],
-    )
-    story = theirs["story"]
-    assert story[story.index(opened()) + 1] == CLOSED
-    assert ours["reason"] == "the PC reported a following error (508)"
-    assert theirs["travel"] < 1.0
+SILENT = ["--cycle", "2", "--intervals", "1", "--missed", "30", "--while-silent"]
+MISSING = ["--miss", "5", "--miss-count", "30"]
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "after"), [("hold", CLOSED), ("continue", CLOSED), ("drive-off", OFF)]
-)
-def test_missing_replies_end_open_mode(behaviour: str, after: str):
-    ours, theirs = session(
-        ["--cycle", "2", "--intervals", "1", "--missed", "30", "--while-silent", behaviour],
-        ["--miss", "5", "--miss-count", "30", "--exit-after", "0"],
-        until=[opened(), after],
-    )  # fmt: skip
+    ("controller", "pc", "after", "reason"),
+    [
+        # And it stays off: nobody pressed the button.
+        (["--cycle", "2", *PATIENT], ["--send-505", "40", "--wrong-targets"], OFF,
+         "the PC asked for drive off (505)"),
+        (["--cycle", "2", "--intervals", "1", *PATIENT], ["--send-508", "40", "--wrong-targets"],
+         CLOSED, "the PC reported a following error (508)"),
+        *(([*SILENT, how], MISSING, after, "no valid reply in 30 cycles of open mode")
+          for how, after in (("hold", CLOSED), ("continue", CLOSED), ("drive-off", OFF))),
+    ],
+    ids=["505", "508", "hold", "continue", "drive-off"],
+)  # fmt: skip
+def test_what_ends_open_mode(controller, pc, after, reason):
+    """Targets beside 505 and 508 are ignored."""
+    ours, theirs = session(controller, [*pc, "--exit-after", "0"], until=[opened(), after])
     story = theirs["story"]
     later = [state for state in story[story.index(opened()) + 1 :] if "[4" not in state]
     assert later[0] == after
-    assert theirs["seen"]["kept silent"] >= 20
-    assert ours["reason"] == "no valid reply in 30 cycles of open mode"
-    assert ours["missed"] >= 30
+    assert ours["reason"] == reason
+    if pc is MISSING:
+        assert theirs["seen"]["kept silent"] >= 20
+        assert ours["missed"] >= 30
+    else:
+        assert theirs["travel"] < 1.0
+    if after == OFF and pc is not MISSING:
+        assert later == [OFF, ENDED]
 
 
 def test_the_controller_waits_for_a_program_that_starts_later():
@@ -433,29 +427,19 @@ def test_a_bus_is_named_as_python_can_names_it():
         far_end_at(can="no-such-bus:0")
 
 
-def test_bad_input_is_one_sentence_and_exit_status_2():
-    done = subprocess.run(
-        [sys.executable, "-m", "hil", "simulate", str(CELL_PATH), "--udp", "127.0.0.1"],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "HOST:PORT" in done.stderr
+class TestButtons:
+    def test_the_first_signal_asks_for_the_end_and_the_second_gives_up(self):
+        buttons = Buttons()
+        assert buttons.request() is Request.GO_ON
+        buttons.press(signal.SIGINT)
+        assert buttons.request() is Request.END
+        buttons.press(signal.SIGTERM)
+        assert buttons.request() is Request.GIVE_UP
 
-
-def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
-    buttons = Buttons()
-    assert buttons.request() is Request.GO_ON
-    buttons.press(signal.SIGINT)
-    assert buttons.request() is Request.END
-    buttons.press(signal.SIGTERM)
-    assert buttons.request() is Request.GIVE_UP
-
-
-def test_a_duration_that_is_over_asks_for_the_end_but_is_no_interrupt():
-    buttons = Buttons(duration=0.0)
-    assert buttons.request() is Request.END
-    assert not buttons.interrupted
+    def test_a_duration_that_is_over_asks_for_the_end_but_is_no_interrupt(self):
+        buttons = Buttons(duration=0.0)
+        assert buttons.request() is Request.END
+        assert not buttons.interrupted
 
 
 def test_every_phase_of_the_controller_has_words():
