@@ -7,9 +7,11 @@ import gc
 import os
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 from typing import Final, Literal
 
@@ -176,22 +178,18 @@ class Served:
     """How a session on a real link came out.
 
     Attributes:
+        controller: that of the last start.
         summary: counts and times of the last start and what followed it.
-        phase: what the controller was doing at the end.
-        reason: why the session ended or the drive was last lost; "" if neither.
         intervals: how often all axes have been open.
         starts: how often the start was begun.
         foreign: datagrams from elsewhere; 0 where the link cannot tell.
-        gave_up: whether the controller ended the session because too many openings were lost.
     """
 
+    controller: SimulatedController
     summary: Tally
-    phase: Phase
-    reason: str
     intervals: int
     starts: int
     foreign: int
-    gave_up: bool = False
 
 
 def serve_session(
@@ -223,53 +221,36 @@ def serve_session(
     while True:
         starts += 1
         controller = build()
-        record = _Observed(controller, pressed, watch)
+        entered: Counter[Phase] = Counter()
+        observe = partial(_observe, controller, entered, [controller.phase], pressed, watch)
         try:
             summary = serve(
-                controller, far_end, faults=faults, request=pressed.request, watch=record.observe,
+                controller, far_end, faults=faults, request=pressed.request, watch=observe,
                 patience=patience, stretch=stretch,
             )  # fmt: skip
         except DriverError as error:
             raise InputError(None, str(error)) from error
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
-        if record.started or not summary.ended or pressed.request() is not Request.GO_ON:
-            return Served(
-                summary,
-                phase=controller.phase,
-                reason=controller.reason,
-                intervals=record.intervals,
-                starts=starts,
-                foreign=getattr(far_end, "foreign", 0),
-                gave_up=controller.gave_up,
-            )
+        if entered[Phase.DRIVE_OFF] or not summary.ended or pressed.request() is not Request.GO_ON:
+            foreign = getattr(far_end, "foreign", 0)
+            return Served(controller, summary, entered[Phase.OPEN], starts, foreign)
         until = time.monotonic() + KNOCK_INTERVAL
         while time.monotonic() < until and pressed.request() is Request.GO_ON:
             time.sleep(0.05)
 
 
-class _Observed:
-    """What one start has come to, seen cycle by cycle."""
-
-    def __init__(
-        self,
-        controller: SimulatedController,
-        pressed: Buttons,
-        watch: Callable[[SimulatedController, Tally], None],
-    ) -> None:
-        self.started = False
-        self.intervals = 0
-        self._controller = controller
-        self._pressed = pressed
-        self._watch = watch
-        self._phase = controller.phase
-
-    def observe(self, tally: Tally) -> None:
-        """Note the phase, pass buttons on, show the counts."""
-        phase = self._controller.phase
-        if phase is not self._phase:
-            self._phase = phase
-            self.started = self.started or phase is Phase.DRIVE_OFF
-            self.intervals += phase is Phase.OPEN
-        self._pressed.pass_on(self._controller)
-        self._watch(self._controller, tally)
+def _observe(
+    controller: SimulatedController,
+    entered: Counter[Phase],
+    phase: list[Phase],
+    pressed: Buttons,
+    watch: Callable[[SimulatedController, Tally], None],
+    tally: Tally,
+) -> None:
+    """Count phases as they are entered (`phase` holds the last one); pass on the buttons."""
+    if controller.phase is not phase[0]:
+        phase[0] = controller.phase
+        entered[phase[0]] += 1
+    pressed.pass_on(controller)
+    watch(controller, tally)

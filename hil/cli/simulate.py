@@ -297,7 +297,7 @@ def simulate(
         typer.echo(printable("\n".join(_sentences(served))))
     if not served.summary.ended and pressed.interrupted:
         raise typer.Exit(130)
-    if served.gave_up or not served.summary.ended:
+    if served.controller.gave_up or not served.summary.ended:
         raise typer.Exit(4)
 
 
@@ -325,15 +325,15 @@ def _figures(served: Served) -> dict[str, object]:
         "foreign": served.foreign,
         "intervals": served.intervals,
         "starts": served.starts,
-        "phase": served.phase.name.lower(),
-        "reason": served.reason,
+        "phase": served.controller.phase.name.lower(),
+        "reason": served.controller.reason,
         **times,
     }
 
 
 def _sentences(served: Served) -> list[str]:
     """The summary for a person."""
-    summary = served.summary
+    summary, reason = served.summary, served.controller.reason
     stretched = (
         f"; {plural(summary.stretched, 'cycle')} stretched to wait for an answer, by up to "
         f"{1e3 * summary.stretch_max:.1f} ms, as no real controller does"
@@ -342,8 +342,7 @@ def _sentences(served: Served) -> list[str]:
         return [f"no PC program answered; the first packet was sent {_times(summary.knocks)}"]
     end = "the session has ended (504)" if summary.ended else "the session was given up"
     return [
-        f"{end}{': ' if served.reason else ''}{served.reason}; "
-        f"open mode was reached {_times(served.intervals)}",
+        f"{end}{': ' if reason else ''}{reason}; open mode was reached {_times(served.intervals)}",
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
         f"{served.foreign} from elsewhere{stretched if summary.stretched else ''}",
