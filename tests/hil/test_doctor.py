@@ -49,7 +49,6 @@ from hil.doctor.diagnosis import (
 from hil.doctor.machine import DiskTrial, disk_checks
 from hil.progress import Silent
 from sim_fixtures.ns16 import CELL_PATH
-from tests.hil.doctor.conftest import Tree
 
 samples = st.lists(st.floats(0.0, 0.01), min_size=1, max_size=50)
 
@@ -381,6 +380,28 @@ def test_what_was_really_given_is_reported() -> None:
 
 
 # --- judgements: files in place of /proc and /sys, canned answers of commands -----------------
+class Tree:
+    """A made-up system below a folder; a command without a canned answer is not installed."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def write(self, files: dict[str, str]) -> Tree:
+        for name, text in files.items():
+            path = self.root / name.lstrip("/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return self
+
+    def system(self, **commands: Answer) -> System:
+        return System(self.root, lambda command: commands.get(command[0]))
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Tree:
+    return Tree(tmp_path)
+
+
 ALL = RealTimeReport("SCHED_FIFO 50", True, True)
 PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now is locked (…)",))
 NOTHING = RealTimeReport("ordinary", False, False)
