@@ -12,9 +12,8 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
-from drivers.transports.simulated import SimulatedTransport
 from hil import weighing
-from hil.campaign import Campaign, Stop, design
+from hil.campaign import Campaign
 from hil.campaign.link import Link
 from hil.cell import Cell, CellError
 from hil.cli import app
@@ -23,7 +22,7 @@ from hil.identify.options import FIXED
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.importers import ColumnMap, Robot, import_log
 from hil.progress import Silent
-from hil.simulation import carrying, simulated_controller, simulated_provenance
+from hil.simulation import carrying
 from identification import FrictionLaw, IdentificationError
 from identification.model.kinematics import pinocchio_model
 from tests.docs.test_commands import QUICK
@@ -223,6 +222,10 @@ class TestRun:
         low, high = pairs["figures"]["mass"]["interval"]
         assert pairs["figures"]["mass"]["value"] == pytest.approx(2.0, rel=0.02)
         assert 0.0 < high - low < 0.2
+        low, high = pairs["figures"]["cx"]["interval"]
+        assert low < 0.3 < high
+        assert pairs["frame"] == "fore"
+        assert set(pairs["undetermined"]) >= {"cy", "Ixy", "Iyz"}
 
     def test_each_side_is_a_campaign_that_was_seen_slowly(
         self, designed: Campaign, pairs: dict[str, Any]
@@ -311,32 +314,3 @@ class TestRun:
     def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(CellError, match=r"simulation\.payload"):
             carrying(fast_cell(tmp_path))
-
-
-class TestCampaigns:
-    def test_campaigns_of_a_simulated_cell_give_its_load(self, tmp_path: Path) -> None:
-        """Through the controller's link: the arm carries 2 kg that its cell file does not know."""
-        load = (
-            '<link name="load"><inertial><mass value="2"/><origin xyz="0.3 0 0.05"/><inertia '
-            'ixx="0.004" iyy="0.006" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-            '<joint name="mount" type="fixed"><parent link="fore"/><child link="load"/></joint>'
-            "</robot>"
-        )
-        cell = fast_cell(tmp_path, repetitions=2)
-        heavier = Cell.from_texts(cell.text, cell.urdf.replace("</robot>", load), cell.path)
-        plan = design(cell, Silent())
-        for seed, (name, arm) in enumerate({"bare": cell, "loaded": heavier}.items(), 1):
-            controller = simulated_controller(arm, seed=seed)
-            Campaign.create(tmp_path / name, cell, plan).run(
-                Link.over(SimulatedTransport(controller), cell, finish=controller.finish),
-                Stop(),
-                Silent(),
-                provenance=simulated_provenance(cell, False),
-                durable=False,
-                unrehearsed=True,
-            )
-        found = find_payload([tmp_path / "bare"], [tmp_path / "loaded"], Silent(), options=FIXED)
-        assert found.figures[0] == pytest.approx(2.0, rel=0.05)
-        assert found.frame == "fore"
-        assert set(found.estimate.undetermined) >= {"cy", "Ixy", "Iyz"}
-        assert not found.outside({"cx": 0.3})
