@@ -23,8 +23,7 @@ from hil import Campaign, Cell
 from hil.campaign import Stop, design
 from hil.campaign.operator import RunStatus
 from hil.progress import Silent, reporter
-from hil.screen import Screen
-from hil.screen.layout import Shown, lines
+from hil.screen import Screen, Shown, lines
 
 HERE: Final = Path(__file__).parent
 COLUMNS, ROWS = 80, 24

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
-from hil.campaign.controller_limits import checks_in_force
 from hil.campaign.errors import MotionRefusedError
-from hil.campaign.intervals import at_limit, beyond, player_of
-from hil.campaign.motion_link import MotionLink
+from hil.campaign.intervals import Interval, player_of, way
+from hil.campaign.motion_link import MotionLink, checks_in_force
 from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
 from hil.recording import archive_spec, kind_entry, origin_of
-from planner import Move, PiecewiseCubic, PlanFile, in_child, plan_moves
+from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]
 
+_ROUND: Final = 0.1
+"""deg; via points drawn at random are as round as those a person teaches."""
 THERE = 1e-4
 """rad; an arm that is so near to a posture is there."""
 
@@ -34,25 +36,49 @@ class Way:
     Attributes:
         start: (n,) rad, where the arm stood when it was planned.
         target: (n,) rad.
-        trajectory: the motion.
-        moves: what it was planned from.
+        interval: the motion, and what it was planned from.
         speed: fraction of the joints' speeds.
         checks: that it passed.
-        not_checked: what the check of contacts leaves out, in words; "" for nothing.
     """
 
     start: Array
     target: Array
-    trajectory: PiecewiseCubic
-    moves: PlanFile
+    interval: Interval
     speed: float
     checks: MotionChecks
-    not_checked: str = ""
+
+    @property
+    def trajectory(self) -> PiecewiseCubic | FourierSeries:
+        """The motion."""
+        return self.interval.trajectory
 
     @property
     def duration(self) -> float:
         """How long it takes at full speed [s]."""
         return self.trajectory.duration
+
+    @property
+    def not_checked(self) -> str:
+        """What the check of contacts leaves out, in words; "" for nothing."""
+        return self.checks.not_checked or ""
+
+
+def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
+    """The home posture, or the middle of the limits, and points within the limits (1 + m, n) [rad].
+
+    Args:
+        cell: whose limits.
+        frame: angles in which they are round.
+        count: points m.
+        seed: the same gives the same points.
+    """
+    limits = cell.joint_limits
+    ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
+    shares = np.random.default_rng(seed).random((count, limits.n_joints))
+    shown = ends[0] + shares * (ends[1] - ends[0])
+    shown = np.clip(np.round(shown / _ROUND) * _ROUND, *ends)
+    home = cell.home if cell.file.campaign is not None else (limits.lower + limits.upper) / 2.0
+    return np.vstack((home, frame.urdf(shown)))
 
 
 def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Array:
@@ -108,11 +134,6 @@ def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
 def joint_index(cell: Cell, joint: str, field: str) -> int:
     """Index, from 0, of a joint given by its name, or its number from 1.
 
-    Args:
-        cell: whose arm.
-        joint: which.
-        field: where it was typed.
-
     Raises:
         InputError: there is no such joint.
     """
@@ -131,10 +152,6 @@ def joint_index(cell: Cell, joint: str, field: str) -> int:
 
 def axis_alone(cell: Cell, joint: str | None) -> int:
     """Number, from 1, of the axis that moves a joint by itself.
-
-    Args:
-        cell: whose arm.
-        joint: see `joint_index`; None where none is named.
 
     Raises:
         InputError: no joint is named, or a wrist coupling turns further motors with it.
@@ -179,20 +196,13 @@ def straight_way(
     """
     checks = checks or MotionChecks.of(cell)
     speed = cell.campaign.approach_speed if speed is None else speed
-    if (beyond_limits := beyond(cell, start)) is not None:
-        raise MotionRefusedError("the way", beyond_limits, "jog the arm to within [limits]")
-    if (outside := beyond(cell, target, "would go to")) is not None:
-        raise MotionRefusedError("the way", outside, "name a posture within [limits]")
-    limits = cell.joint_limits
-    to = Move(at_limit(target, limits), speed=speed)
-    motion = in_child(plan_moves, at_limit(start, limits), (to,), limits)
-    _require(checks, motion.trajectory)
-    moves = PlanFile.of(motion, cell.joint_names)
-    return Way(start, target, motion.trajectory, moves, speed, checks, checks.not_checked or "")
+    planned = way(cell, start, target, speed)
+    _require(checks, planned.trajectory)
+    return Way(start, target, planned, speed, checks)
 
 
 def send(
-    way: Way,
+    planned: Way,
     cell: Cell,
     link: MotionLink,
     path: Path,
@@ -204,7 +214,7 @@ def send(
     """Run a way on a connected link and archive every cycle of it.
 
     Args:
-        way: what passed its checks.
+        planned: what passed its checks.
         cell: travels in the archive.
         link: connected.
         path: of the archive, which must not exist.
@@ -218,21 +228,20 @@ def send(
         ControllerFault: it was not accepted (nothing moved), or the link broke.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
     """
-    checks = checks_in_force(cell, link.connection, way.checks)
-    if checks is not way.checks:
-        _require(checks, way.trajectory)
+    checks = checks_in_force(cell, link.connection, planned.checks)
+    if checks is not planned.checks:
+        _require(checks, planned.trajectory)
     spec = archive_spec(
         cell,
         path,
         {**kind_entry(path, "move"), **origin_of(cell, only_simulated=link.only_simulated)},
-        {"trajectory": way.trajectory.to_dict(), **moves_to_dict(way.moves)},
+        {"trajectory": planned.trajectory.to_dict(), **moves_to_dict(planned.interval.moves)},
         durable=durable,
     )
-    return link.run(player_of(cell, way.trajectory), spec, stop, watch=watch)
+    return link.run(player_of(cell, planned.trajectory), spec, stop, watch=watch)
 
 
-def _require(checks: MotionChecks, trajectory: PiecewiseCubic) -> None:
-    problem = checks.refusal(trajectory)
-    if problem is not None:
+def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:
+    if (problem := checks.refusal(trajectory)) is not None:
         remedy = "go slower or by way of another posture, or jog the arm"
         raise MotionRefusedError("the way", problem, remedy)

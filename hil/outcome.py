@@ -85,12 +85,6 @@ def report_replay(
 ) -> None:
     """Add a replay to the report in a folder, if it has the same parameters.
 
-    Args:
-        folder: with results, series and report.
-        results: of the identification that was replayed.
-        replay: adds its series.
-        reporter: says where it is, or why it is not.
-
     Raises:
         InputError: results or series cannot be read.
         OutputError: the folder cannot be written to.

@@ -13,7 +13,6 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -41,6 +40,13 @@ def say(text: str, *, err: bool = False) -> None:
     put(Console(stderr=err), text)
 
 
+class Task(Protocol):
+    """The running piece of work."""
+
+    def advance(self, units: float, note: str = "") -> None:
+        """`units` more are done; `note` says what is being done now."""
+
+
 class Reporter(Protocol):
     """What long work tells a person."""
 
@@ -52,11 +58,15 @@ class Reporter(Protocol):
         """A piece of work of `total` units; advance it through the yielded task."""
 
 
-class Task(Protocol):
-    """The running piece of work."""
+class _Advancing:
+    """A task that passes on how much is done by now, of so many units."""
+
+    def __init__(self, show: Callable[[float, str], None]) -> None:
+        self._show, self._done = show, 0.0
 
     def advance(self, units: float, note: str = "") -> None:
-        """`units` more are done; `note` says what is being done now."""
+        self._done += units
+        self._show(self._done, note)
 
 
 class Silent:
@@ -67,17 +77,21 @@ class Silent:
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A task nobody sees."""
-        del title, total
-        yield _SilentTask()
+        """A line for `title`, and for every tenth of the way."""
+        self.say(title)
+        said = 0
+
+        def show(done: float, note: str) -> None:
+            nonlocal said
+            tenth = int(10 * done / max(total, 1e-12) + 1e-9)
+            if tenth > said:
+                said = tenth
+                self.say(f"{title}: {10 * tenth} %  {note}".rstrip())
+
+        yield _Advancing(show)
 
 
-class _SilentTask:
-    def advance(self, units: float, note: str = "") -> None:
-        del units, note
-
-
-class LineReporter:
+class LineReporter(Silent):
     """One line per tenth of a task: for logs and pipes."""
 
     def __init__(self) -> None:
@@ -87,25 +101,6 @@ class LineReporter:
         """Print the line at once."""
         self._out.write(printable(text) + "\n")
         self._out.flush()
-
-    @contextmanager
-    def task(self, title: str, total: float) -> Iterator[Task]:
-        """Print `title` and every tenth of the way."""
-        self.say(title)
-        yield _PlainTask(self, title, total)
-
-
-class _PlainTask:
-    def __init__(self, reporter: LineReporter, title: str, total: float) -> None:
-        self._reporter, self._title, self._total = reporter, title, max(total, 1e-12)
-        self._done, self._said = 0.0, 0
-
-    def advance(self, units: float, note: str = "") -> None:
-        self._done += units
-        tenth = int(10 * self._done / self._total + 1e-9)
-        if tenth > self._said:
-            self._said = tenth
-            self._reporter.say(f"{self._title}: {10 * tenth} %  {note}".rstrip())
 
 
 class Bar:
@@ -133,7 +128,12 @@ class Bar:
             expand=True,
         )
         with progress:
-            yield _BarTask(progress, progress.add_task(title, total=round(total), note=""))
+            task = progress.add_task(title, total=round(total), note="")
+
+            def show(done: float, note: str) -> None:
+                progress.update(task, completed=round(done), note=printable(note, keep=""))
+
+            yield _Advancing(show)
 
 
 class _WithNote(Progress):
@@ -149,16 +149,6 @@ class _WithNote(Progress):
 def _whole(column: Callable[..., ProgressColumn], *arguments: str) -> ProgressColumn:
     """Return a column that gives up none of its text for others."""
     return column(*arguments, table_column=Column(no_wrap=True))
-
-
-class _BarTask:
-    def __init__(self, progress: Progress, task: TaskID) -> None:
-        self._progress, self._task, self._done = progress, task, 0.0
-
-    def advance(self, units: float, note: str = "") -> None:
-        self._done += units
-        shown = printable(note, keep="")
-        self._progress.update(self._task, completed=round(self._done), note=shown)
 
 
 def reporter(*, quiet: bool = False) -> Reporter:

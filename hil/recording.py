@@ -6,22 +6,24 @@ import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.archive import CONTROLLERS_OWN, ArchiveName, ArchiveSpec
-from hil.campaign import Recorded, Stop
-from hil.campaign.motion_link import Recording, Watch, unwatched
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import make_folder
 from hil.version import software
+
+if TYPE_CHECKING:
+    from hil.campaign.motion_link import MotionLink, Recorded, Watch
+    from hil.campaign.operator import Stop
 
 KINDS = ("excitation", "validation", "standstill")
 """What a recording can be used for."""
 
 
 def record(
-    link: Recording,
+    link: MotionLink,
     cell: Cell,
     path: Path,
     *,
@@ -29,7 +31,7 @@ def record(
     stop: Stop,
     duration: float | None = None,
     wait: float | None = None,
-    watch: Watch = unwatched,
+    watch: Watch = lambda _: None,
     durable: bool = True,
 ) -> Recorded:
     """Record what the controller does, from its first cycle on. No motion is ever requested.

@@ -13,8 +13,7 @@ from .link import Link
 from .live_link import LiveLink
 from .motion_link import MotionLink, Progress, Recorded
 from .operator import Stop, stop_on_interrupt
-from .plan import CampaignPlan, PlannedMotion
-from .quick_design import design, plan_around
+from .plan import CampaignPlan, PlannedMotion, design, plan_around
 
 __all__ = [
     "Campaign",

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from hil.archive.live import LiveView
 from hil.cell import Cell
 from hil.design.run import DESIGN_FILES
-from hil.errors import InputError, OutputError
+from hil.errors import HilError, InputError, OutputError
 from hil.files import make_folder, write_atomically
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
@@ -24,8 +25,7 @@ from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
 from .motion_link import MotionLink
 from .operator import Operator, Stop, Unattended
-from .plan import CampaignPlan
-from .quick_design import plan_around
+from .plan import CampaignPlan, plan_around
 from .rehearsal import Rehearsal
 from .status import CampaignStatus, status_of
 
@@ -34,10 +34,6 @@ if TYPE_CHECKING:
     from sim_fixtures import SimulatedDrive
 
     from .run import RunResult
-
-import shutil
-
-from hil.errors import HilError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,16 +73,16 @@ class Campaign:
             WrongObjectError: it was given something that is no cell or no excitation.
             OutputError: the disk refuses; the folder is as it was.
         """
-        root = _path(folder)
-        _require(cell, "cell", (Cell,), "give one that was loaded (`hil.Cell.load(path)`)")
-        _require(
-            excitation,
-            "excitation",
-            (Excitation, CampaignPlan),
-            "give an Excitation (`hil.design.load_design(folder, cell)`, `hil.campaign.design`) or "
-            "a CampaignPlan",
-        )
-        plan = excitation
+        root, plan = _path(folder), excitation
+        if not isinstance(cell, Cell):
+            remedy = "give one that was loaded (`hil.Cell.load(path)`)"
+            raise WrongObjectError("cell", cell, remedy)
+        if not isinstance(plan, Excitation | CampaignPlan):
+            remedy = (
+                "give an Excitation (`hil.design.load_design(folder, cell)`, "
+                "`hil.campaign.design`) or a CampaignPlan"
+            )
+            raise WrongObjectError("excitation", plan, remedy)
         if exist_ok and CampaignFolder(root).plan.exists():
             return cls.open(root)._if_of(cell, plan)
         if isinstance(plan, Excitation):
@@ -140,7 +136,8 @@ class Campaign:
         if isinstance(wanted, CampaignPlan):
             fits = self.plan.to_text() == wanted.to_text()
         else:
-            fits = json.dumps(self.plan.excitation.to_dict()) == json.dumps(wanted.to_dict())
+            mine = self.plan.excitation.trajectory.to_dict()
+            fits = json.dumps(mine) == json.dumps(wanted.trajectory.to_dict())
         if not same or not fits:
             what = "excitation" if same else "cell"
             raise CampaignFolderError(
@@ -279,38 +276,30 @@ class Campaign:
             CampaignFolderError: the folder was changed, or another run is at work on it.
             OutputError: what came of it cannot be written down.
         """
-        from .execution import execute  # which knows campaigns
-        from .run import Run
+        from .run import Run  # which `hil status` does not need
 
-        return execute(
-            Run(
-                self,
-                link,
-                stop or Stop(),
-                reporter or Silent(),
-                operator or Unattended(),
-                said=provenance,
-                durable=durable,
-                unrehearsed=unrehearsed,
-                dry_run_only=dry_run_only,
-                accept_dry_run=accept_dry_run,
-                accept_torque=tuple(accept_torque),
-                live=live,
-                repetitions=repetitions,
-            )
-        )
+        return Run(
+            self,
+            link,
+            stop or Stop(),
+            reporter or Silent(),
+            operator or Unattended(),
+            said=provenance,
+            durable=durable,
+            unrehearsed=unrehearsed,
+            dry_run_only=dry_run_only,
+            accept_dry_run=accept_dry_run,
+            accept_torque=tuple(accept_torque),
+            live=live,
+            repetitions=repetitions,
+        ).execute()
 
 
 def _path(folder: object) -> Path:
     """A folder as the caller names it."""
-    _require(folder, "folder", (str, PathLike), "give the path of a folder")
-    return Path(cast("str | PathLike[str]", folder))
-
-
-def _require(given: object, name: str, kinds: tuple[type, ...], remedy: str) -> None:
-    """Refuse what is of another type than was asked for."""
-    if not isinstance(given, kinds):
-        raise WrongObjectError(name, given, remedy)
+    if not isinstance(folder, str | PathLike):
+        raise WrongObjectError("folder", folder, "give the path of a folder")
+    return Path(folder)
 
 
 _OURS = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)
@@ -344,9 +333,8 @@ def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campai
     _ = cell.controller  # named before anything is drawn
     folder = CampaignFolder(root)
     if folder.sealed:
-        there = _there(root)
-        if there is not None and _same(there, cell, excitation):
-            return there
+        with suppress(HilError):
+            return Campaign.create(root, cell, excitation, exist_ok=True)
         require_replaceable(root)
         with folder.locked():
             for name in _OURS:
@@ -354,16 +342,3 @@ def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campai
             shutil.rmtree(folder.archives, ignore_errors=True)
             shutil.rmtree(folder.rehearsed, ignore_errors=True)
     return Campaign.create(root, cell, excitation)
-
-
-def _there(root: Path) -> Campaign | None:
-    try:
-        return Campaign.open(root)
-    except HilError:
-        return None
-
-
-def _same(there: Campaign, cell: Cell, excitation: Excitation) -> bool:
-    own = cell.with_urdf(there.folder.cell, there.folder.urdf.name)
-    mine, theirs = (one.trajectory.to_dict() for one in (excitation, there.plan.excitation))
-    return (there.cell.text, there.cell.urdf, theirs) == (own.text, own.urdf, mine)

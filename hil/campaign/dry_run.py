@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import getpass
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, Self
@@ -16,22 +15,38 @@ from numpy.typing import NDArray
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, OperatorStopError
-from hil.files import write_or_tell
-from hil.reading import json_of, lies_there, text_of
 
-from .errors import AgainstGravityError, CampaignFolderError, DryRunError
-from .folder import CampaignFolder, read_back
+from .errors import AgainstGravityError, DryRunError
+from .folder import CampaignFolder, load_record, save_record
 from .intervals import Interval
 
 if TYPE_CHECKING:
-    from .run import Run
-    from .runner import Runner
+    from .run import Run, Runner
 
 Array = NDArray[np.float64]
+DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 SIMULATED: Final = "simulated"
 """Metadata: whether nothing but a simulated arm can have moved, "yes" or "no". The link says so,
 whatever the caller of a run says."""
+OVERRIDE: Final = 0.2
+"""Largest share of the planned speed."""
+FORMAT_VERSION: Final = 2
+"""1 did not look at torques."""
+_FIELDS: Final = (
+    *("cycle", "gap", "position", "target_position", "target_current", "torque"),
+    "commanded_position",
+)
+AGAINST: Final = (
+    "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
+)
+CLEAR: Final = 0.5
+"""Correlation from which torque and gravity belong together, or against each other."""
+_LEAST_SHARE: Final = 0.05
+"""Gravity as a share of the rms torque below which the joint has none to speak of."""
+_LEAST_SAMPLES: Final = 100
+_STEP: Final = 0.01
+"""s between samples whose torque is looked at."""
 
 
 def said_of(only_simulated: bool) -> str:
@@ -47,69 +62,14 @@ def made_by(path: Path, only_simulated: bool) -> bool:
         return False
 
 
-DryRunState = Literal["accepted", "to be accepted", "left out"]
-
-OVERRIDE: Final = 0.2
-"""Largest share of the planned speed."""
-FORMAT_VERSION: Final = 2
-"""1 did not look at torques."""
-_FIELDS: Final = ("cycle", "gap", "position", "target_position", "target_current")
-
-
-AGAINST: Final = (
-    "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
-)
-CLEAR: Final = 0.5
-"""Correlation from which torque and gravity belong together, or against each other."""
-_LEAST_SHARE: Final = 0.05
-"""Gravity as a share of the rms torque below which the joint has none to speak of."""
-_LEAST_SAMPLES: Final = 100
-_STEP: Final = 0.01
-"""s between samples that are looked at."""
-_GRAVITY_FIELDS: Final = ("position", "commanded_position", "torque")
-
-
-@dataclass(frozen=True)
-class GravityCheck:
-    """What slow motion says of the sign of each joint's torque.
-
-    At a fifth of full speed inertia is next to nothing: what a joint's torque is beside friction is
-    gravity. The measured torque is regressed on the nominal model's gravity with Coulomb and
-    viscous friction beside it; the correlation of what friction leaves of both tells whether they
-    agree. A torque of the wrong sign, a `joint_sign` or zero position that mirrors the arm, or
-    masses that are not there make it negative. There is no constant beside them: the sign of a
-    weight that hardly changes counts as well.
-
-    Attributes:
-        against: joints whose torque runs against the model's gravity.
-        not_seen: joints with too little gravity, beside friction, to tell.
-    """
-
-    against: tuple[str, ...]
-    not_seen: tuple[str, ...]
-
-    @classmethod
-    def of(cls, cell: Cell, paths: Sequence[Path]) -> GravityCheck:
-        """What the archives of a dry run say.
-
-        Raises:
-            ArchiveError: one of them cannot be read.
-        """
-        parts = [_slow_motion(path, cell.period) for path in paths]
-        q, qd, torque = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        still, model = np.zeros_like(q), cell.model
-        rigid = np.where(model.friction_columns, 0.0, cell.nominal_values())
-        gravity = model.torque(rigid, q, still, still) + model.load_torque(q, still, still)
-        found = agreement(gravity, torque, qd, model.moving(qd))
-        names = np.array(cell.joint_names)
-        return cls(
-            against=tuple(names[found < -CLEAR].tolist()),
-            not_seen=tuple(names[~(np.abs(found) >= CLEAR)].tolist()),
-        )
-
-
 def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np.bool_]) -> Array:
     """Correlation of gravity and torque beside friction, -1 to 1, for each joint (n,).
+
+    At a fifth of full speed inertia is next to nothing: what a joint's torque is beside friction is
+    gravity. Both are regressed on Coulomb and viscous friction, and what that leaves of them is
+    compared. A torque of the wrong sign, a `joint_sign` or zero position that mirrors the arm, or
+    masses that are not there make the correlation negative. There is no constant beside them: the
+    sign of a weight that hardly changes counts as well.
 
     Args:
         gravity: by the model (m, n) [N·m].
@@ -136,27 +96,9 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
     return found
 
 
-def _slow_motion(path: Path, period: float) -> tuple[Array, Array, Array]:
-    """Position, planned velocity and torque (m, n) of one archive, each every `_STEP`."""
-    columns = open_archive(path, fields=_GRAVITY_FIELDS).recorded(*_GRAVITY_FIELDS)
-    commanded = columns["commanded_position"]
-    step = max(1, round(_STEP / period))
-    rows = np.flatnonzero(~np.isnan(commanded).any(axis=1))[::step]
-    if len(rows) < 2:
-        empty = np.zeros((0, commanded.shape[1]))
-        return empty, empty, empty
-    velocity = np.gradient(commanded[rows], step * period, axis=0)
-    return columns["position"][rows], velocity, columns["torque"][rows]
-
-
 @dataclass(frozen=True)
 class Acceptance:
-    """Who accepted a dry run, and when.
-
-    Attributes:
-        by: name of the user on this computer.
-        at: time of day, ISO 8601.
-    """
+    """Who accepted a dry run: name of the user on this computer, and time of day, ISO 8601."""
 
     by: str
     at: str
@@ -211,32 +153,20 @@ class DryRun:
 
     @classmethod
     def load(cls, folder: CampaignFolder, plan_hash: str | None = None) -> Self | None:
-        """That of a plan, as it was written down; None where there is none.
-
-        Args:
-            folder: of the campaign.
-            plan_hash: of the plan; the folder's as it lies there if left out.
+        """That of a plan (of the folder, if left out), as it was written down; None without one.
 
         Raises:
             CampaignFolderError: the file is damaged, or of another version.
         """
-        path = folder.dry_run
-        if not lies_there(path):
-            return None
-        try:
-            text = text_of(path)
-            version = json_of(text)["format_version"]
-            if version != FORMAT_VERSION:
-                raise ValueError(f"format version {version}, this is {FORMAT_VERSION}")
-            found = read_back(cls, text)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CampaignFolderError(
-                path.parent,
-                f"{path.name} is damaged, or of another version ({error})",
-                "remove it; its archives are looked at again, or the dry run is done again",
-            ) from error
-        now = folder.plan_hash if plan_hash is None else plan_hash
-        return found if found.plan_hash == now else None
+        found = load_record(
+            cls,
+            folder.dry_run,
+            "is damaged, or of another version",
+            "remove it; its archives are looked at again, or the dry run is done again",
+            version=FORMAT_VERSION,
+        )
+        now = folder.plan_hash if plan_hash is None and found is not None else plan_hash
+        return found if found is not None and found.plan_hash == now else None
 
     @classmethod
     def that_counts(
@@ -246,12 +176,6 @@ class DryRun:
 
         What a simulated arm did says nothing of the room around a real one, and a file that was
         copied, or whose archives are gone, says nothing at all.
-
-        Args:
-            folder: of the campaign.
-            plan_hash: of the plan.
-            motions: that are to be run slowly.
-            simulated: whether nothing but a simulated arm can move now.
 
         Raises:
             CampaignFolderError: the file is damaged, or of another version.
@@ -276,19 +200,13 @@ class DryRun:
     ) -> Self:
         """What the archives of a dry run say.
 
-        Args:
-            folder: of the campaign.
-            cell: of the campaign.
-            names: of the archives, one for each motion.
-            plan_hash: of the plan that was run.
-            simulated: whether nothing but a simulated arm can have moved.
-
         Raises:
             ArchiveError: one of them cannot be read.
         """
-        limit = cell.drive_train.current_limit
+        limit, step = cell.drive_train.current_limit, max(1, round(_STEP / cell.period))
         current, following = np.zeros(len(limit)), np.zeros(len(limit))
         missed = late = cycles = 0
+        slow: list[tuple[Array, Array, Array]] = []
         for name in names:
             archive = open_archive(folder.archives / name, fields=_FIELDS)
             columns = archive.recorded(*_FIELDS)
@@ -299,7 +217,19 @@ class DryRun:
             if archive.outcome is not None:
                 late += archive.outcome.late_replies or 0
             cycles += archive.n_samples
-        gravity = GravityCheck.of(cell, [folder.archives / name for name in names])
+            commanded = columns["commanded_position"]
+            rows = np.flatnonzero(~np.isnan(commanded).any(axis=1))[::step]
+            if len(rows) > 1:
+                velocity = np.gradient(commanded[rows], step * cell.period, axis=0)
+                slow.append((columns["position"][rows], velocity, columns["torque"][rows]))
+        correlation = np.full(len(limit), np.nan)
+        if slow:
+            q, qd, torque = (np.concatenate(parts) for parts in zip(*slow, strict=True))
+            still, model = np.zeros_like(q), cell.model
+            rigid = np.where(model.friction_columns, 0.0, cell.nominal_values())
+            gravity = model.torque(rigid, q, still, still) + model.load_torque(q, still, still)
+            correlation = agreement(gravity, torque, qd, model.moving(qd))
+        joints = np.array(cell.joint_names)
         return cls(
             plan_hash=plan_hash,
             override=OVERRIDE,
@@ -311,8 +241,8 @@ class DryRun:
             following_error=tuple(following.tolist()),
             missed=missed,
             late=late,
-            against_gravity=gravity.against,
-            gravity_not_seen=gravity.not_seen,
+            against_gravity=tuple(joints[correlation < -CLEAR].tolist()),
+            gravity_not_seen=tuple(joints[~(np.abs(correlation) >= CLEAR)].tolist()),
         )
 
     @property
@@ -326,8 +256,7 @@ class DryRun:
         Raises:
             OutputError: the disk refuses.
         """
-        content = {"format_version": FORMAT_VERSION, **asdict(self)}
-        write_or_tell(path, json.dumps(content, indent=1) + "\n")
+        save_record(path, self, FORMAT_VERSION)
 
     def accepted_now(self) -> DryRun:
         """This dry run, accepted by whoever runs the program."""
@@ -337,9 +266,6 @@ class DryRun:
 class DryRunStage:
     """Every motion that will be sent at full speed, once and slowly.
 
-    Args:
-        run: whose excitation and validation motions are looked at; repetitions of one once.
-
     Attributes:
         intervals: the motions under the names of their slow runs.
         state: whether a person has accepted what was done; "left out" where the caller did without.
@@ -348,33 +274,30 @@ class DryRunStage:
     def __init__(self, run: Run) -> None:
         self._run = run
         self.state: DryRunState = "left out" if run.unrehearsed else "to be accepted"
-        self._motions = [
+        motions = [
             one for one in run.wanted
             if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
         ]  # fmt: skip
-        self.intervals = [
-            replace(one, kind="dryrun", index=k) for k, one in enumerate(self._motions)
-        ]
+        self.intervals = [replace(one, kind="dryrun", index=k) for k, one in enumerate(motions)]
         # Nobody knows beforehand what will contradict: only what an earlier run saw is accepted.
         self._known = run.accept_torque if run.accept_torque and self.found() else ()
 
     def found(self) -> DryRun | None:
         """The dry run of exactly this plan and kind of arm; None where none counts."""
-        if self._run.unrehearsed:
+        run = self._run
+        if run.unrehearsed:
             return None
         return DryRun.that_counts(
-            self._run.folder,
-            plan_hash=self._run.plan_hash,
-            motions=len(self._motions),
-            simulated=self._run.simulated,
+            run.folder,
+            plan_hash=run.plan_hash,
+            motions=len(self.intervals),
+            simulated=run.simulated,
         )
 
     def missing(self) -> list[Interval]:
         """Each motion that was not run slowly yet."""
-        if self._run.unrehearsed:
-            return []
-        both = zip(self._motions, self.intervals, strict=True)
-        return [one for one, slow in both if self._whole(slow) is None]
+        intervals = [] if self._run.unrehearsed else self.intervals
+        return [one for one in intervals if self._whole(one) is None]
 
     def run(self, runner: Runner) -> None:
         """Run what is missing, slowly, and have it accepted.
@@ -382,13 +305,12 @@ class DryRunStage:
         Raises:
             DryRunError, OperatorStopError: see `settle`.
         """
-        missing = [slow for slow in self.intervals if self._whole(slow) is None]
-        if self._run.unrehearsed or not missing:
-            return
+        missing = self.missing()
         for slow in missing:
-            name = runner.play(slow, slow.index + 1, len(self._motions), OVERRIDE)
+            name = runner.play(slow, slow.index + 1, len(self.intervals), OVERRIDE)
             self._run.entering.enter(slow, name)
-        self.settle()
+        if missing:
+            self.settle()
 
     def settle(self) -> None:
         """Write down what was done, once all of it is, and have it accepted.
@@ -402,7 +324,7 @@ class DryRunStage:
             return
         if found is None:
             names = [name for slow in self.intervals if (name := self._whole(slow)) is not None]
-            if len(names) < len(self._motions):
+            if len(names) < len(self.intervals):
                 return
             found = DryRun.of(
                 run.folder, run.cell, names, plan_hash=run.plan_hash, simulated=run.simulated
@@ -432,19 +354,13 @@ class DryRunStage:
 
     def _whole(self, slow: Interval) -> str | None:
         """Name of its whole archive, if this kind of arm made it."""
-        folder = self._run.folder
-        name = folder.whole(slow.kind, slow.index)
-        made = name is not None and made_by(folder.archives / name, self._run.simulated)
+        name = self._run.folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(self._run.folder.archives / name, self._run.simulated)
         return name if made else None
 
 
 def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
-    """What is raised where a dry run that was done is not accepted.
-
-    Args:
-        folder: of the campaign.
-        against: joints whose torque runs against the model's gravity, and that nobody named.
-    """
+    """What is raised where a dry run is not accepted, or torques of joints that nobody named."""
     if against:
         return AgainstGravityError(folder.root, against, AGAINST)
     how = f"if the motions looked right, run `hil run {folder.root} --accept-dry-run`"

@@ -8,17 +8,22 @@ it.
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from hil.archive import ArchiveName
-from hil.archive.header import REJECTED
-from hil.files import write_atomically
+from hil.files import write_atomically, write_or_tell
 from hil.io import digest, file_digest, is_locked, json_digest, locked
-from hil.reading import is_no_file, json_of, lies_there, opened, text_of
+from hil.reading import is_no_file, json_of, lies_there, opened, text_of, toml_of
+from identification.errors import ModelError
+from identification.model.urdf_text import urdf_tree
 
 from .errors import CampaignFolderError, NotRehearsedError
 
@@ -27,18 +32,16 @@ if TYPE_CHECKING:
 
     from .plan import CampaignPlan
 
-
-import io
-from collections.abc import Mapping
-from typing import TypeVar
-
-from pydantic import TypeAdapter, ValidationError
-
-from hil.reading import toml_of
-from identification.errors import ModelError
-from identification.model.urdf_text import urdf_tree
-
 T = TypeVar("T")
+
+LOCK: Final = "campaign.lock"
+LOCK_PATIENCE: Final = 0.5
+"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
+MESH: Final = "mesh "
+"""Begins the entry of a mesh, by its name in the URDF."""
+MISSING: Final = "missing"
+_ANOTHER: Final = "{} is not the one this campaign began with"
+_RESTORE: Final = "restore it, or begin a new campaign"
 
 
 def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
@@ -56,24 +59,47 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
     try:
         return TypeAdapter(kind).validate_json(text, strict=strict or None)
     except ValidationError as error:
-        raise ValueError(first_of(error)) from error
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{place}: {first['msg']}" if place else str(first["msg"])) from error
 
 
-def first_of(error: ValidationError) -> str:
-    """The first thing that is wrong, with its place."""
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"]))
-    return f"{place}: {first['msg']}" if place else str(first["msg"])
+def load_record(
+    kind: type[T], path: Path, problem: str, remedy: str, *, version: int = 0, strict: bool = True
+) -> T | None:
+    """What a step of a campaign left in its folder; None where there is nothing.
+
+    Args:
+        kind: of the object.
+        path: of the file.
+        problem: said of a file that cannot be read.
+        remedy: what to do about it.
+        version: the only `format_version` that is read; 0 for any.
+        strict: see `read_back`.
+
+    Raises:
+        CampaignFolderError: it cannot be read.
+    """
+    if not lies_there(path):
+        return None
+    try:
+        text = text_of(path)
+        if version and (found := json_of(text)["format_version"]) != version:
+            raise ValueError(f"format version {found}, this is {version}")
+        return read_back(kind, text, strict=strict)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise CampaignFolderError(path.parent, f"{path.name} {problem} ({why})", remedy) from error
 
 
-LOCK: Final = "campaign.lock"
-LOCK_PATIENCE: Final = 0.5
-"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
-MESH: Final = "mesh "
-"""Begins the entry of a mesh, by its name in the URDF."""
-MISSING: Final = "missing"
-_PACKAGE: Final = "package://"
-_FILE: Final = "file://"
+def save_record(path: Path, record: Any, version: int) -> None:
+    """Write a dataclass so that `load_record` reads it.
+
+    Raises:
+        OutputError: the disk refuses.
+    """
+    content = {"format_version": version, **asdict(record)}
+    write_or_tell(path, json.dumps(content, indent=1) + "\n")
 
 
 def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
@@ -87,15 +113,22 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
         By file name; a mesh that cannot be read is "missing" (no motion is checked without).
     """
     sums = {name: digest(content) for name, content in contents.items()}
-    for mesh in _collision_meshes(contents.get("robot.urdf", b"")):
-        places = _places(mesh, _mesh_folders(contents.get("cell.toml", b""), root), root)
-        sums[MESH + mesh] = next(filter(None, map(_read, places)), MISSING)
+    try:
+        urdf = urdf_tree(as_text(contents.get("robot.urdf", b"")))
+        found = urdf.iterfind("./link/collision/geometry/mesh")
+        meshes = sorted({name for mesh in found if (name := mesh.get("filename"))})
+    except (ModelError, UnicodeDecodeError):  # whoever loads it says so
+        return sums
+    try:
+        cell = toml_of(as_text(contents.get("cell.toml", b"")))
+        folders = [root / name for name in cell["cell"]["mesh_folders"]]
+    except (ValueError, KeyError, TypeError):  # likewise
+        folders = []
+    for mesh in meshes:
+        name = mesh.removeprefix("package://").removeprefix("file://")
+        places = folders if mesh.startswith("package://") else [root, *folders]
+        sums[MESH + mesh] = next(filter(None, (_sum(place / name) for place in places)), MISSING)
     return sums
-
-
-def combined(sums: Mapping[str, str]) -> str:
-    """One checksum over all."""
-    return json_digest(dict(sums))
 
 
 def as_text(content: bytes) -> str:
@@ -103,40 +136,11 @@ def as_text(content: bytes) -> str:
     return io.TextIOWrapper(io.BytesIO(content), "utf-8").read()
 
 
-def _collision_meshes(urdf: bytes) -> list[str]:
-    try:
-        root = urdf_tree(as_text(urdf))
-    except (ModelError, UnicodeDecodeError):  # whoever loads it says so
-        return []
-    found = root.iterfind("./link/collision/geometry/mesh")
-    return sorted({name for mesh in found if (name := mesh.get("filename"))})
-
-
-def _mesh_folders(cell: bytes, root: Path) -> list[Path]:
-    try:
-        named = toml_of(as_text(cell))["cell"]["mesh_folders"]
-        return [root / name for name in named]
-    except (ValueError, KeyError, TypeError):  # likewise
-        return []
-
-
-def _places(mesh: str, folders: list[Path], root: Path) -> list[Path]:
-    """Where a mesh is looked for, in that order."""
-    if mesh.startswith(_PACKAGE):
-        return [folder / mesh.removeprefix(_PACKAGE) for folder in folders]
-    name = mesh.removeprefix(_FILE)
-    return [root / name, *(folder / name for folder in folders)]
-
-
-def _read(path: Path) -> str | None:
+def _sum(path: Path) -> str | None:
     try:
         return file_digest(path)
     except OSError:
         return None
-
-
-_ANOTHER: Final = "{} is not the one this campaign began with"
-_RESTORE: Final = "restore it, or begin a new campaign"
 
 
 @dataclass(frozen=True)
@@ -148,6 +152,9 @@ class Entry:
         outcome: how its motion ended; "rejected" for one that ended well and is of no use.
         sha256: checksum of the file.
         reason: why it was rejected, in words; "" for every other.
+
+    Raises:
+        ValueError: it names a file elsewhere.
     """
 
     name: str
@@ -155,67 +162,60 @@ class Entry:
     sha256: str
     reason: str = ""
 
+    def __post_init__(self) -> None:
+        if Path(self.name).name != self.name or not self.name.strip("."):
+            raise ValueError(f"{self.name!r} is no name of a file in archives/")
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    inputs: dict[str, str]
+    archives: list[Entry]
+
+
+class _Below:
+    """A path in the folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: CampaignFolder, _owner: object = None) -> Path:
+        return folder.root / self._name
+
 
 @dataclass(frozen=True)
 class CampaignFolder:
-    """Paths below one campaign folder."""
+    """Paths below one campaign folder, and what its manifest says.
+
+    Attributes:
+        archives: folder of the MCAP files.
+        cell, urdf: the campaign's own copies.
+        plan: excitation and validation motions, as planned.
+        results, report: what the identification found, for programs and for people.
+        rehearsal: how the rehearsal of the plan went.
+        rehearsed: folder of the rehearsal's own campaigns: its archives and reports.
+        dry_run: who accepted the slow dry run.
+        warmup: how the friction fell while the arm warmed up.
+    """
 
     root: Path
 
-    @property
-    def archives(self) -> Path:
-        """Folder of the MCAP files."""
-        return self.root / "archives"
-
-    @property
-    def cell(self) -> Path:
-        """The campaign's own copy of the cell file."""
-        return self.root / "cell.toml"
-
-    @property
-    def urdf(self) -> Path:
-        """The campaign's own copy of the URDF."""
-        return self.root / "robot.urdf"
-
-    @property
-    def plan(self) -> Path:
-        """Excitation and validation motions, as planned."""
-        return self.root / "plan.json"
-
-    @property
-    def results(self) -> Path:
-        """What the identification found."""
-        return self.root / "results.json"
-
-    @property
-    def report(self) -> Path:
-        """The report for people."""
-        return self.root / "report.html"
-
-    @property
-    def rehearsal(self) -> Path:
-        """How the rehearsal of the plan went."""
-        return self.root / "rehearsal.json"
-
-    @property
-    def rehearsed(self) -> Path:
-        """Folder of the rehearsal's own campaigns: its archives and reports."""
-        return self.root / "rehearsal"
-
-    @property
-    def dry_run(self) -> Path:
-        """Who accepted the slow dry run."""
-        return self.root / "dry_run.json"
-
-    @property
-    def warmup(self) -> Path:
-        """How the friction fell while the arm warmed up."""
-        return self.root / "warmup.json"
+    archives = _Below("archives")
+    cell = _Below("cell.toml")
+    urdf = _Below("robot.urdf")
+    plan = _Below("plan.json")
+    results = _Below("results.json")
+    report = _Below("report.html")
+    rehearsal = _Below("rehearsal.json")
+    rehearsed = _Below("rehearsal")
+    dry_run = _Below("dry_run.json")
+    warmup = _Below("warmup.json")
+    _path = _Below("manifest.json")
 
     @property
     def plan_hash(self) -> str:
         """SHA-256 over cell, URDF, plan and collision meshes as they lie there."""
-        return combined(self._inputs())
+        return json_digest(self._inputs())
 
     @property
     def motion_hash(self) -> str:
@@ -229,9 +229,9 @@ class CampaignFolder:
         try:
             cell = toml_of(as_text(contents[self.cell.name]))
         except (KeyError, ValueError):
-            return combined(sums)  # no cell that anything could be run with
+            return json_digest(sums)  # no cell that anything could be run with
         cell.get("campaign", {}).pop("repetitions", None)
-        return combined(sums | {self.cell.name: json_digest(cell)})
+        return json_digest(sums | {self.cell.name: json_digest(cell)})
 
     def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
         """The hash of a cell and a plan in memory, which must be those that lie in the folder.
@@ -242,28 +242,22 @@ class CampaignFolder:
             CampaignFolderError: one of them was changed since it was read.
         """
         contents = self._contents()
-        same = {
-            self.cell.name: as_text(contents.get(self.cell.name, b"")) == cell.text,
-            self.urdf.name: as_text(contents.get(self.urdf.name, b"")) == cell.urdf,
-            self.plan.name: plan.is_of(as_text(contents.get(self.plan.name, b""))),
-        }
-        for name, unchanged in same.items():
+        names = self.cell.name, self.urdf.name, self.plan.name
+        texts = [as_text(contents.get(name, b"")) for name in names]
+        same = texts[0] == cell.text, texts[1] == cell.urdf, plan.is_of(texts[2])
+        for name, unchanged in zip(names, same, strict=True):
             if not unchanged:
                 raise CampaignFolderError(
                     self.root,
                     f"{name} was changed after it was read",
                     "open the campaign anew, and begin this step again",
                 )
-        return combined(self._checksums(contents))
-
-    @property
-    def _manifest(self) -> Path:
-        return self.root / "manifest.json"
+        return json_digest(self._checksums(contents))
 
     @property
     def sealed(self) -> bool:
         """Whether there is a manifest."""
-        return lies_there(self._manifest)
+        return lies_there(self._path)
 
     def locked(self) -> AbstractContextManager[None]:
         """Keep every other run out of the folder; a run that dies lets go of it.
@@ -289,7 +283,7 @@ class CampaignFolder:
 
     def seal(self) -> None:
         """Begin the manifest with the checksums of what the campaign is about."""
-        self._save({"inputs": self._inputs(), "archives": []})
+        self._save(_Manifest(self._inputs(), []))
 
     def accept_changes(self) -> None:
         """Take cell, URDF and plan as they are, if nothing has been recorded with them yet.
@@ -297,8 +291,9 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: something was recorded, and one of them changed since.
         """
-        if not self._content()["archives"]:
-            if self._content()["inputs"] != self._inputs():
+        manifest = self._manifest()
+        if not manifest.archives:
+            if manifest.inputs != self._inputs():
                 self.seal()
         elif changed := self._changed():
             raise CampaignFolderError(self.root, _ANOTHER.format(changed), _RESTORE)
@@ -309,25 +304,10 @@ class CampaignFolder:
         Raises:
             NotRehearsedError: names the file that changed.
         """
-        changed = self._changed()
-        if changed:
-            remedy = (
-                _RESTORE
-                if self._content()["archives"]
-                else f"restore it, or rehearse again (`hil rehearse {self.root}`)"
-            )
+        if changed := self._changed():
+            again = f"restore it, or rehearse again (`hil rehearse {self.root}`)"
+            remedy = _RESTORE if self.manifest() else again
             raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
-
-    def _changed(self) -> str | None:
-        """The first file that is not the one that was sealed."""
-        sealed: dict[str, str] = self._content()["inputs"]
-        now = self._inputs()
-        for name in sorted(sealed.keys() | now.keys()):
-            if name.startswith(MESH) and name not in sealed:
-                continue  # sealed by a version that did not look at meshes
-            if sealed.get(name) != now.get(name):
-                return name
-        return None
 
     def manifest(self) -> list[Entry]:
         """Closed archives in the order they were made.
@@ -335,69 +315,27 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: the manifest cannot be read.
         """
-        try:
-            entries = [Entry(**entry) for entry in self._content()["archives"]]
-            if not all(isinstance(text, str) for e in entries for text in asdict(e).values()):
-                raise TypeError("an entry is not made of words")
-            if away := [
-                e.name for e in entries if Path(e.name).name != e.name or not e.name.strip(".")
-            ]:
-                raise TypeError(f"{away[0]!r} is no name of a file in {self.archives.name}/")
-            return entries
-        except (KeyError, TypeError) as error:
-            raise self._damaged(error) from error
+        return self._manifest().archives
 
     def add(self, name: str, outcome: str, reason: str = "") -> None:
-        """Enter a closed archive into the manifest.
-
-        Args:
-            name: of the file.
-            outcome: how its motion ended, or "rejected".
-            reason: why it was rejected.
+        """Enter a closed archive into the manifest, or anew what became of one.
 
         Raises:
             CampaignFolderError: the disk refuses.
         """
-        content = self._content()
-        entry = Entry(name, outcome, file_digest(self.archives / name), reason)
-        self._save(content | {"archives": [*content["archives"], asdict(entry)]})
-
-    def reject(self, name: str, reason: str) -> None:
-        """Enter an archive that was found good before as rejected; it says so itself by now.
-
-        Raises:
-            CampaignFolderError: the disk refuses.
-        """
-        content = self._content()
-        now = asdict(Entry(name, REJECTED, file_digest(self.archives / name), reason))
-        entries = [now if one["name"] == name else one for one in content["archives"]]
-        self._save(content | {"archives": entries})
+        manifest = self._manifest()
+        new = Entry(name, outcome, file_digest(self.archives / name), reason)
+        entries = [new if one.name == name else one for one in manifest.archives]
+        entries += [] if new in entries else [new]
+        self._save(replace(manifest, archives=entries))
 
     def whole(self, kind: str, index: int) -> str | None:
         """Name of the whole archive of this interval, if there is one with outcome `completed`."""
-        for entry in reversed(self.manifest()):
-            name = ArchiveName.parse(entry.name)
-            if (
-                name is not None
-                and (name.kind, name.index, entry.outcome) == (kind, index, "completed")
-                and self._unchanged(entry)
-            ):
-                return entry.name
-        return None
+        return self._whole(kind, index).get(index)
 
     def completed(self, kind: str) -> list[Path]:
         """Whole archives of one kind, by index; of several attempts the last completed one."""
-        latest: dict[int, str] = {}
-        for entry in self.manifest():
-            name = ArchiveName.parse(entry.name)
-            if (
-                name is not None
-                and name.kind == kind
-                and entry.outcome == "completed"
-                and self._unchanged(entry)
-            ):
-                latest[name.index] = entry.name
-        return [self.archives / latest[index] for index in sorted(latest)]
+        return [self.archives / name for _, name in sorted(self._whole(kind).items())]
 
     def damaged(self) -> list[str]:
         """What the manifest names and is missing, or is not what was written, in words."""
@@ -413,13 +351,37 @@ class CampaignFolder:
         Raises:
             CampaignFolderError: the manifest cannot be read.
         """
-        used = {entry.name for entry in self.manifest()}
-        attempt = 1
+        used, attempt = {entry.name for entry in self.manifest()}, 1
         while (name := ArchiveName(kind, index, attempt).filename) in used or (
             self.archives / name
         ).exists():
             attempt += 1
         return ArchiveName(kind, index, attempt)
+
+    def _whole(self, kind: str, index: int | None = None) -> dict[int, str]:
+        """Names of the whole archives of a kind (of one of them) by index, the last ones."""
+        found: dict[int, str] = {}
+        for entry in reversed(self.manifest()):
+            name = ArchiveName.parse(entry.name)
+            if (
+                name is not None
+                and (name.kind, entry.outcome) == (kind, "completed")
+                and index in (None, name.index)
+                and name.index not in found
+                and self._unchanged(entry)
+            ):
+                found[name.index] = entry.name
+        return found
+
+    def _changed(self) -> str | None:
+        """The first file that is not the one that was sealed."""
+        sealed, now = self._manifest().inputs, self._inputs()
+        for name in sorted(sealed.keys() | now.keys()):
+            if name.startswith(MESH) and name not in sealed:
+                continue  # sealed by a version that did not look at meshes
+            if sealed.get(name) != now.get(name):
+                return name
+        return None
 
     def _unchanged(self, entry: Entry) -> bool:
         try:
@@ -457,36 +419,21 @@ class CampaignFolder:
         """Checksums of these; a mesh that is not on this computer counts as it was sealed."""
         sums = checksums(contents, self.root)
         if MISSING in sums.values():
-            sealed = self._content()["inputs"]
-            sums |= {
-                name: sealed[name] for name in sums if sums[name] == MISSING and name in sealed
-            }
+            sealed = self._manifest().inputs
+            sums |= {n: sealed[n] for n, one in sums.items() if one == MISSING and n in sealed}
         return sums
 
-    def _content(self) -> dict[str, Any]:
-        if not self.sealed:
-            return {"inputs": {}, "archives": []}
-        try:
-            content = json_of(text_of(self._manifest))
-            inputs = dict(content["inputs"])
-            if not all(isinstance(text, str) for pair in inputs.items() for text in pair):
-                raise TypeError("its inputs are not names and checksums")
-            return {"inputs": inputs, "archives": list(content["archives"])}
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise self._damaged(error) from error
+    def _manifest(self) -> _Manifest:
+        found = load_record(_Manifest, self._path, "is damaged", "restore it or start a new folder")
+        return found or _Manifest({}, [])
 
-    def _save(self, content: dict[str, Any]) -> None:
+    def _save(self, manifest: _Manifest) -> None:
         # A line an archive. With `indent` each call leaves a reference cycle, motion by motion.
-        archives = ",\n".join(map(json.dumps, content["archives"]))
-        text = f'{{"inputs": {json.dumps(content["inputs"])},\n"archives": [\n{archives}\n]}}\n'
+        archives = ",\n".join(json.dumps(asdict(one)) for one in manifest.archives)
+        text = f'{{"inputs": {json.dumps(manifest.inputs)},\n"archives": [\n{archives}\n]}}\n'
         try:
-            write_atomically(self._manifest, text)
+            write_atomically(self._path, text)
         except OSError as error:
             raise CampaignFolderError(
                 self.root, f"manifest.json cannot be written ({error})", "make room and run again"
             ) from error
-
-    def _damaged(self, error: Exception) -> CampaignFolderError:
-        return CampaignFolderError(
-            self.root, f"manifest.json is damaged ({error})", "restore it or start a new folder"
-        )

@@ -12,20 +12,17 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .controller_limits import narrower_thresholds
 from .dry_run import DryRun, DryRunStage, not_accepted, said_of
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .motion_link import Connection
+from .motion_link import Connection, narrower_limits
 from .rehearsal import Rehearsal
 
 if TYPE_CHECKING:
     from .run import Run
 
-_ADDRESS: Final = ("transport", "host", "port", "bind", "can", "packets")
+_ADDRESS: Final = {"transport", "host", "port", "bind", "can", "packets"}
 """Keys of `[controller]` that say where it is, and not what is exchanged."""
-_MADE_BY: Final = {"yes": "a simulated arm", "no": "a real arm"}
-"""By what an archive says of itself."""
 
 
 def require_gates(run: Run, dry_run: DryRunStage) -> None:
@@ -37,21 +34,35 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
     """
     _require_one_world(run)
     _require_own_link(run)
+    root = run.folder.root
     if run.unrehearsed:
-        _require_simulated(run)
+        if not run.simulated:
+            raise NotRehearsedError(
+                root,
+                "was not rehearsed, and its link leads out of this computer",
+                "only a simulated controller on this computer (127.0.0.1) is driven without a "
+                f"rehearsal: run `hil rehearse {root}`",
+            )
         return
     if (warning := require_rehearsed(run.folder, run.plan_hash).warning) is not None:
         run.notes.append(warning)
         run.reporter.say(f"note: {warning}")
-    _require_dry_run(run, dry_run.found())
+    # Before anything moves, where nobody could accept the dry run that is to come.
+    found, first = dry_run.found(), f"run `hil run {root} --dry-run`"
+    if found is None and run.accept_dry_run and not run.simulated:
+        remedy = f"{first}, watch the arm, and accept it then"
+        raise DryRunError(root, "cannot be accepted before it was done", remedy)
+    if run.operator.can_answer or run.dry_run_only or run.accept_dry_run:
+        return
+    if found is None:
+        remedy = f"{first} and watch the arm"
+        raise DryRunError(root, "was not done, and nobody is here to accept it", remedy)
+    if found.accepted is None:
+        raise not_accepted(run.folder, found.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
-    """The rehearsal of a plan; one that was not passed on the simulated twin is refused.
-
-    Args:
-        folder: of the campaign.
-        plan_hash: of the plan; the folder's as it lies there if left out.
+    """The rehearsal of a plan, or of the folder's; one that was not passed is refused.
 
     Raises:
         NotRehearsedError: there was none of exactly this cell, URDF and plan, or it failed.
@@ -71,41 +82,28 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     return found
 
 
-def _require_simulated(run: Run) -> None:
-    """Refuse to leave out rehearsal and dry run where an arm may move."""
-    root = run.folder.root
-    if not run.simulated:
-        raise NotRehearsedError(
-            root,
-            "was not rehearsed, and its link leads out of this computer",
-            "only a simulated controller on this computer (127.0.0.1) is driven without a "
-            f"rehearsal: run `hil rehearse {root}`",
-        )
-
-
 def _require_one_world(run: Run) -> None:
     """Refuse to mix a simulated arm and a real one in one campaign.
 
     What a simulated arm did slowly says nothing of the room around a real one, and what either
     did must not be pooled. Archives that cannot be read are made anew.
     """
+    ours = said_of(run.simulated)
     for entry in run.folder.manifest():
-        path = run.folder.archives / entry.name
-        made_by: str | None = said_of(run.simulated)
+        path, made_by = run.folder.archives / entry.name, ours
         with suppress(ArchiveError):
             if path.is_file():
-                made_by = open_archive(path, fields=()).header.simulated
-        if made_by == said_of(run.simulated):
-            continue
-        what = _MADE_BY.get(
-            made_by or "", "an arm that they do not name (an earlier version wrote them)"
-        )
-        link = "a simulated one" if run.simulated else "a real one"
-        raise CampaignFolderError(
-            run.folder.root,
-            f"holds archives of {what}, and its link leads to {link}",
-            "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
-        )
+                made_by = open_archive(path, fields=()).header.simulated or ""
+        if made_by != ours:
+            whose = {"yes": "a simulated arm", "no": "a real arm"}.get(
+                made_by, "an arm that they do not name (an earlier version wrote them)"
+            )
+            link = "a simulated one" if run.simulated else "a real one"
+            raise CampaignFolderError(
+                run.folder.root,
+                f"holds archives of {whose}, and its link leads to {link}",
+                "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
+            )
 
 
 def _require_own_link(run: Run) -> None:
@@ -118,8 +116,7 @@ def _require_own_link(run: Run) -> None:
     if not isinstance(other, Cell) or other is run.cell:
         return
     ours, theirs = _as_linked(run.cell), _as_linked(other)
-    differ = [name for name in ours if ours[name] != theirs[name]]
-    if differ:
+    if differ := [name for name in ours if ours[name] != theirs[name]]:
         raise CampaignFolderError(
             run.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",
@@ -130,40 +127,17 @@ def _require_own_link(run: Run) -> None:
 def _as_linked(cell: Cell) -> dict[str, Any]:
     """What of a cell decides what a link sends, by table of its file."""
     file = cell.file
-    exchange = {} if file.controller is None else file.controller.model_dump(exclude={*_ADDRESS})
     return {
         "URDF": cell.urdf,
         "[limits]": file.limits,
         "[bounds]": file.bounds,
         "[drive_train]": file.drive_train,
-        "[controller]": exchange,
+        "[controller]": file.controller and file.controller.model_dump(exclude=_ADDRESS),
     }
-
-
-def _require_dry_run(run: Run, found: DryRun | None) -> None:
-    """Refuse before anything moves, where nobody could accept the dry run that is to come."""
-    if found is None and run.accept_dry_run and not run.simulated:
-        raise DryRunError(
-            run.folder.root,
-            "cannot be accepted before it was done",
-            f"run `hil run {run.folder.root} --dry-run`, watch the arm, and accept it then",
-        )
-    if run.operator.can_answer or run.dry_run_only or run.accept_dry_run:
-        return
-    if found is None:
-        how = f"run `hil run {run.folder.root} --dry-run` and watch the arm"
-        raise DryRunError(run.folder.root, "was not done, and nobody is here to accept it", how)
-    if found.accepted is None:
-        raise not_accepted(run.folder, found.against_gravity)
 
 
 def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None) -> None:
     """Refuse a controller whose figures are not those that everything was checked with.
-
-    Args:
-        run: what is run.
-        connection: to the controller.
-        found: the dry run, for what was needed then; None where there is none.
 
     Raises:
         NotRehearsedError: names the differences, or each joint whose following error trips the
@@ -177,15 +151,14 @@ def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None)
             f"controller's ({'; '.join(connection.differences)})",
             "write the controller's figures into the cell file and rehearse",
         )
-    below = narrower_thresholds(cell, connection)
+    below = narrower_limits(cell, connection, "following_error")
     if not below:
         return
     needed = "what the motions need at full speed, no model tells"
     if found is not None:
         turns = np.abs(cell.drive_train.motor_from_joint) @ np.array(found.following_error) / TURN
-        seen = ", ".join(
-            f"{joint} {turn:.3g}" for joint, turn in zip(cell.joint_names, turns, strict=True)
-        )
+        both = zip(cell.joint_names, turns, strict=True)
+        seen = ", ".join(f"{joint} {turn:.3g}" for joint, turn in both)
         needed = f"at {found.override:.0%} of the speed the dry run needed {seen}"
     raise NotRehearsedError(
         root,

@@ -42,14 +42,7 @@ from .motion_link import (
     unwatched,
 )
 from .operator import MotionWatch, Stop, unwatched_motion
-from .steering import (
-    ASKED_EVERY,
-    NOT_BEGUN,
-    PacketCounts,
-    ProgressDisplay,
-    Steering,
-    duration_of,
-)
+from .steering import ASKED_EVERY, NOT_BEGUN, PacketCounts, Steering
 
 Array = NDArray[np.float64]
 DRAIN_CYCLES = 100
@@ -71,6 +64,7 @@ class Link:
         cycles: records archived so far.
         packets: the raw packets, where archives keep them.
         cell: whose controller is at the far end, where it is known.
+        only_simulated: True: virtual time reaches nothing else.
     """
 
     transport: Transport
@@ -82,6 +76,7 @@ class Link:
     connection: Connection = field(default_factory=Connection)
     packets: PacketRing | None = None
     cell: Cell | None = None
+    only_simulated: bool = True
 
     def __repr__(self) -> str:
         whose = "" if self.cell is None else f"{self.cell!r}, "
@@ -109,22 +104,13 @@ class Link:
             )
         ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
         guard = Guard(cell.guard_limits, cell.period)
-        session = Session(
-            cell.drive_train,
-            guard,
-            ring,
-            **cell.session_settings(accept_init=accept_init, only_axis=only_axis),
-        )
-        if not cell.controller.packets:
-            return cls(transport, session, ring, guard, finish, cell=cell)
-        packets = PacketRing(20 * DRAIN_CYCLES)
-        tap = TappedTransport(transport, packets, lambda: session.cycle)
-        return cls(tap, session, ring, guard, finish, packets=packets, cell=cell)
-
-    @property
-    def only_simulated(self) -> bool:
-        """True: virtual time reaches nothing else."""
-        return True
+        settings = cell.session_settings(accept_init=accept_init, only_axis=only_axis)
+        session = Session(cell.drive_train, guard, ring, **settings)
+        link = cls(transport, session, ring, guard, finish, cell=cell)
+        if cell.controller.packets:
+            link.packets = PacketRing(20 * DRAIN_CYCLES)
+            link.transport = TappedTransport(transport, link.packets, lambda: session.cycle)
+        return link
 
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
         """See `MotionLink.connect`; the timeout counts the controller's own time."""
@@ -140,7 +126,7 @@ class Link:
             return self.session.state is State.CLOSED or late or stop.requested
 
         exchange(self.transport, self.session, until=ready)
-        self._events()
+        self.events()
         self.connection.require_usable(self.cell)
         if stop.requested:
             raise ControllerFault("stopped by the operator before anything moved")
@@ -158,51 +144,49 @@ class Link:
         watch: MotionWatch = unwatched_motion,
     ) -> MotionEnded:
         """See `MotionLink.run`; while a hold stands, the simulated controller waits too."""
-        steering = Steering(watch, override)
-        steering.begin(source, stop)  # so that no archive stays open while a hold stands
+        steering = Steering(source, watch, override, self._counts)
+        steering.begin(stop)  # so that no archive stays open while a hold stands
         with self._open(spec) as writer:
-            taking = _Taking(self, Recorder(writer, self.session.drive_train))
-            watching = _Watching(self, source, watch, steering)
-            taking.display = watching.display
+            taking = _Taking(self, writer, steering)
             self.ring.drain()
             self.drain_packets()
-            self._events()
-            if not steering.begin(source, stop):
+            self.events()
+            if not steering.begin(stop):
                 taking.recorder.close("stopped", NOT_BEGUN)
                 return MotionEnded("stopped", NOT_BEGUN, -1, -1)
             try:
                 self.session.request(source)
             except RequestError as error:
                 raise ControllerFault(str(error)) from error
+            recorder, beginning, hopeless = taking.recorder, Beginning(self.transport.now), None
             until_drain, patience = 1, AFTERMATH_CYCLES  # a request counts from the first cycle
-            beginning, hopeless = Beginning(self.transport.now), None
 
             def over() -> bool:
                 nonlocal until_drain, patience, hopeless
                 if stop.requested:
                     self.session.stop("stopped by the operator")
                 until_drain -= 1
-                if until_drain == 0 or not (self.session.requested or taking.recorder.ended):
+                if until_drain == 0 or not (self.session.requested or recorder.ended):
                     until_drain = DRAIN_CYCLES
                     taking.take()
-                    watching.look(stop)
+                    self._look(source, steering, stop)
                     if not taking.began:
                         hopeless = beginning.hopeless(self.session.state, self.transport.now)
-                patience -= taking.recorder.ended is not None
+                patience -= recorder.ended is not None
                 # One that was stopped while its axes opened has not begun; they have to close.
-                over = taking.recorder.over and self.session.state not in HAS_SET_POINTS
+                over = recorder.over and self.session.state not in HAS_SET_POINTS
                 return over or patience < 0 or hopeless is not None
 
             exchange(self.transport, self.session, until=over)
             if hopeless is not None:
                 self.session.stop(hopeless)
-            taking.take()
-            if taking.failure is not None:
-                raise taking.failure
+            taking.finish()
             if hopeless is not None:
-                taking.recorder.close("void", hopeless)
+                recorder.close("void", hopeless)
                 raise ControllerFault(f"{hopeless}; nothing was sent ({spec.path})")
-            return taking.closed()
+            ended = recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
+            recorder.close(ended.outcome, ended.reason)
+            return ended
 
     def record(
         self,
@@ -213,18 +197,25 @@ class Link:
         wait: float | None = None,
         watch: Watch = unwatched,
     ) -> Recorded:
-        """See `Recording.record`; `wait` counts the controller's own time."""
-        until = inf if wait is None else self.transport.now + wait
-        exchange(self.transport, self.session, until=lambda: self._known(stop, until))
-        if stop.requested and self.connection.init is None:
-            raise OperatorStopError("ended before the controller came: nothing was recorded")
+        """See `MotionLink.record`; `wait` counts the controller's own time."""
+        waits_until = inf if wait is None else self.transport.now + wait
+
+        def known() -> bool:
+            self.events()
+            late = self.transport.now > waits_until
+            return self.connection.init is not None or stop.requested or late
+
+        exchange(self.transport, self.session, until=known)
         if self.connection.init is None:
+            if stop.requested:
+                raise OperatorStopError("ended before the controller came: nothing was recorded")
             raise ControllerFault("the controller did not start a session: nothing was recorded")
         self.connection.require_usable(self.cell)
+        limit = None if duration is None else round(duration / spec.period)
+        until_drain = DRAIN_CYCLES
         with self._open(spec) as writer:
-            taking = _Taking(self, Recorder(writer, self.session.drive_train))
-            limit = None if duration is None else round(duration / writer.period)
-            until_drain = DRAIN_CYCLES
+            taking = _Taking(self, writer)
+            recorder = taking.recorder
 
             def over() -> bool:
                 nonlocal until_drain
@@ -232,29 +223,18 @@ class Link:
                 if until_drain == 0:
                     until_drain = DRAIN_CYCLES
                     taking.take()
-                    watch(self._progress(taking.recorder))
-                recorder = taking.recorder
+                    newest = self.ring.last(1)
+                    position = newest["position"][0] if len(newest) else None
+                    missed, state = self.session.counters.missed, self.session.state
+                    watch(Progress(recorder.records, missed, state, position))
                 full = limit is not None and recorder.records + DRAIN_CYCLES - until_drain >= limit
                 return full or stop.requested or recorder.restarted or recorder.link_lost
 
             exchange(self.transport, self.session, until=over)
-            taking.take()
-            if taking.failure is not None:
-                raise taking.failure
-            outcome, reason = how_recording_ended(taking.recorder, stop, limit)
-            taking.recorder.close(outcome, reason)
-        recorder = taking.recorder
-        return Recorded(
-            outcome,
-            reason,
-            recorder.records,
-            recorder.records_lost,
-            seconds=(recorder.newest + 1) * spec.period,
-            events_lost=recorder.events_lost,
-            missed=recorder.missed,
-            late=recorder.late,
-            untaken=recorder.untaken,
-        )
+            taking.finish()
+            outcome, reason = how_recording_ended(recorder, stop, limit)
+            recorder.close(outcome, reason)
+        return Recorded.of(outcome, reason, (recorder.newest + 1) * spec.period, recorder)
 
     def close(self) -> None:
         """Ask the far end to end the session, and answer until it does or `END_TIMEOUT` s are over.
@@ -278,20 +258,6 @@ class Link:
                 f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
             )
 
-    def _known(self, stop: Stop, until: float) -> bool:
-        self._events()
-        known = self.connection.init is not None
-        return known or stop.requested or self.transport.now > until
-
-    def _progress(self, recorder: Recorder) -> Progress:
-        newest = self.ring.last(1)
-        return Progress(
-            cycles=recorder.records,
-            missed=self.session.counters.missed,
-            state=self.session.state,
-            position=newest["position"][0] if len(newest) else None,
-        )
-
     def drain_packets(self) -> NDArray[np.void] | None:
         """Raw packets since the last call; None if they are not stored."""
         if self.packets is None or not isinstance(self.transport, TappedTransport):
@@ -299,20 +265,37 @@ class Link:
         self.transport.settle()
         return self.packets.drain()
 
-    @property
-    def packets_overflow(self) -> int:
-        """Raw packets overwritten before they were drained, so far."""
-        return 0 if self.packets is None else self.packets.overflow
+    def events(self) -> list[Event]:
+        """What the session said since the last call."""
+        events = self.session.events()
+        for event in events:
+            self.connection.note(event)
+        return events
 
     def _open(self, spec: ArchiveSpec) -> ArchiveWriter:
         spec = described(spec, self.connection, self.session.drive_train)
         return replace(spec, packets=self.packets is not None).open()
 
-    def _events(self) -> list[Event]:
-        events = self.session.events()
-        for event in events:
-            self.connection.note(event)
-        return events
+    def _look(self, source: MotionSource, steering: Steering, stop: Stop) -> None:
+        """Show the motion if that is due, and pass requests on; returns when no hold stands.
+
+        A simulated controller waits for its answer, so that a hold costs no simulated time.
+        """
+        while True:
+            motion_time, rate = progress_of(source)
+            if steering.due:
+                drives, state = self.session.drive_train, self.session.state
+                steering.show(drives, self.guard, state, motion_time, rate)
+            steering.follow(self.session)
+            rests = progress_of(source)[1] == 0.0
+            if not (steering.held and rests) or stop.requested:
+                return
+            time.sleep(ASKED_EVERY)
+
+    def _counts(self) -> PacketCounts:
+        counters = self.session.counters
+        late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
+        return PacketCounts(counters.answered, counters.missed, late, counters.unanswered)
 
 
 def how_recording_ended(recorder: Recorder, stop: Stop, limit: int | None) -> tuple[str, str]:
@@ -331,74 +314,44 @@ def how_recording_ended(recorder: Recorder, stop: Stop, limit: int | None) -> tu
 
 
 class _Taking:
-    """Takes records and events from the session into the recorder."""
+    """Takes records and events from the session into an archive, and shows them to `steering`."""
 
-    def __init__(self, link: Link, recorder: Recorder) -> None:
-        self.recorder = recorder
-        self.failure: Exception | None = None
+    def __init__(self, link: Link, writer: ArchiveWriter, steering: Steering | None = None) -> None:
+        self.recorder = Recorder(writer, link.session.drive_train)
         self.began = False
-        self.display: ProgressDisplay | None = None
-        self._link = link
-        self._overflow = link.ring.overflow
-        self._packets_overflow = link.packets_overflow
+        self._failure: Exception | None = None
+        self._link, self._steering = link, steering
+        self._overflow, self._packets_overflow = self._overflows()
 
     def take(self) -> None:
         """Archive what has come since the last call; a failure stops the motion on its path."""
         link, recorder = self._link, self.recorder
         packets = link.drain_packets()
-        events, records, before = link._events(), link.ring.drain(), recorder.records
+        events, records, before = link.events(), link.ring.drain(), recorder.records
         self.began |= any(isinstance(one, MotionStarted | MotionEnded) for one in events)
-        lost, self._overflow = link.ring.overflow - self._overflow, link.ring.overflow
-        lost_packets = link.packets_overflow - self._packets_overflow
-        self._packets_overflow = link.packets_overflow
-        if self.display is not None:
-            self.display.note(events)
-            self.display.take(records)
-        if self.failure is not None:
+        earlier = self._overflow, self._packets_overflow
+        self._overflow, self._packets_overflow = self._overflows()
+        if self._steering is not None:
+            self._steering.note(events)
+            self._steering.take(records)
+        if self._failure is not None:
             recorder.note(events)
             return
         try:
             if packets is not None:
-                recorder.take_packets(packets, lost_packets)
-            recorder.take(records, events, lost)
+                recorder.take_packets(packets, self._packets_overflow - earlier[1])
+            recorder.take(records, events, self._overflow - earlier[0])
         except Exception as error:  # whatever it is, the arm comes to rest first
-            self.failure = error
+            self._failure = error
             link.session.stop("the archive cannot be written")
         link.cycles += recorder.records - before
 
-    def closed(self) -> MotionEnded:
-        """How the motion ended; the recording is completed."""
-        ended = self.recorder.ended or MotionEnded("lost", "the link ended", -1, -1)
-        self.recorder.close(ended.outcome, ended.reason)
-        return ended
+    def finish(self) -> None:
+        """Take the rest, and raise what went wrong on the way."""
+        self.take()
+        if self._failure is not None:
+            raise self._failure
 
-
-class _Watching:
-    """Shows a motion to its watch and does what that requests."""
-
-    def __init__(
-        self, link: Link, source: MotionSource, watch: MotionWatch, steering: Steering
-    ) -> None:
-        self._link, self._source, self._watch, self._steering = link, source, watch, steering
-        drives, duration = link.session.drive_train, duration_of(source)
-        self.display = ProgressDisplay(drives, link.guard, steering, duration, self._counts())
-
-    def look(self, stop: Stop) -> None:
-        """Show it if that is due, and pass requests on; returns when no hold stands any more.
-
-        A simulated controller waits for its answer, so that a hold costs no simulated time.
-        """
-        while True:
-            if self.display.due:
-                state, progress = self._link.session.state, progress_of(self._source)
-                self.display.show(self._watch, state, self._counts(), *progress)
-            self._steering.follow(self._link.session, self.display.messages)
-            rests = progress_of(self._source)[1] == 0.0
-            if not (self._steering.held and rests) or stop.requested:
-                return
-            time.sleep(ASKED_EVERY)
-
-    def _counts(self) -> PacketCounts:
-        counters = self._link.session.counters
-        late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
-        return PacketCounts(counters.answered, counters.missed, late, counters.unanswered)
+    def _overflows(self) -> tuple[int, int]:
+        packets = self._link.packets
+        return self._link.ring.overflow, 0 if packets is None else packets.overflow

@@ -16,15 +16,31 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Self, get_args
+from typing import Final, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError, RequestError
-from drivers.events import MotionEnded, Outcome
-from drivers.exchange.control import Pulse
-from drivers.exchange.event_log import NO_ARCHIVE, NO_SUPERVISOR
+from drivers.events import (
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    Outcome,
+    PacketRejected,
+    Refused,
+)
+from drivers.exchange.control import ControlBlock, Pulse
+from drivers.exchange.event_log import (
+    NO_ARCHIVE,
+    NO_SUPERVISOR,
+    EventsLost,
+    ExchangeEnded,
+    ExchangeEvent,
+    ExchangeFailed,
+    Leaving,
+)
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings, WithdrawnError
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
@@ -38,6 +54,7 @@ from hil.archive.supervised import (
     ArchiveProcessHandle,
     Close,
     Closed,
+    Command,
     Failed,
     Open,
     Opened,
@@ -46,28 +63,26 @@ from hil.archive.supervised import (
 from hil.cell import Cell
 from hil.cell.cell import stays_here
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
+from hil.terminal_text import plural
 
-from .exchange_view import ExchangeView
 from .motion_link import (
     END_TIMEOUT,
+    Beginning,
     Connection,
     Progress,
     Recorded,
     Watch,
     described,
     drives_in_force,
+    guard_in_force,
     not_ready,
     unwatched,
 )
 from .operator import MotionWatch, Stop, unwatched_motion
-from .steering import (
-    NOT_BEGUN,
-    PacketCounts,
-    ProgressDisplay,
-    Steering,
-    duration_of,
-    guard_in_force,
-)
+from .steering import NOT_BEGUN, PacketCounts, Steering
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
 
 BEAT: Final = 0.05
 """s between two heartbeats; the exchange stops the arm after 0.5 s without one."""
@@ -75,15 +90,37 @@ STALL: Final = 1.0
 """s within which the loop that supervises a motion must have turned."""
 _STARVED: Final = 0.4
 """s between two beats that are reported: the exchange may have missed them."""
+HUNG: Final = 5.0
+"""s without a sign of life after which an exchange process is ended: the controller, unanswered
+for so long, has acted by its own watch."""
+READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
+"""States with the drive on. A controller may open its axes at once: they are held where they are
+until a motion is asked for."""
+POLL: Final = 0.02
+"""s between two looks at everything while a motion runs."""
+OPEN_TIMEOUT = 10.0
+"""s within which a file must have been created, or completed."""
+SLOW_DISK: Final = 1.0
+"""s at once that a disk takes for a flush when something is wrong with it."""
+REST_TIMEOUT: Final = 30.0
+"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
+_M_MMAP_THRESHOLD: Final = -3
+LARGE: Final = 128 * 1024
+"""Bytes; glibc's own value, before it adapts."""
+
+
+def return_large_arrays() -> None:
+    """Have arrays of `LARGE` bytes and more returned to the system when they are freed.
+
+    glibc takes larger and larger ones from its heap, once such have been freed. They come to lie
+    between small ones that stay, and over hours the heap grows around the holes.
+    """
+    with suppress(OSError, AttributeError, TypeError):  # another C library
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)
 
 
 class Heartbeat:
-    """Beats for a link.
-
-    Args:
-        beat: gives one sign of life.
-        clock: s, monotonic.
-    """
+    """Beats for a link."""
 
     def __init__(
         self, beat: Callable[[], None], clock: Callable[[], float] = time.monotonic
@@ -96,7 +133,13 @@ class Heartbeat:
 
     def start(self) -> None:
         """Beat in a thread until `end`."""
-        threading.Thread(target=self._go_on, daemon=True).start()
+
+        def beat() -> None:
+            while not self._over:
+                self.look()
+                time.sleep(BEAT)
+
+        threading.Thread(target=beat, daemon=True).start()
 
     def end(self) -> None:
         """Beat no more."""
@@ -127,6 +170,7 @@ class Heartbeat:
 
     def explained(self, text: str) -> str:
         """What the exchange says, with the cause where it missed our signs of life."""
+        starved = max(self._starved, self._clock() - self._last)
         if NO_SUPERVISOR not in text:
             return text
         if self._stalled:
@@ -134,7 +178,7 @@ class Heartbeat:
                 f"whatever looks at the motion (show, request) did not return for "
                 f"{self._stalled:.1f} s, and nobody could have passed on a stop"
             )
-        elif (starved := max(self._starved, self._clock() - self._last)) > _STARVED:
+        elif starved > _STARVED:
             cause = (
                 f"this program got no processor time for {starved:.1f} s, load average "
                 f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} processors: end what else runs here"
@@ -143,41 +187,115 @@ class Heartbeat:
             return text
         return text.replace(NO_SUPERVISOR, f"{NO_SUPERVISOR} ({cause})")
 
-    def _go_on(self) -> None:
-        while not self._over:
-            self.look()
-            time.sleep(BEAT)
 
+@dataclass(eq=False)
+class ExchangeView:
+    """What the supervising process knows of its exchange process.
 
-_M_MMAP_THRESHOLD: Final = -3
-LARGE: Final = 128 * 1024
-"""Bytes; glibc's own value, before it adapts."""
-
-
-def return_large_arrays() -> None:
-    """Have arrays of `LARGE` bytes and more returned to the system when they are freed.
-
-    glibc takes larger and larger ones from its heap, once such have been freed. They come to lie
-    between small ones that stay, and over hours the heap grows around the holes.
+    Attributes:
+        exchange: the process.
+        explained: adds the cause to what the process says, where it is known here.
+        connection: what is known of the controller.
+        lost: the last loss of the link.
+        ended: the end of the motion asked for last, if its event came.
+        inits: init packets so far.
+        refused: the refusal since a motion was asked for last.
+        not_understood: of packets that came last and got no answer, how many and why.
+        began: whether the motion asked for last has sent anything, or may have.
+        ended_for: what a process that had to be ended was ended for; "" for none.
     """
-    with suppress(OSError, AttributeError, TypeError):  # another C library
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)
 
+    exchange: ExchangeProcess
+    explained: Callable[[str], str] = str
+    connection: Connection = field(default_factory=Connection)
+    lost: LinkLost | None = None
+    ended: MotionEnded | None = None
+    inits: int = 0
+    began: bool = False
+    refused: Refused | None = None
+    not_understood: str = ""
+    ended_for: str = ""
+    _beginning: Beginning = field(default_factory=lambda: Beginning(time.monotonic()))
+    _rejected: int = 0
+    _said: str = ""
+    _ended_before: int = 0
+    _pulse: Pulse = field(init=False)
 
-Array = NDArray[np.float64]
+    def __post_init__(self) -> None:
+        control = ControlBlock(self.exchange.control_fd)
+        self._pulse = Pulse(lambda: control.exchange_heartbeat)
 
-READY = frozenset((State.CLOSED, State.OPENING, State.OPEN))
-"""States with the drive on. A controller may open its axes at once: they are held where they are
-until a motion is asked for."""
-POLL = 0.02
-"""s between two looks at everything while a motion runs."""
-OPEN_TIMEOUT = 10.0
-"""s within which a file must have been created."""
+    def look(self) -> list[ExchangeEvent]:
+        """Take in what the exchange says, and return it."""
+        events = self.exchange.events()
+        for event in events:
+            self.connection.note(event)
+            match event:
+                case InitReceived():
+                    self.inits += 1
+                case LinkLost():
+                    self.lost = event
+                case MotionEnded():
+                    self.ended = event
+                case Refused():
+                    self.refused = event
+                case PacketRejected() if event.why:
+                    self._rejected += event.count
+                    packets = plural(self._rejected, "packet")
+                    self.not_understood = f"{packets} came and got no answer: {event.why}"
+                case MotionStarted() | EventsLost():
+                    self.began = True
+                case ExchangeFailed():
+                    self._said = event.trace.strip().splitlines()[-1]
+                case Leaving() | ExchangeEnded() if not self._said:
+                    self._said = self.explained(event.reason)
+        return events
+
+    def forget_motion(self) -> None:
+        """Another motion is about to be asked for."""
+        self.look()
+        self.ended, self.refused, self.began = None, None, False
+        self._beginning = Beginning(time.monotonic())
+        self._ended_before = self.status.ended_count
+
+    def not_begun(self) -> str | None:
+        """Why the motion asked for will not begin any more, in words; None while it may."""
+        found = self._beginning.hopeless(self.state, time.monotonic())
+        return None if self.began or self.motion_ended else found
+
+    @property
+    def motion_ended(self) -> bool:
+        """Whether the motion asked for has ended; the event that says so may have been lost."""
+        return self.ended is not None or self.status.ended_count != self._ended_before
+
+    @property
+    def status(self) -> ControlBlock:
+        """The exchange's fields of the control block."""
+        return self.exchange.status()
+
+    @property
+    def state(self) -> State:
+        """Of the session."""
+        return State(self.status.state)
+
+    def failure(self) -> str | None:
+        """Why no answers come any more, in words; None as long as they do.
+
+        A process that hangs is ended.
+        """
+        if self.exchange.alive and self._pulse.quiet() > HUNG:
+            self.exchange.kill()
+            self.ended_for = f"gave no sign of life for {HUNG:g} s and was ended"
+        if self.exchange.alive:
+            return None
+        self.look()
+        said = f" ({self._said})" if self._said else ""
+        return f"the exchange process {self.ended_for or 'ended' + said}"
 
 
 @dataclass(eq=False)
 class LiveLink:
-    """A connection over a real transport, in real time; a `MotionLink` and a `Recording`.
+    """A connection over a real transport, in real time; a `MotionLink`.
 
     Use it as a context manager: leaving it, for whatever reason, brings the arm to rest, leaves
     open mode and ends both processes.
@@ -333,7 +451,7 @@ class LiveLink:
         watch: MotionWatch = unwatched_motion,
     ) -> MotionEnded:
         """See `MotionLink.run`."""
-        return LiveMotion(self, stop, watch, override).run(source, spec)
+        return _LiveMotion(self, source, spec, stop, watch, override).run()
 
     def record(
         self,
@@ -344,8 +462,8 @@ class LiveLink:
         wait: float | None = None,
         watch: Watch = unwatched,
     ) -> Recorded:
-        """See `Recording.record`."""
-        return LiveRecording(self, stop, watch).run(spec, duration, wait)
+        """See `MotionLink.record`."""
+        return _LiveRecording(self, stop, watch).run(spec, duration, wait)
 
     def close(self) -> None:
         """End the session where the far end can be asked to, then both processes.
@@ -383,23 +501,17 @@ class LiveLink:
         drives = drives_in_force(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
         spec = replace(spec, packets=self.cell.controller.packets)
+        self.view.lost = None
         self.job += 1
         self.open_path = str(spec.path)
-        self.view.lost = None
-        self.archive.send(Open(self.job, spec, drives, from_now, until_ended))
-        answer = self.archive.answer(OPEN_TIMEOUT, self.job)
-        if answer is not None:
+        command = Open(self.job, spec, drives, from_now, until_ended)
+        unsent = f"nothing was sent, and {spec.path} is not recorded"
+        if self._asked(command, Opened, unsent) is not None:
             self._late_path = ""  # commands are obeyed in order
-        if isinstance(answer, Opened):
             return
-        self.open_path = ""
-        if isinstance(answer, Failed):
-            raise write_error(answer)
-        if (failure := self.archive.failure()) is not None:
-            raise ControllerFault(f"{failure}; nothing was sent, and {spec.path} is not recorded")
         # Should it come to it after all, it is to be closed at once.
         self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
-        self._late_path = str(spec.path)
+        self.open_path, self._late_path = "", str(spec.path)
         late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
         raise ControllerFault(f"the archive process {late}; nothing was sent")
 
@@ -412,27 +524,17 @@ class LiveLink:
         """
         self.heart.rest()  # what was supervised is over, or never began
         path = self.open_path
-        self.archive.send(Close(self.job, outcome, reason))
-        deadline = time.monotonic() + OPEN_TIMEOUT
-        while time.monotonic() < deadline:
-            answer = self.archive.answer(POLL, self.job)
-            if isinstance(answer, Closed):
-                self.count(answer)
-                return answer
-            if isinstance(answer, Failed):
-                self.open_path = ""
-                raise write_error(answer)
-            if (failure := self.archive_failure()) is not None:
-                raise ControllerFault(f"{failure}; {path} is not complete ({outcome}: {reason})")
-        raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
+        incomplete = f"{path} is not complete ({outcome}: {reason})"
+        closed = self._asked(Close(self.job, outcome, reason), Closed, incomplete)
+        if closed is None:
+            raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
+        self.count(closed)
+        return closed
 
-    def failed_write(self) -> Failed | None:
-        """What the archive process says of an archive that cannot be written further, if it does.
-
-        Waits `POLL` s for it.
-        """
-        answer = self.archive.answer(POLL, self.job)
-        return answer if isinstance(answer, Failed) else None
+    def write_failed(self, failed: Failed) -> ArchiveWriteError:
+        """The error of an archive that cannot be written further."""
+        self.open_path = ""
+        return write_error(failed)
 
     def archive_failure(self) -> str | None:
         """What is wrong with the archive process; whoever asks tells what becomes of the file."""
@@ -447,6 +549,26 @@ class LiveLink:
         self.cycles += closed.records
         self.late += closed.late
         self.untaken += closed.untaken
+
+    def _asked(self, command: Command, wanted: type[T], otherwise: str) -> T | None:
+        """The answer to a command to the archive process; None if none came in `OPEN_TIMEOUT` s.
+
+        Raises:
+            ArchiveWriteError: the disk refuses.
+            ControllerFault: the process is gone, or hangs.
+        """
+        self.archive.send(command)
+        deadline = time.monotonic() + OPEN_TIMEOUT
+        while time.monotonic() < deadline:
+            answer = self.archive.answer(POLL, self.job)
+            if isinstance(answer, wanted):
+                return answer
+            if isinstance(answer, Failed):
+                self._late_path = ""
+                raise self.write_failed(answer)
+            if (failure := self.archive_failure()) is not None:
+                raise ControllerFault(f"{failure}; {otherwise}")
+        return None
 
     def _await_late(self, stop: Stop) -> None:
         """Until an archive that was opened too late is closed; only then are free names known."""
@@ -465,13 +587,13 @@ class LiveLink:
         """Have the archive process let viewers look."""
         cell = self.cell
         self.job += 1
-        self.archive.send(Serve(self.job, view, cell.joint_names, cell.period, cell.drive_train))
-        answer = self.archive.answer(OPEN_TIMEOUT, self.job)
-        if isinstance(answer, Failed):
-            raise LiveViewError(None, answer.problem, remedy=answer.remedy)
-        if not isinstance(answer, Serving):
-            failure = self.archive.failure() or "the archive process does not answer"
-            raise ControllerFault(f"{failure}; nothing was sent")
+        command = Serve(self.job, view, cell.joint_names, cell.period, cell.drive_train)
+        try:
+            answer = self._asked(command, Serving, "nothing was sent")
+        except ArchiveWriteError as error:
+            raise LiveViewError(None, error.problem, remedy=error.remedy) from error
+        if answer is None:
+            raise ControllerFault("the archive process does not answer; nothing was sent")
         self.live = replace(view, port=answer.port)
 
     def _shut(self) -> str | None:
@@ -488,7 +610,8 @@ class LiveLink:
             while self.view.failure() is None and time.monotonic() < deadline:
                 self.exchange.beat()
                 time.sleep(POLL)
-            trouble = self.view.trouble
+            if self.view.ended_for:
+                trouble = f"the exchange process {self.view.ended_for}"
             if self.exchange.alive:
                 trouble = (
                     f"the exchange process still answers {END_TIMEOUT:g} s after it was asked to "
@@ -502,79 +625,63 @@ class LiveLink:
         return trouble
 
 
-SLOW_DISK: Final = 1.0
-"""s at once that a disk takes for a flush when something is wrong with it."""
-REST_TIMEOUT: Final = 30.0
-"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
-
-
-class LiveMotion:
+class _LiveMotion:
     """One motion on a `LiveLink`.
 
     Whatever happens here delays no answer: the exchange is asked through shared memory.
     """
 
-    def __init__(self, link: LiveLink, stop: Stop, watch: MotionWatch, override: float) -> None:
-        self._link, self._stop, self._watch = link, stop, watch
-        self._view, self._exchange = link.view, link.exchange
-        self._steering = Steering(watch, override)
-        self._reader = link.reader()
+    def __init__(
+        self,
+        link: LiveLink,
+        source: MotionSource,
+        spec: ArchiveSpec,
+        stop: Stop,
+        watch: MotionWatch,
+        override: float,
+    ) -> None:
+        self._link, self._source, self._path, self._stop = link, source, spec.path, stop
+        self._spec = spec
+        self._view, self._exchange, self._reader = link.view, link.exchange, link.reader()
+        self._steering = Steering(source, watch, override, self._counts)
         self._stop_passed = False
 
-    def run(self, source: MotionSource, spec: ArchiveSpec) -> MotionEnded:
+    def run(self) -> MotionEnded:
         """See `MotionLink.run`."""
-        self._wait_for_begin(source)  # no archive is opened while a hold stands
-        self._link.open_archive(spec, from_now=True, until_ended=True)
+        link, view = self._link, self._view
+        self._begins()  # no archive is opened while a hold stands
+        link.open_archive(self._spec, from_now=True, until_ended=True)
         # That may have taken seconds: nothing is asked for that is no longer wanted.
-        while self._wanted(source):
-            self._require_same_session()
-            self._view.forget_motion()
-            display = self._display(source)
-            self._link.heart.begin()
+        while self._begins():
+            if view.inits > link.inits:  # with limits that no motion was checked against
+                why = "the controller began a new session since it was connected"
+                link.complete("void", why)
+                raise ControllerFault(
+                    f"{why}; nothing was sent, run again: its limits are checked anew"
+                )
+            view.forget_motion()
+            self._reader.drain()
+            link.heart.begin()
             try:
-                self._submit(source, spec)
-                return self._supervised(display, spec)
+                self._submit()
+                return self._supervised()
             except WithdrawnError:
                 continue  # it was stopped, held or slowed meanwhile, or a new session began
             finally:
-                self._link.heart.rest()
-        self._link.complete("stopped", NOT_BEGUN)
+                link.heart.rest()
+        link.complete("stopped", NOT_BEGUN)
         return MotionEnded("stopped", NOT_BEGUN, -1, -1)
 
-    def _supervised(self, display: ProgressDisplay, spec: ArchiveSpec) -> MotionEnded:
-        """How the motion that was asked for ended."""
-        due = math.inf
-        while True:
-            self._look(display)
-            if (idle := self._view.not_begun()) is not None:
-                return self._give_up(idle)
-            answer = self._link.archive.answer(POLL, self._link.job)
-            if isinstance(answer, Closed):
-                return self._ending(answer)
-            if isinstance(answer, Failed):
-                self._link.open_path = ""
-                self._come_to_rest()
-                raise write_error(answer)
-            self._raise_failure()
-            if self._view.motion_ended or self._view.failure() is not None:
-                due = min(due, time.monotonic() + REST_TIMEOUT)
-            if time.monotonic() > due:
-                what = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
-                raise ControllerFault(f"the motion is over, but {what}")
-
-    def _wanted(self, source: MotionSource) -> bool:
-        """Whether the motion is still to begin; waits while it is held."""
-        try:
-            return self._wait_for_begin(source)
-        except ControllerFault as error:
-            self._link.complete("void", str(error))
-            raise
-
-    def _wait_for_begin(self, source: MotionSource) -> bool:
+    def _begins(self) -> bool:
         """See `Steering.begin`; what the exchange says meanwhile is not lost."""
-        begins = self._steering.begin(source, self._stop, self._view.look)
-        self._view.look()
-        return begins
+        try:
+            return self._steering.begin(self._stop, self._view.look)
+        except ControllerFault as error:
+            if self._link.open_path:
+                self._link.complete("void", str(error))
+            raise
+        finally:
+            self._view.look()
 
     def _still_wanted(self) -> bool:
         """Whether it may begin the next moment, as it was handed over."""
@@ -583,55 +690,55 @@ class LiveMotion:
         same_session = self._view.inits == self._link.inits
         return same_session and self._steering.unchanged(self._stop)
 
-    def _require_same_session(self) -> None:
-        """A controller that began anew may announce limits that no motion was checked against."""
-        self._view.look()
-        if self._view.inits > self._link.inits:
-            why = "the controller began a new session since it was connected"
-            self._link.complete("void", why)
-            raise ControllerFault(
-                f"{why}; nothing was sent, run again: its limits are checked anew"
-            )
-
-    def _submit(self, source: MotionSource, spec: ArchiveSpec) -> None:
+    def _submit(self) -> None:
         try:
-            self._exchange.submit(source, self._still_wanted)
+            self._exchange.submit(self._source, self._still_wanted)
         except WithdrawnError:
             raise
         except RequestError as error:
             self._link.complete("refused", str(error))
             why = self._link.heart.explained(str(error))
-            raise ControllerFault(f"{why}; {spec.path} says so") from error
+            raise ControllerFault(f"{why}; {self._path} says so") from error
         except DriverError as error:
-            self._raise_failure()
+            self._require_archive()
             self._exchange.stop()
             self._view.look()
             why = self._view.failure() or str(error)
             closed = self._link.complete("void", why)
-            raise ControllerFault(f"{why}; {spec.path} is {closed.outcome}") from error
+            raise ControllerFault(f"{why}; {self._path} is {closed.outcome}") from error
 
-    def _look(self, display: ProgressDisplay) -> None:
-        """Take in what is new, pass requests on, and show it if that is due."""
-        self._link.heart.turn()
-        display.note(self._view.look())
-        if self._stop.requested and not self._stop_passed:
-            self._exchange.stop()
-            self._stop_passed = True
-        if not self._view.motion_ended:
-            self._steering.follow(self._exchange, display.messages)
-        if display.due:
-            display.take(self._reader.drain())
-            status = self._view.status
-            display.show(
-                self._watch, self._view.state, self._counts(), status.motion_time, status.rate
-            )
-
-    def _display(self, source: MotionSource) -> ProgressDisplay:
-        connection, cell = self._link.connection, self._link.cell
-        drives = drives_in_force(cell, connection)
-        guard = guard_in_force(cell, drives, connection.init)
-        self._reader.drain()
-        return ProgressDisplay(drives, guard, self._steering, duration_of(source), self._counts())
+    def _supervised(self) -> MotionEnded:
+        """How the motion that was asked for ended."""
+        link, view, due = self._link, self._view, math.inf
+        drives = drives_in_force(link.cell, link.connection)
+        guard = guard_in_force(link.cell, drives, link.connection.init)
+        while True:
+            link.heart.turn()
+            self._steering.note(view.look())
+            if self._stop.requested and not self._stop_passed:
+                self._exchange.stop()
+                self._stop_passed = True
+            if not view.motion_ended:
+                self._steering.follow(self._exchange)
+            if self._steering.due:
+                self._steering.take(self._reader.drain())
+                status = view.status
+                self._steering.show(drives, guard, view.state, status.motion_time, status.rate)
+            if (idle := view.not_begun()) is not None:
+                return self._given_up(idle)
+            answer = link.archive.answer(POLL, link.job)
+            if isinstance(answer, Closed):
+                return self._ending(answer)
+            if isinstance(answer, Failed):
+                error = link.write_failed(answer)
+                self._come_to_rest()
+                raise error
+            self._require_archive()
+            if view.motion_ended or view.failure() is not None:
+                due = min(due, time.monotonic() + REST_TIMEOUT)
+            if time.monotonic() > due:
+                what = f"{self._path} was not completed within {REST_TIMEOUT:g} s"
+                raise ControllerFault(f"the motion is over, but {what}")
 
     def _counts(self) -> PacketCounts:
         status = self._view.status
@@ -645,45 +752,43 @@ class LiveMotion:
         )
 
     def _ending(self, closed: Closed) -> MotionEnded:
+        view = self._view
         self._link.count(closed)
-        self._view.look()
-        if self._view.ended is not None:
-            ended = self._view.ended
-            return replace(ended, reason=self._explained(ended.reason, closed))
-        if closed.outcome in get_args(Outcome) and self._view.motion_ended:
+        view.look()
+        ended = view.ended
+        if ended is None and closed.outcome in get_args(Outcome) and view.motion_ended:
             outcome: Outcome = closed.outcome  # type: ignore[assignment]
-            reason = self._explained(closed.reason, closed)
-            return MotionEnded(outcome, reason, closed.interval, -1)
-        failure = self._view.failure() or closed.reason
-        alone = "the controller gets no answers and acts by its own watch"
-        raise ControllerFault(f"{failure}; {alone}; the archive ({closed.outcome}) is whole so far")
-
-    def _explained(self, reason: str, closed: Closed) -> str:
-        """Why a motion ended, with the cause where a process of ours did not get on."""
-        if reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
+            ended = MotionEnded(outcome, closed.reason, closed.interval, -1)
+        if ended is None:
+            failure = view.failure() or closed.reason
+            raise ControllerFault(
+                f"{failure}; the controller gets no answers and acts by its own watch; "
+                f"the archive ({closed.outcome}) is whole so far"
+            )
+        if ended.reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
             waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
-            return f"{reason} ({waited}: look after that disk)"
-        return self._link.heart.explained(reason)
+            return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: look after that disk)")
+        return replace(ended, reason=self._link.heart.explained(ended.reason))
 
-    def _give_up(self, why: str) -> MotionEnded:
+    def _given_up(self, why: str) -> MotionEnded:
         """A motion that has not begun is dropped; without an archive it cannot begin any more."""
-        path, refused = self._link.open_path, self._view.refused
-        outcome = "void" if refused is None else "refused"
-        self._link.complete(outcome, why if refused is None else str(refused.error))
+        refused = self._view.refused
+        reason = why if refused is None else str(refused.error)
+        self._link.complete("void" if refused is None else "refused", reason)
         self._exchange.stop()
         if refused is None:
-            raise ControllerFault(f"{why}; nothing was sent ({path})")
-        return MotionEnded("refused", str(refused.error), -1, -1)
+            raise ControllerFault(f"{why}; nothing was sent ({self._path})")
+        return MotionEnded("refused", reason, -1, -1)
 
-    def _raise_failure(self) -> None:
+    def _require_archive(self) -> None:
         """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
-        path = self._link.open_path
         if (failure := self._link.archive_failure()) is not None:
             rests = "the arm was brought to rest"
             if not self._come_to_rest():
                 state = self._view.state.name
                 rests = f"the arm was asked to stop, but was not seen at rest ({state})"
-            raise ControllerFault(f"{failure}; {rests}, and {path} is readable up to its last part")
+            readable = f"{self._path} is readable up to its last part"
+            raise ControllerFault(f"{failure}; {rests}, and {readable}")
 
     def _come_to_rest(self) -> bool:
         """Whether the motion has ended; the exchange stops it by itself, but is asked to again."""
@@ -698,17 +803,17 @@ class LiveMotion:
         return self._view.motion_ended
 
 
-SILENCE = 1.0
+SILENCE: Final = 1.0
 """s without a packet after which nobody is there to be answered."""
-NOBODY = frozenset((State.SYNC, State.INIT, State.ENDED))
+NOBODY: Final = frozenset((State.SYNC, State.INIT, State.ENDED))
 """States in which no session is going on."""
-TARGET_MOVED = 1e-5
+TARGET_MOVED: Final = 1e-5
 """rad; a target at rest does not change at all, but its rounding may."""
-ARM_MOVED = 5e-4
+ARM_MOVED: Final = 5e-4
 """rad; more than an encoder's noise, less than any motion makes in a second."""
-REST = 1.0
+REST: Final = 1.0
 """s of the controller's time without motion after which the arm is at rest."""
-OFF = 1.0
+OFF: Final = 1.0
 """s with the drive off after which answers end; a session that is being ended is ended by then."""
 
 
@@ -721,30 +826,29 @@ class Standstill:
 
     def __init__(self, period: float) -> None:
         self._cycles = round(REST / period)
-        self._target: NDArray[np.float64] | None = None
-        self._position: NDArray[np.float64] | None = None
-        self._since = 0
+        self._still: NDArray[np.void] | None = None
 
     def take(self, records: NDArray[np.void]) -> bool:
         """Whether the arm has been at rest for `REST` at the end of the next records (k,)."""
-        if not len(records):
-            return False
         for record in records:
-            target, position, cycle = record["target_position"], record["position"], record["cycle"]
-            still = (
-                self._target is not None
-                and self._position is not None
-                and cycle > self._since
-                and bool(np.all(np.abs(target - self._target) <= TARGET_MOVED))
-                and bool(np.all(np.abs(position - self._position) <= ARM_MOVED))
-            )
-            if not still:
-                self._target, self._position = target.copy(), position.copy()
-                self._since = int(cycle)
-        return int(records["cycle"][-1]) - self._since >= self._cycles
+            last = self._still
+            if (
+                last is None
+                or not record["cycle"] > last["cycle"]
+                or not _near(record, last, "target_position", TARGET_MOVED)
+                or not _near(record, last, "position", ARM_MOVED)
+            ):
+                self._still = record.copy()
+        if self._still is None or not len(records):
+            return False
+        return int(records["cycle"][-1]) - int(self._still["cycle"]) >= self._cycles
 
 
-class LiveRecording:
+def _near(record: NDArray[np.void], other: NDArray[np.void], name: str, bound: float) -> bool:
+    return bool(np.all(np.abs(record[name] - other[name]) <= bound))
+
+
+class _LiveRecording:
     """One recording on a `LiveLink`.
 
     The controller's own program goes on when a recording ends, for whatever reason, and what it
@@ -755,8 +859,7 @@ class LiveRecording:
 
     def __init__(self, link: LiveLink, stop: Stop, watch: Watch) -> None:
         self._link, self._stop, self._watch = link, stop, watch
-        self._view = link.view
-        self._reader: RingReader = link.reader()
+        self._view, self._reader = link.view, link.reader()
         self._position: Array | None = None
 
     def run(self, spec: ArchiveSpec, duration: float | None, wait: float | None) -> Recorded:
@@ -775,15 +878,15 @@ class LiveRecording:
         return recorded
 
     def _await_controller(self, wait: float | None) -> None:
-        until = None if wait is None else time.monotonic() + wait
+        until = math.inf if wait is None else time.monotonic() + wait
         while self._link.connection.init is None:
             self._view.look()
-            self._show(over="")
+            self._show()
             if self._stop.requested:
                 raise OperatorStopError("ended before the controller came: nothing was recorded")
             if (failure := self._view.failure()) is not None:
                 raise ControllerFault(f"{failure}: nothing was recorded")
-            if until is not None and time.monotonic() > until:
+            if time.monotonic() > until:
                 status = self._view.status
                 table = self._link.cell.controller
                 who = table.host if table.transport == "udp" else "the controller"
@@ -797,66 +900,51 @@ class LiveRecording:
             time.sleep(POLL)
 
     def _record(self, spec: ArchiveSpec, duration: float | None, inits: int) -> Recorded:
+        link = self._link
         while True:
             ending = self._ends(duration, restarted=self._view.inits > inits)
-            self._take()
-            self._show(over="")
+            self._records()
+            self._show()
             if ending is not None:
-                break
-            if (failed := self._link.failed_write()) is not None:
-                raise write_error(failed)
-            if (failure := self._link.archive_failure()) is not None:
+                seconds = (self._view.status.cycle + 1) * link.cell.period
+                closed = link.complete(*ending)
+                return Recorded.of(closed.outcome, closed.reason, seconds, closed)
+            if isinstance(answer := link.archive.answer(POLL, link.job), Failed):
+                raise write_error(answer)
+            if (failure := link.archive_failure()) is not None:
                 raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
-        seconds = (self._view.status.cycle + 1) * self._link.cell.period
-        closed = self._link.complete(*ending)
-        return Recorded(
-            closed.outcome,
-            closed.reason,
-            closed.records,
-            closed.records_lost,
-            seconds=seconds,
-            events_lost=closed.events_lost,
-            missed=closed.missed,
-            late=closed.late,
-            untaken=closed.untaken,
-        )
 
     def _ends(self, duration: float | None, *, restarted: bool) -> tuple[str, str] | None:
         """Outcome and reason of a recording that is to end now, or None."""
         # The process first: what it said and how the session stood at its end is known then.
         failure = self._view.failure()
         self._view.look()
-        status, period = self._view.status, self._link.cell.period
-        over = (
-            restarted,
-            status.state == State.ENDED,
-            failure,
-            self._view.lost,
-            self._stop.requested,
-        )
-        asked = duration is not None and (status.cycle + 1) * period >= duration
-        if self._view.refused is not None and (asked or any(over)):
-            return "refused", str(self._view.refused.error)
+        status = self._view.status
+        ending = None
         if restarted:
-            return "stopped", "the controller began a new session"
-        if duration is not None and (status.cycle + 1) * period >= duration:
-            return "completed", "as long as was asked for"
-        if status.state == State.ENDED:
-            return "completed", "the controller ended the session"
-        if failure is not None:
-            return "lost", failure
-        if self._view.lost is not None:
-            return "lost", describe(self._view.lost)
-        if self._stop.requested:
-            return ("completed" if duration is None else "stopped"), "ended by the operator"
-        return None
+            ending = "stopped", "the controller began a new session"
+        elif duration is not None and (status.cycle + 1) * self._link.cell.period >= duration:
+            ending = "completed", "as long as was asked for"
+        elif status.state == State.ENDED:
+            ending = "completed", "the controller ended the session"
+        elif failure is not None:
+            ending = "lost", failure
+        elif self._view.lost is not None:
+            ending = "lost", describe(self._view.lost)
+        elif self._stop.requested:
+            outcome = "completed" if duration is None else "stopped"
+            ending = outcome, "ended by the operator"
+        if ending is not None and self._view.refused is not None:
+            return "refused", str(self._view.refused.error)
+        return ending
 
     def _answer_until_rest(self, why: str) -> None:
         """Do nothing, for as long as the exchange should go on answering."""
         stopped, still = self._stop.requested, Standstill(self._link.cell.period)
-        reader, driven, heard = self._link.reader(), time.monotonic(), 1
+        driven, heard = time.monotonic(), 1
         pulse = Pulse(lambda: heard, longest_look=5 * POLL)
-        reader.drain()
+        self._reader = self._link.reader()
+        self._reader.drain()
         while not (self._stop.insisted or (self._stop.requested and not stopped)):
             failure, state, now = self._view.failure(), self._view.state, time.monotonic()
             if state is not State.DRIVE_OFF:
@@ -864,21 +952,21 @@ class LiveRecording:
             if failure is not None or state in NOBODY or now - driven > OFF:
                 return
             self._view.look()
-            records = reader.drain()
-            if len(records):
-                heard += 1
-                self._position = records["position"][-1].copy()
+            records = self._records()
+            heard += len(records) > 0
             if still.take(records) or pulse.quiet() > SILENCE:
                 return
             self._show(over=why)
             time.sleep(POLL)
 
-    def _take(self) -> None:
+    def _records(self) -> NDArray[np.void]:
+        """Records since the last call; the last position is shown."""
         records = self._reader.drain()
         if len(records):
             self._position = records["position"][-1].copy()
+        return records
 
-    def _show(self, *, over: str) -> None:
+    def _show(self, over: str = "") -> None:
         status = self._view.status
         self._watch(
             Progress(

@@ -1,11 +1,11 @@
-"""What a campaign needs of a link, in virtual or in real time."""
+"""What a campaign needs of a link, in virtual or in real time, and what is known of its far end."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final, Protocol
+from dataclasses import dataclass, replace
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,24 +13,29 @@ from numpy.typing import NDArray
 from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange.event_log import ExchangeEvent
-from drivers.init_check import compare
+from drivers.guard import Guard
+from drivers.init_check import InitCheck, compare, narrower, shown
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
-from hil.archive.recorder import describe
+from hil.archive.recorder import Recorder, describe
+from hil.archive.supervised import Closed
 from hil.cell import Cell
 from hil.errors import ControllerFault
+from hil.motion_checks import MotionChecks
 
 from .operator import MotionWatch, Stop, unwatched_motion
+
+Array = NDArray[np.float64]
 
 BEGIN_TIMEOUT: Final = 60.0
 """s within which a motion that was accepted must have begun."""
 OFF_TIMEOUT: Final = 2.0
 """s with the drive off after which a motion that was accepted does not begin any more."""
-_WITHOUT_DRIVE: Final = frozenset(
-    (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
-)
+END_TIMEOUT: Final = 30.0
+"""s within which a session has to end after that was asked for."""
+_WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
 
 
 class Beginning:
@@ -47,19 +52,12 @@ class Beginning:
         """Why a motion that has not begun will not begin any more, in words; None while it may."""
         if state not in _WITHOUT_DRIVE:
             self._driven = now
-        if now - self._driven > OFF_TIMEOUT and state is State.FAULTED:
-            return "a refusal came before the motion began"
         if now - self._driven > OFF_TIMEOUT:
-            return "the drive went off before the motion began"
+            came = "a refusal came" if state is State.FAULTED else "the drive went off"
+            return f"{came} before the motion began"
         if now - self._asked > BEGIN_TIMEOUT:
             return f"the motion did not begin within {BEGIN_TIMEOUT:g} s ({state.name})"
         return None
-
-
-Array = NDArray[np.float64]
-
-END_TIMEOUT = 30.0
-"""s within which a session has to end after that was asked for."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,10 @@ class Recorded:
     """How a recording of the controller's own motion ended.
 
     Attributes:
-        outcome: "completed", "stopped" or "lost".
+        outcome: "completed", "stopped", "lost" or "refused".
         reason: in a sentence.
-        records: cycles archived.
-        records_lost: cycles overwritten before they could be archived.
         seconds: of the controller's time since its init packet.
+        records, records_lost: cycles archived, and overwritten before they could be.
         events_lost: events overwritten likewise.
         missed: packets that never arrived.
         late: packets whose answer was late, or left out for a newer one.
@@ -80,13 +77,28 @@ class Recorded:
 
     outcome: str
     reason: str
+    seconds: float
     records: int
     records_lost: int
-    seconds: float = 0.0
-    events_lost: int = 0
-    missed: int = 0
-    late: int = 0
-    untaken: int = 0
+    events_lost: int
+    missed: int
+    late: int
+    untaken: int
+
+    @classmethod
+    def of(cls, outcome: str, reason: str, seconds: float, counts: Recorder | Closed) -> Recorded:
+        """With the counts of its archive."""
+        return cls(
+            outcome,
+            reason,
+            seconds,
+            records=counts.records,
+            records_lost=counts.records_lost,
+            events_lost=counts.events_lost,
+            missed=counts.missed,
+            late=counts.late,
+            untaken=counts.untaken,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +137,6 @@ def unwatched(_progress: Progress) -> None:
     """Nobody looks."""
 
 
-def _unsaid(_text: str) -> None:
-    """Nobody listens."""
-
-
 @dataclass(eq=False)
 class Connection:
     """What has become known of the controller since the link was opened.
@@ -147,7 +155,7 @@ class Connection:
     differences: tuple[str, ...] = ()
     adopted: bool = False
     refused: Refused | None = None
-    say: Callable[[str], None] = _unsaid
+    say: Callable[[str], object] = str
 
     def note(self, event: ExchangeEvent) -> None:
         """Take in an event."""
@@ -161,9 +169,6 @@ class Connection:
     def require_usable(self, cell: Cell | None) -> None:
         """Refuse a controller that is not the cell's.
 
-        Args:
-            cell: whose controller it should be, where that is known.
-
         Raises:
             ControllerFault: the arm cannot be moved.
         """
@@ -172,7 +177,8 @@ class Connection:
         remedy = ""
         if self.differences and not self.adopted:
             remedy = "; correct the cell file, or the controller"
-            if cell is not None and self.init is not None and _may_accept(cell, self.init):
+            # Another cycle or a closed axis cannot be accepted.
+            if cell is not None and self.init is not None and _accepted(cell, self.init).adopted:
                 remedy += (
                     "; only `hil record` and `hil move` can use the controller's figures instead "
                     "(--accept-init)"
@@ -181,26 +187,19 @@ class Connection:
 
 
 def not_ready(state: State, waited: float) -> ControllerFault:
-    """What is reported where a controller did not come so far that a motion may be asked for.
-
-    Args:
-        state: of the session.
-        waited: for how long [s].
-    """
-    after = f"within {waited:.3g} s (state {state.name})"
+    """What is reported of a controller that was `waited` s for, and not ready for a motion."""
+    after, drive = f"within {waited:.3g} s", "switch the drive on and try again"
+    anew = "start the program on the controller anew and try again"
     if state is State.SYNC:
-        return ControllerFault(
-            f"the controller did not begin a session {after}: it is silent, or still in one that "
-            "began before this program; start the program on the controller anew and try again"
+        what = (
+            f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
+            f"began before this program; {anew}"
         )
-    if state is State.ENDED:
-        return ControllerFault(
-            f"the controller ended the session {after} before its drive was on; start the program "
-            "on the controller anew and try again"
-        )
-    return ControllerFault(
-        f"the controller did not reach drive-on {after}; switch the drive on and try again"
-    )
+    elif state is State.ENDED:
+        what = f"ended the session {after} before its drive was on; {anew}"
+    else:
+        what = f"did not reach drive-on {after} (state {state.name}); {drive}"
+    return ControllerFault(f"the controller {what}")
 
 
 class MotionLink(Protocol):
@@ -259,26 +258,14 @@ class MotionLink(Protocol):
         """
         ...
 
-    def close(self) -> None:
-        """End the connection; nothing moves any more.
-
-        Raises:
-            ControllerFault: it did not end as it should.
-        """
-        ...
-
-
-class Recording(Protocol):
-    """A connection on which the controller's own motion is recorded."""
-
     def record(
         self,
         spec: ArchiveSpec,
         stop: Stop,
         *,
-        duration: float | None,
-        wait: float | None,
-        watch: Watch,
+        duration: float | None = None,
+        wait: float | None = None,
+        watch: Watch = unwatched,
     ) -> Recorded:
         """Answer safely and archive every cycle from the controller's first on.
 
@@ -292,7 +279,7 @@ class Recording(Protocol):
         ...
 
     def close(self) -> None:
-        """End the connection.
+        """End the connection; nothing moves any more.
 
         Raises:
             ControllerFault: it did not end as it should.
@@ -303,14 +290,18 @@ class Recording(Protocol):
 def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> ArchiveSpec:
     """The archive with the controller's init packet, and with the drive train in force.
 
-    Its `drive_train.json`, the cell's, is brought to what the link uses.
+    Its `drive_train.json`, the cell's, gets the ratios, calibration and coupling of `drives`.
     """
     if connection.init is None:
         return spec
-    attachments = {"init_packet.bin": connection.init.encode()}
-    metadata = {}
+    attachments, metadata = {"init_packet.bin": connection.init.encode()}, {}
     if connection.adopted:
-        attachments["drive_train.json"] = _in_force(spec.attachments["drive_train.json"], drives)
+        table = json.loads(spec.attachments["drive_train.json"]) | {
+            "gear_ratio": drives.gear_ratio.tolist(),
+            "calibration": drives.calibration.tolist(),
+            **{name: getattr(drives, name) for name in ("k54", "k64", "k65")},
+        }
+        attachments["drive_train.json"] = json.dumps(table).encode()
         metadata = {
             "accepted_init": "yes",
             "accepted_init.differences": "; ".join(connection.differences),
@@ -320,24 +311,65 @@ def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> 
 
 def drives_in_force(cell: Cell, connection: Connection) -> DriveTrain:
     """The cell's drive train, or that of a controller whose figures were accepted."""
-    drives, init, table = cell.drive_train, connection.init, cell.controller
-    if init is None or not connection.adopted:
-        return drives
-    others = frozenset(table.other_axes)
-    return compare(drives, cell.period, init, table.arm, True, others).drive_train
+    if connection.init is None or not connection.adopted:
+        return cell.drive_train
+    return _accepted(cell, connection.init).drive_train
 
 
-def _may_accept(cell: Cell, init: InitPacket) -> bool:
-    """Whether the controller's figures can be accepted: not another cycle, nor a closed axis."""
+def guard_in_force(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> Guard:
+    """A guard with the limits in force: the narrower of the cell's and the controller's."""
+    guard = Guard(cell.guard_limits, cell.period)
+    if init is not None:
+        current = np.fmin(_stated(cell, init, "current_limit"), drives.current_limit)
+        guard.narrow(_stated(cell, init, "following_error"), current)
+    return guard
+
+
+def checks_in_force(
+    cell: Cell, connection: Connection, checks: MotionChecks | None = None
+) -> MotionChecks:
+    """What a motion to a connected controller is checked against.
+
+    The narrower of the cell's and the controller's current limits count, and gears that were
+    accepted from the controller; the very `checks` where both are the cell's.
+    """
+    checks = MotionChecks.of(cell) if checks is None else checks
+    if connection.adopted:
+        gears = drives_in_force(cell, connection).motor_from_joint
+        checks = replace(checks, currents=replace(checks.currents, motor_from_joint=gears))
+    if connection.init is None:
+        return checks
+    return checks.within(_stated(cell, connection.init, "current_limit"))
+
+
+Limit = Literal["current_limit", "following_error"]
+
+
+def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
+    """Limits of the controller below the cell's, in words joint by joint.
+
+    No model tells how far a servo lags behind, so that no motion can be checked against thresholds
+    of the following error.
+    """
+    if connection.init is None:
+        return ()
+    theirs, ours = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
+    unit = "A" if limit == "current_limit" else "motor revolutions"
+    return tuple(
+        f"{cell.joint_names[joint]}: {shown(theirs[joint])} {unit} in the controller, "
+        f"{ours[joint]:.9g} in the cell file"
+        for joint in np.flatnonzero(narrower(theirs, np.array(ours)))
+    )
+
+
+def _accepted(cell: Cell, init: InitPacket) -> InitCheck:
+    """The init packet held against the cell, its figures accepted where they can be."""
     table = cell.controller
     others = frozenset(table.other_axes)
-    return compare(cell.drive_train, cell.period, init, table.arm, True, others).adopted
+    return compare(cell.drive_train, cell.period, init, table.arm, True, others)
 
 
-def _in_force(text: bytes, drives: DriveTrain) -> bytes:
-    """A drive train table with the ratios, calibration and coupling of `drives`."""
-    table = json.loads(text)
-    table["gear_ratio"] = drives.gear_ratio.tolist()
-    table["calibration"] = drives.calibration.tolist()
-    table |= {"k54": drives.k54, "k64": drives.k64, "k65": drives.k65}
-    return json.dumps(table).encode()
+def _stated(cell: Cell, init: InitPacket, limit: Limit) -> Array:
+    """A limit of the cell's arm in an init packet (n,), NaN where it has none."""
+    values = getattr(init, limit)[cell.controller.arm - 1, : len(cell.joint_names)]
+    return np.asarray(values, dtype=np.float64)

@@ -6,9 +6,9 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import FrameType
-from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .dry_run import DryRun
 
 Array = NDArray[np.float64]
-
 
 REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, whoever ends programs, and the end of the terminal."""
@@ -88,12 +87,9 @@ class OperatorRequest:
 
 @dataclass(frozen=True)
 class Latency:
-    """How long the PC took, from a packet's arrival to the departure of its answer, this motion.
+    """How long the PC took from a packet's arrival to its answer, in this motion [s].
 
-    Attributes:
-        median: s.
-        p99: s, not exceeded by 99 % of the answers.
-        worst: s.
+    `p99` is not exceeded by 99 % of the answers.
     """
 
     median: float
@@ -106,19 +102,16 @@ class MotionProgress:
     """A motion at one moment. Joint arrays are (n,); None before the first record.
 
     Attributes:
-        motion_time: s of the planned motion done; None if the source does not tell.
-        duration: s of the planned motion, at full speed; None if the source does not tell.
-        cycles: answered since this motion was asked for.
-        missed: packets that never arrived, of them.
-        late: answers late, or left out for a newer packet's.
-        untaken: answers that the controller did not take.
+        motion_time, duration: s of the planned motion, done and in all, at full speed; None if
+            the source does not tell.
+        cycles, missed, late, untaken: packets answered since this motion was asked for, and those
+            that never arrived, were answered late or left out, or whose answer was not accepted.
         state: of the session.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
         following_share: magnitude of that as a share of the threshold in force.
         current: A at the motors, the controller's target (there is no measured one).
         current_share: magnitude of that as a share of the limit in force.
-        temperature: °C at the motors; None where the controller tells none (C4G Open does not).
         override: the fraction asked for last.
         rate: fraction of the planned speed at this moment; None if the source does not tell.
         held: whether a hold was asked for.
@@ -138,7 +131,6 @@ class MotionProgress:
     following_share: Array | None = None
     current: Array | None = None
     current_share: Array | None = None
-    temperature: Array | None = None
     override: float = 1.0
     rate: float | None = None
     held: bool = False
@@ -207,17 +199,12 @@ class RunStatus:
     time_left: float
     motion: MotionProgress | None = None
     drift: DriftCurve | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     motions_left: int = 0
 
 
 class Operator(Protocol):
-    """Who watches a run.
-
-    `show` and `request` are called from the loop that supervises the motion and must return at
-    once: no stop and no hold is passed on meanwhile. On a real link the arm is brought to rest on
-    its path when one of them takes longer than a second. One that raises costs only what it shows.
-    """
+    """Who watches a run; as quick as a `MotionWatch`. One that raises costs only what it shows."""
 
     @property
     def can_answer(self) -> bool:
@@ -240,10 +227,7 @@ class Operator(Protocol):
 class Unattended:
     """Nobody watches a run, or a motion: full speed, no hold, and no dry run is accepted."""
 
-    @property
-    def can_answer(self) -> bool:
-        """Nobody is there."""
-        return False
+    can_answer = False
 
     def show(self, status: object) -> None:
         """Show nothing."""
@@ -253,7 +237,7 @@ class Unattended:
         """Full speed."""
         return OperatorRequest()
 
-    def accept_dry_run(self, found: DryRun) -> bool:
+    def accept_dry_run(self, found: object) -> bool:
         """Nobody has seen it."""
         del found
         return False
@@ -278,64 +262,51 @@ class RunWatch:
         operator: who looks.
         stop: brings the arm to rest on its path.
         time_left: s of motion after the present one, each at the largest override it may have.
-        motions_left: after the present one.
-        drift: of the warm-up so far.
         began: when the present motion began, or the last one [s since 1970]; later than it was
             asked for where it was held.
-        blind: what went wrong with showing, None for nothing; nothing is shown from then on.
-        deaf: what went wrong first with asking for a request, None for nothing.
+        status: what was shown last, but for its time left.
     """
 
     operator: Operator
     stop: Stop
     time_left: float = 0.0
-    motions_left: int = 0
-    drift: DriftCurve | None = None
     began: float = 0.0
-    blind: Exception | None = None
-    deaf: Exception | None = None
-    _shown: bool = False
-    _held_deaf: bool = False
-    _phase: Phase = "move"
-    _number: int = 1
-    _total: int = 1
+    status: RunStatus = RunStatus("move", 1, 1, 0.0)
     _duration: float = 0.0
     _most: float = 1.0
-    _request: OperatorRequest = field(default_factory=OperatorRequest)
-    _notes: tuple[str, ...] = ()
+    _request: OperatorRequest = OperatorRequest()
+    _troubles: dict[str, str] = field(default_factory=dict)
 
-    def expect(self, seconds: float) -> None:
-        """One more motion is to come, of so many s."""
-        self.time_left += seconds
-        self.motions_left += 1
+    def expect(self, times: list[float]) -> None:
+        """More motions are to come, of so many s each."""
+        self.time_left += sum(times)
+        self.status = replace(self.status, motions_left=self.status.motions_left + len(times))
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
-        """The next motion.
-
-        Args:
-            kind: of its archive.
-            number: which of its kind, from 1.
-            total: of how many.
-            duration: at full speed [s].
-            most: largest override.
-        """
+        """The next motion, of `duration` s at full speed, at an override of at most `most`."""
         self.time_left = max(0.0, self.time_left - duration / most)
-        self.motions_left = max(0, self.motions_left - 1)
-        self._phase, self._number, self._total = _phase_of(kind), number, total
-        self._duration, self._most = duration, most
-        self._shown, self.began = False, time.time()
-        self._tell(None)
+        self._duration, self._most, self.began = duration, most, time.time()
+        self._tell(
+            None,
+            phase=cast(Phase, WORDS.get(kind, kind)),
+            number=number,
+            total=total,
+            motions_left=max(0, self.status.motions_left - 1),
+        )
 
     def note(self, text: str) -> None:
-        """A line on the quality of a motion."""
-        self._duration = 0.0  # notes are written between motions
-        self._notes = (*self._notes, text)[-NOTES:]
-        self._tell(None)
+        """A line on the quality of the motion that has ended."""
+        self._duration = 0.0
+        self._tell(None, notes=(*self.status.notes, text)[-NOTES:])
+
+    def warms(self, drift: DriftCurve) -> None:
+        """How far the warm-up is."""
+        self.status = replace(self.status, drift=drift)
 
     def show(self, progress: MotionProgress) -> None:
         """See `MotionWatch.show`; links do not show a motion before they ask for it."""
-        if not self._shown:
-            self._shown, self.began = True, time.time()
+        if self.status.motion is None:
+            self.began = time.time()
         self._tell(progress)
 
     def request(self) -> OperatorRequest:
@@ -346,52 +317,34 @@ class RunWatch:
                 raise TypeError(f"{request!r} is no OperatorRequest")
             self._request = request
         except Exception as error:  # the arm moves: a screen must not decide how it ends
-            self.deaf = self.deaf or error
+            became = "the last request stayed in force"
             if self._request.held and not self.stop.requested:
-                self._held_deaf = self.stop.requested = True
+                self.stop.requested = True
+                became = "the arm was held, which nobody could end any more: the run was stopped"
+                self._troubles.pop("request", None)
+            self._troubles.setdefault(
+                "request",
+                f"the operator could not be asked for requests ({type(error).__name__}: {error}); "
+                f"{became}",
+            )
         return self._request
 
     @property
     def troubles(self) -> tuple[str, ...]:
         """What went wrong with the operator's screen, in sentences."""
-        sentences = []
-        if self.blind is not None:
-            sentences.append(
-                f"the operator's screen failed ({_words(self.blind)}); nothing was shown"
-            )
-        if self.deaf is not None:
-            became = "the last request stayed in force"
-            if self._held_deaf:
-                became = "the arm was held, which nobody could end any more: the run was stopped"
-            why = _words(self.deaf)
-            sentences.append(f"the operator could not be asked for requests ({why}); {became}")
-        return tuple(sentences)
+        return tuple(self._troubles.values())
 
-    def _tell(self, progress: MotionProgress | None) -> None:
-        if self.blind is not None:
-            return
+    def _tell(self, progress: MotionProgress | None, **changes: Any) -> None:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
-        wished = max(self._request.override, 0.01)
-        left = max(self._duration - done, 0.0) / min(self._most, wished) + self.time_left / wished
-        status = RunStatus(
-            self._phase,
-            self._number,
-            self._total,
-            left,
-            motion=progress,
-            drift=self.drift,
-            notes=self._notes,
-            motions_left=self.motions_left,
+        requested = max(self._request.override, 0.01)
+        left = max(self._duration - done, 0.0) / min(self._most, requested)
+        self.status = replace(
+            self.status, motion=progress, time_left=left + self.time_left / requested, **changes
         )
+        if "show" in self._troubles:
+            return
         try:
-            self.operator.show(status)
+            self.operator.show(self.status)
         except Exception as error:  # likewise
-            self.blind = error
-
-
-def _phase_of(kind: str) -> Phase:
-    return cast(Phase, WORDS.get(kind, kind))
-
-
-def _words(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+            said = f"{type(error).__name__}: {error}"
+            self._troubles["show"] = f"the operator's screen failed ({said}); nothing was shown"

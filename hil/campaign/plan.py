@@ -1,20 +1,44 @@
-"""What a campaign is going to do: its excitation and its validation motions, in one small file."""
+"""What a campaign is going to do: its excitation and its validation motions, in one small file.
+
+Around a designed excitation, or one found in a few seconds.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import isqrt
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
+from hil.cell import Cell
+from hil.design import DesignSettings, preset, run_search
+from hil.design.advice import NoExcitationError, forbidden
 from hil.errors import InputError
 from hil.files import write_atomically
+from hil.motion_checks import MotionChecks, planned
+from hil.progress import Reporter
 from hil.reading import json_of, text_of
-from identification.excitation import Excitation
+from identification.excitation import (
+    RESCORE_PERIOD,
+    DrawnMotion,
+    Excitation,
+    NoFeasibleMotionError,
+    Objective,
+    random_validation_motions,
+)
 from identification.excitation.excitation import trajectory_from_dict
 from planner import FourierSeries, PiecewiseCubic, PlanFile
 
+from .errors import MotionRefusedError
+
+LEAST: Final = 4
+"""Individuals that a genetic search needs."""
+SLOWEST: Final = 0.5
+"""Smallest share of a joint's speed that is tried: slow motions excite little."""
+LONGEST: Final = 60.0
+"""s that the excitation may last."""
 FORMAT_VERSION = 4
 """1 kept no moves: of validation motions the trajectories only, and no limits. 2 knew excitations
 through via points only, without their method, 3 validation motions in pieces only, no sines."""
@@ -132,3 +156,90 @@ class CampaignPlan:
             ),
             moves_from_dict(content),
         )
+
+
+def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
+    """Search an excitation quickly and draw the validation motions, all within the cell.
+
+    The paper's method B with as few individuals as `[campaign].candidates` allows; `hil design`
+    searches longer and finds better ones.
+
+    Raises:
+        NoExcitationError: says which constraint forbids every motion, where, and by how much;
+            of the validation motions as well.
+    """
+    excitation = run_search(cell, quick_settings(cell), reporter).excitation
+    return plan_around(cell, excitation)
+
+
+def quick_settings(cell: Cell) -> DesignSettings:
+    """Settings of the quick search: its seed, via points and size are those of `[campaign]`.
+
+    It scores at most `candidates` motions (4 at least), in about as many generations as each has
+    individuals.
+    """
+    campaign = cell.campaign
+    motions = max(LEAST, campaign.candidates)
+    population = max(LEAST, isqrt(4 * motions // 3))
+    return preset("b").replaced(
+        seed=campaign.seed,
+        search={"population": population, "generations": motions // population, "polish": 0},
+        via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": SLOWEST},
+        constraints={"closed": True, "collision": True, "current": True, "max_duration": LONGEST},
+    )
+
+
+def plan_around(
+    cell: Cell, excitation: Excitation, checks: MotionChecks | None = None
+) -> CampaignPlan:
+    """Return a plan with this excitation, and validation motions motion for the cell.
+
+    Args:
+        cell: whose `[campaign]` says how many validation motions, and from which seed.
+        excitation: designed for this cell.
+        checks: those of the cell, where they are at hand.
+
+    Raises:
+        MotionRefusedError: the excitation must not be sent to this cell's arm.
+        NoExcitationError: no validation motion keeps the constraints; says which one.
+    """
+    checks = checks or MotionChecks.of(cell)
+    problem = checks.refusal(excitation.trajectory)
+    if problem is not None:
+        raise MotionRefusedError("the excitation", problem, "design another motion")
+    # A design may have judged some parameters only, or what it adds to earlier archives; what is
+    # executed is compared with the motion by itself, over all parameters.
+    criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
+    excitation = replace(excitation, criteria=criteria)
+    validation = _validation_motions(cell, checks)
+    return CampaignPlan(
+        excitation,
+        tuple(PlannedMotion(motion.trajectory, _moves_of(cell, motion)) for motion in validation),
+        _moves_of(cell, excitation),
+    )
+
+
+def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, ...]:
+    settings = cell.campaign
+    try:
+        return random_validation_motions(
+            cell.joint_limits,
+            home=cell.home,
+            seed=settings.seed,
+            count=settings.validation_runs,
+            n_via=settings.n_via,
+            fly=settings.fly,
+            checker=checks.checker,
+            currents=planned(checks.currents),
+        )
+    except NoFeasibleMotionError as error:
+        reason = forbidden(error, checks.frame)
+        raise NoExcitationError(f"no motion to test the result with: {reason}") from error
+
+
+def _moves_of(cell: Cell, motion: Excitation | DrawnMotion) -> PlanFile | None:
+    """The moves behind a motion through via points; none behind sines."""
+    moves, via_points = motion.moves, motion.via_points
+    if moves is None or via_points is None:
+        return None
+    return PlanFile(cell.joint_names, via_points[0], moves, limits=cell.joint_limits)

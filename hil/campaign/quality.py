@@ -49,34 +49,20 @@ COMPARED: Final = 9
 """Earlier repetitions that a new one is compared with."""
 FEWEST: Final = 4
 """Earlier repetitions that tell their own scatter."""
-_FIRST_FOLLOWING: Final = 0.05
-"""Share of the following-error threshold by which the first repetitions may differ (rms)."""
-_FIRST_CURRENT: Final = 0.1
-"""Share of the motion's rms current by which they may."""
-_LEAST_FOLLOWING: Final = 0.005
-_LEAST_CURRENT: Final = 0.02
-"""Likewise: differences below that never reject, however well the earlier ones agree."""
+_CHANNELS: Final = (
+    ("position", "the following-error threshold", 0.05, 0.005),
+    ("current", "its rms current", 0.1, 0.02),
+)
+"""What is compared; its scale; the share of it by which the first repetitions may differ (rms); and
+the share that never rejects, however well the earlier ones agree."""
 _WIDE: Final = 3.0
 """Times the median difference of the earlier ones that is never rejected."""
 _OUTLYING: Final = 6.0
 """Robust standard deviations above the median difference."""
+_FEWEST_ALIKE: Final = 2
+"""Attempts that must agree before they speak against what counts."""
 
-
-@dataclass(frozen=True)
-class Groups:
-    """Repetitions of two kinds: each agrees with its own and with none of the others.
-
-    Attributes:
-        reference: file names of those that count.
-        later: of attempts that were rejected for being unlike them.
-    """
-
-    reference: tuple[str, ...]
-    later: tuple[str, ...]
-
-    def with_one(self, name: str) -> Groups:
-        """One more later attempt."""
-        return Groups(self.reference, (*self.later, name))
+Motion = PiecewiseCubic | FourierSeries
 
 
 @dataclass(frozen=True)
@@ -87,13 +73,15 @@ class Problem:
         sentence: in words.
         by_hand: whether somebody held or slowed it: that says nothing against the arm.
         apart: whether it is only unlike the repetitions before it.
-        against: where so many attempts agree with it that the arm itself may be another by now.
+        reference, later: where so many attempts agree with it that the arm itself may be another
+            by now: file names of the repetitions that count, and of those attempts.
     """
 
     sentence: str
     by_hand: bool = False
     apart: bool = False
-    against: Groups | None = None
+    reference: tuple[str, ...] = ()
+    later: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return self.sentence
@@ -136,44 +124,45 @@ class Played:
         same = (np.diff(position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
         rows &= ~(same & (velocity != 0.0).any(axis=1))
         return cls(
-            position=columns["position"][rows],
-            current=columns["target_current"][rows],
-            commanded=position[rows],
-            missed=missed,
+            columns["position"][rows], columns["target_current"][rows], position[rows], missed
         )
 
 
-def problem_of(
-    played: Played, trajectory: PiecewiseCubic | FourierSeries, cell: Cell
-) -> Problem | None:
-    """What is wrong with a motion by itself; None if nothing is.
-
-    Args:
-        played: it, as archived.
-        trajectory: it, as planned.
-        cell: its period and current limits.
-    """
-    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
-    torn = torn_or_slowed(played, trajectory, cell)
-    if torn is not None:
+def problem_of(played: Played, trajectory: Motion, cell: Cell) -> Problem | None:
+    """What is wrong with a motion by itself; None if nothing is."""
+    if (torn := torn_or_slowed(played, trajectory, cell)) is not None:
         return torn
+    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     if played.missed > MISSED_SHARE * wanted:
         words = f"{played.missed} of {wanted} packets were missed; {MISSED_SHARE:.0%} are bearable"
         return Problem(words)
-    return _stuck(played, cell) or _saturation(played.current, cell)
+    high = np.abs(played.current) >= SATURATED * cell.drive_train.current_limit
+    for joint, name in enumerate(cell.joint_names):
+        # A joint that stands while it is commanded to move: nothing is estimated from such data.
+        found = stuck(played.position[:, joint], played.commanded[:, joint])
+        if found is not None:
+            start, travel = found
+            return Problem(
+                f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
+                f"after the begin on while it is commanded to move by {travel:.3g}"
+            )
+    for name, column in zip(cell.joint_names, high.T, strict=True):
+        edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
+        longest = int((edges[1::2] - edges[::2]).max(initial=0))
+        if longest >= SATURATED_CYCLES:
+            lasted = f"{longest * cell.period * 1e3:.0f} ms"
+            return Problem(f"the current of {name} was at its limit for {lasted}")
+    return None
 
 
-def torn_or_slowed(
-    played: Played, trajectory: PiecewiseCubic | FourierSeries, cell: Cell
-) -> Problem | None:
+def torn_or_slowed(played: Played, trajectory: Motion, cell: Cell) -> Problem | None:
     """Whether a motion is not all there, or was held or slowed: it is another motion then."""
     wanted, rows = int(np.ceil(trajectory.duration / cell.period - 1e-6)), len(played.commanded)
     if rows < wanted - 1:
         return Problem(f"{rows} of its {wanted} cycles are archived")
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
-    planned = trajectory.sample(times)[0]
-    offset = played.commanded[0] - planned[0]
-    off = np.abs(played.commanded - planned - offset).max(axis=1)
+    off = played.commanded - trajectory.sample(times)[0]
+    off = np.abs(off - off[0]).max(axis=1)
     if off.max() <= OFF_PATH:
         return None
     at = int(np.argmax(off > OFF_PATH)) * cell.period
@@ -184,17 +173,11 @@ def torn_or_slowed(
     )
 
 
-def unrest(played: Played, cell: Cell) -> Problem | None:
-    """What is wrong with a recording of the arm at rest: the noise of its sensors is read from it.
-
-    Args:
-        played: it, as archived.
-        cell: its joints' names.
-    """
+def unrest(played: Played, _trajectory: Motion, cell: Cell) -> Problem | None:
+    """What is wrong with a recording of the arm at rest, from which its sensors' noise is read."""
     rows = min(round(STANDSTILL_WINDOW / cell.period), len(played.position) - 1)
-    speed = np.abs(played.position[rows:] - played.position[:-rows]).max(axis=0) / (
-        rows * cell.period
-    )
+    moved = np.abs(played.position[rows:] - played.position[:-rows]).max(axis=0)
+    speed = moved / (rows * cell.period)
     allowed = np.maximum(cell.model.friction.standstill, _ARM_MOVED / STANDSTILL_WINDOW)
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
@@ -205,61 +188,22 @@ def unrest(played: Played, cell: Cell) -> Problem | None:
     )
 
 
-def _stuck(played: Played, cell: Cell) -> Problem | None:
-    """A joint that stands while it is commanded to move: nothing is estimated from such data."""
-    for joint, name in enumerate(cell.joint_names):
-        found = stuck(played.position[:, joint], played.commanded[:, joint])
-        if found is not None:
-            start, travel = found
-            return Problem(
-                f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
-                f"after the begin on while it is commanded to move by {travel:.3g}"
-            )
-    return None
-
-
-def _saturation(current: Array, cell: Cell) -> Problem | None:
-    high = np.abs(current) >= SATURATED * cell.drive_train.current_limit
-    for joint, column in enumerate(high.T):
-        run = _longest_run(column)
-        if run >= SATURATED_CYCLES:
-            return Problem(
-                f"the current of {cell.joint_names[joint]} was at its limit for "
-                f"{run * cell.period * 1e3:.0f} ms"
-            )
-    return None
-
-
-def _longest_run(flags: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
-
-
-@dataclass(frozen=True, eq=False)
-class Difference:
-    """Of one repetition from the median of others, rms over time, (n,) each.
-
-    Attributes:
-        position: as a share of the following-error threshold.
-        current: as a share of the motion's rms current.
-    """
-
-    position: Array
-    current: Array
+_JUDGES: Final = {
+    "standstill": unrest,
+    "validation": problem_of,
+    # A cold arm may want more current than it has: that is what warming up is for.
+    "warmup": torn_or_slowed,
+}
+"""By kind of motion; repetitions are compared as well, and other motions are not judged."""
 
 
 class RepetitionCheck:
-    """Compares repetitions of one motion with the last ones that were found good.
+    """Compares repetitions of one motion with the last ones that were found good."""
 
-    Args:
-        cell: whose thresholds count.
-        trajectory: the motion.
-    """
-
-    def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
+    def __init__(self, cell: Cell, trajectory: Motion) -> None:
         self._cell, self._trajectory = cell, trajectory
         self._earlier: deque[Played] = deque(maxlen=COMPARED)
-        self._differences: deque[Difference] = deque(maxlen=2 * COMPARED)
+        self._differences: deque[Array] = deque(maxlen=2 * COMPARED)
 
     def learn(self, archives: Sequence[Path]) -> None:
         """Take in repetitions that were found good before."""
@@ -272,26 +216,27 @@ class RepetitionCheck:
             self._differences.append(self._difference(played))
         self._earlier.append(played)
 
-    @property
-    def known(self) -> int:
-        """Repetitions that a new one is compared with."""
-        return len(self._earlier)
-
     def problem(self, played: Played) -> Problem | None:
         """Why a repetition is of no use; None if it is good."""
         found = problem_of(played, self._trajectory, self._cell)
         if found is not None or not self._earlier:
             return found
-        new = self._difference(played)
-        for what, values, first, least in (
-            ("position", new.position, _FIRST_FOLLOWING, _LEAST_FOLLOWING),
-            ("current", new.current, _FIRST_CURRENT, _LEAST_CURRENT),
-        ):
-            past = np.array([getattr(one, what) for one in self._differences])
-            bound = _bounds(past, first, least, len(values))
-            joint = int(np.argmax(values / bound))
-            if values[joint] > bound[joint]:
-                return self._problem(what, joint, float(values[joint]), float(bound[joint]))
+        new, past = self._difference(played), np.array(self._differences)
+        for row, (what, scale, first, least) in enumerate(_CHANNELS):
+            bound = np.full(len(new[row]), first)
+            if len(past) >= FEWEST - 1:
+                middle = np.median(past[:, row], axis=0)
+                scatter = 1.4826 * np.median(np.abs(past[:, row] - middle), axis=0)
+                usual = np.maximum(_WIDE * middle, middle + _OUTLYING * scatter)
+                bound = np.maximum(usual, least)
+            joint = int(np.argmax(new[row] / bound))
+            if new[row, joint] > bound[joint]:
+                return Problem(
+                    f"the {what} of {self._cell.joint_names[joint]} differs from that of the "
+                    f"{len(self._earlier)} repetitions before by {new[row, joint]:.2%} of {scale} "
+                    f"(rms); {bound[joint]:.2%} are allowed",
+                    apart=True,
+                )
         return None
 
     @property
@@ -299,27 +244,23 @@ class RepetitionCheck:
         """How well the last good repetition agrees with those before, in a few words."""
         if not self._differences:
             return "nothing to compare with yet"
-        return f"currents agree within {self._differences[-1].current.max():.1%} (rms)"
+        return f"currents agree within {self._differences[-1][1].max():.1%} (rms)"
 
-    def _difference(self, played: Played) -> Difference:
+    def _difference(self, played: Played) -> Array:
+        """Of a repetition from the median of the earlier ones, rms over time (2, n).
+
+        Positions as shares of the following-error thresholds, currents of the motion's rms current.
+        """
         rows = min(len(played.position), *(len(one.position) for one in self._earlier))
-        cell = self._cell
         usual = np.median([one.position[:rows] for one in self._earlier], axis=0)
-        apart = np.sqrt(np.mean((played.position[:rows] - usual) ** 2, axis=0))
         currents = np.median([one.current[:rows] for one in self._earlier], axis=0)
-        off = np.sqrt(np.mean((played.current[:rows] - currents) ** 2, axis=0))
-        size = np.sqrt(np.mean(currents**2, axis=0))
-        floor = 1e-3 * cell.drive_train.current_limit
-        return Difference(apart / following_threshold(cell), off / np.maximum(size, floor))
+        size = np.maximum(_rms(currents), 1e-3 * self._cell.drive_train.current_limit)
+        apart = _rms(played.position[:rows] - usual) / following_threshold(self._cell)
+        return np.array([apart, _rms(played.current[:rows] - currents) / size])
 
-    def _problem(self, what: str, joint: int, value: float, bound: float) -> Problem:
-        name, earlier = self._cell.joint_names[joint], len(self._earlier)
-        scale = "the following-error threshold" if what == "position" else "its rms current"
-        return Problem(
-            f"the {what} of {name} differs from that of the {earlier} repetitions before by "
-            f"{value:.2%} of {scale} (rms); {bound:.2%} are allowed",
-            apart=True,
-        )
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
 
 
 def following_threshold(cell: Cell) -> Array:
@@ -328,29 +269,9 @@ def following_threshold(cell: Cell) -> Array:
     return np.asarray(np.abs(cell.drive_train.joint_from_motor) @ (2.0 * np.pi * turns))
 
 
-def _bounds(past: Array, first: float, least: float, n_joints: int) -> Array:
-    """Largest difference allowed (n,), from those of earlier repetitions (k, n)."""
-    if len(past) < FEWEST - 1:
-        return np.full(n_joints, first)
-    middle = np.median(past, axis=0)
-    scatter = 1.4826 * np.median(np.abs(past - middle), axis=0)
-    usual = np.maximum(_WIDE * middle, middle + _OUTLYING * scatter)
-    return np.asarray(np.maximum(usual, least))
-
-
-_JUDGED: Final = frozenset({"standstill", "excitation", "validation", "warmup"})
-_FEWEST_ALIKE: Final = 2
-"""Attempts that must agree before they speak against what counts."""
-
-
 @dataclass(frozen=True)
 class Rejected:
-    """A motion that ended well and is of no use.
-
-    Attributes:
-        archive: its file name.
-        reason: in words.
-    """
+    """A motion that ended well and is of no use: the file name of its archive, and why."""
 
     archive: str
     reason: str
@@ -362,20 +283,13 @@ class Entering:
     Only after an archive says itself that it is rejected does the manifest: whoever finds the file
     alone, or in a folder whose run was killed, must not pool it either.
 
-    Args:
-        folder: of the campaign.
-        cell: of the campaign.
-        motion: its excitation.
-
     Attributes:
         rejected: what was found to be of no use.
         adopted: what an earlier run completed and did not live to enter.
         notes: what a reader must know of how repetitions were judged.
     """
 
-    def __init__(
-        self, folder: CampaignFolder, cell: Cell, motion: PiecewiseCubic | FourierSeries
-    ) -> None:
+    def __init__(self, folder: CampaignFolder, cell: Cell, motion: Motion) -> None:
         self._folder, self._cell, self._motion = folder, cell, motion
         self._check = RepetitionCheck(cell, self._motion)
         self._check.learn(folder.completed("excitation"))
@@ -384,35 +298,45 @@ class Entering:
         self.notes: list[str] = []
 
     def enter(self, interval: Interval, name: str, known: Problem | None = None) -> Problem | None:
-        """Judge the whole archive of an interval and enter it; why it is of no use, or None.
-
-        Args:
-            interval: what was run.
-            name: of the archive.
-            known: what is wrong with it, where that is known already.
-        """
-        played, problem = None, known
-        if problem is None and interval.kind in _JUDGED:
+        """Judge the whole archive of an interval and enter it; why it is of no use, or None."""
+        problem, played = known, None
+        if problem is None and interval.kind == "excitation":
             played = self._played(name)
-            if interval.kind == "excitation":
-                problem = self._judged(played)
-            elif interval.kind == "standstill":
-                problem = unrest(played, self._cell)
-            else:
-                # A cold arm may want more current than it has: that is what warming up is for.
-                judge = problem_of if interval.kind == "validation" else torn_or_slowed
-                problem = judge(played, interval.trajectory, self._cell)
-        if problem is not None:
-            amend_outcome(self._folder.archives / name, REJECTED, problem.sentence)
-            self._folder.add(name, REJECTED, problem.sentence)
-            self.rejected.append(Rejected(name, problem.sentence))
-            if problem.against is not None:
-                return replace(problem, against=problem.against.with_one(name))
-            return problem
-        self._folder.add(name, "completed")
-        if played is not None and interval.kind == "excitation":
-            self._check.accept(played)
-        return None
+            problem = self._judged(played)
+        elif problem is None and (judge := _JUDGES.get(interval.kind)) is not None:
+            problem = judge(self._played(name), interval.trajectory, self._cell)
+        if problem is None:
+            self._folder.add(name, "completed")
+            if played is not None:
+                self._check.accept(played)
+            return None
+        amend_outcome(self._folder.archives / name, REJECTED, problem.sentence)
+        self._folder.add(name, REJECTED, problem.sentence)
+        self.rejected.append(Rejected(name, problem.sentence))
+        return replace(problem, later=(*problem.later, name)) if problem.reference else problem
+
+    def agreement(self) -> str:
+        """How well the last good repetition agrees with those before, in a few words."""
+        return self._check.agreement
+
+    def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
+        """Enter archives that an earlier run completed and was killed before it entered them."""
+        sought = {(one.kind, one.index): one for one in intervals}
+        entered = {entry.name for entry in self._folder.manifest()}
+        found = {path.name for path in self._folder.archives.glob("*.mcap")}
+        for name in sorted(found - entered):
+            parsed = ArchiveName.parse(name)
+            interval = None if parsed is None else sought.get((parsed.kind, parsed.index))
+            if interval is None or self._folder.whole(interval.kind, interval.index) is not None:
+                continue
+            try:
+                archive = open_archive(self._folder.archives / name, fields=())
+            except ArchiveError:
+                continue  # torn at its head: done again
+            completed = archive.outcome is not None and archive.outcome.outcome == "completed"
+            if archive.complete and completed and made(archive.header):
+                self.adopted.append(name)
+                self.enter(interval, name)
 
     def _judged(self, played: Played) -> Problem | None:
         """What is wrong with a repetition.
@@ -431,12 +355,11 @@ class Entering:
         if len(alike) + 1 < max(enough, beside + 2):
             return problem
         if len(good) > 1:
-            groups = Groups(tuple(path.name for path in good), alike)
-            return replace(problem, against=groups)
+            return replace(problem, reference=tuple(path.name for path in good), later=alike)
         reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
         for path in good:
             amend_outcome(path, REJECTED, reason)
-            self._folder.reject(path.name, reason)
+            self._folder.add(path.name, REJECTED, reason)
             self.rejected.append(Rejected(path.name, reason))
             self.notes.append(
                 f"{path.name} was the only repetition that counted, and was rejected because "
@@ -449,61 +372,25 @@ class Entering:
     def _alike(self, played: Played) -> tuple[tuple[str, ...], int]:
         """Attempts that agree with this one and each other, and how many do with the good ones.
 
-        Of those that were rejected since one was good: what was unlike an earlier one that counted
-        says nothing against those that count now.
+        Of sound ones that were rejected since one was good: what was unlike an earlier one that
+        counted says nothing against those that count now.
         """
-        check, alike, beside = RepetitionCheck(self._cell, self._motion), list[str](), 0
-        check.accept(played)
-        for name, other in self._sound_but_rejected().items():
-            beside += self._check.problem(other) is None
-            if check.problem(other) is None:
-                check.accept(other)
-                alike.append(name)
-        return tuple(alike), beside
-
-    def _sound_but_rejected(self) -> dict[str, Played]:
-        """Repetitions rejected since the last good one, and sound by themselves, in order."""
-        found: dict[str, Played] = {}
+        rejected = list[str]()
         for entry in self._folder.manifest():
             name = ArchiveName.parse(entry.name)
-            if name is None or name.kind != "excitation":
-                continue
-            if entry.outcome != REJECTED:
-                found.clear()
-                continue
+            if name is not None and name.kind == "excitation":
+                rejected = [*rejected, entry.name] if entry.outcome == REJECTED else []
+        check, alike, beside = RepetitionCheck(self._cell, self._motion), list[str](), 0
+        check.accept(played)
+        for one in rejected:
             with suppress(ArchiveError):
-                played = self._played(entry.name)
-                if problem_of(played, self._motion, self._cell) is None:
-                    found[entry.name] = played
-        return found
+                other = self._played(one)
+                if problem_of(other, self._motion, self._cell) is None:
+                    beside += self._check.problem(other) is None
+                    if check.problem(other) is None:
+                        check.accept(other)
+                        alike.append(one)
+        return tuple(alike), beside
 
     def _played(self, name: str) -> Played:
         return Played.of(open_archive(self._folder.archives / name, fields=FIELDS))
-
-    def agreement(self) -> str:
-        """How well the last good repetition agrees with those before, in a few words."""
-        return self._check.agreement
-
-    def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
-        """Enter archives that an earlier run completed and was killed before it entered them.
-
-        Args:
-            intervals: what a run may have made.
-            made: whether an archive was made of this plan, by its header.
-        """
-        sought = {(one.kind, one.index): one for one in intervals}
-        entered = {entry.name for entry in self._folder.manifest()}
-        found = sorted(path.name for path in self._folder.archives.glob("*.mcap"))
-        for name in (one for one in found if one not in entered):
-            parsed = ArchiveName.parse(name)
-            interval = None if parsed is None else sought.get((parsed.kind, parsed.index))
-            if interval is None or self._folder.whole(interval.kind, interval.index) is not None:
-                continue
-            try:
-                archive = open_archive(self._folder.archives / name, fields=())
-            except ArchiveError:
-                continue  # torn at its head: done again
-            completed = archive.outcome is not None and archive.outcome.outcome == "completed"
-            if archive.complete and completed and made(archive.header):
-                self.adopted.append(name)
-                self.enter(interval, name)

@@ -11,11 +11,9 @@ from typing import Final, Literal, Self
 from pydantic import StrictBool, model_validator
 
 from hil.files import write_or_tell
-from hil.reading import lies_there, text_of
 from hil.results import Frozen
 
-from .errors import CampaignFolderError
-from .folder import CampaignFolder, read_back
+from .folder import CampaignFolder, load_record
 
 FORMAT_VERSION: Final = 1
 AS_MODELLED: Final = "as modelled"
@@ -82,18 +80,13 @@ class Rehearsal(Frozen):
         Raises:
             CampaignFolderError: the file cannot be read.
         """
-        path = folder.rehearsal
-        if not lies_there(path):
-            return None
-        try:
-            return read_back(cls, text_of(path), strict=False)
-        except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise CampaignFolderError(
-                folder.root,
-                f"{path.name} cannot be read ({why})",
-                f"rehearse again (`hil rehearse {folder.root} --again`)",
-            ) from error
+        return load_record(
+            cls,
+            folder.rehearsal,
+            "cannot be read",
+            f"rehearse again (`hil rehearse {folder.root} --again`)",
+            strict=False,
+        )
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all.
@@ -105,10 +98,6 @@ class Rehearsal(Frozen):
 
     def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
         """Whether it is the rehearsal of a plan, or of the same motions repeated as often or not.
-
-        Args:
-            folder: of the campaign.
-            plan_hash: of the plan; a folder that was changed since has another.
 
         Raises:
             CampaignFolderError: cell, URDF or plan cannot be read.

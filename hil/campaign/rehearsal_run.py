@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -83,8 +83,7 @@ class Twin:
     """A simulated arm to rehearse on.
 
     Attributes:
-        cell: nominal, but simulated, with fewer repetitions; what was varied is in its
-            `[simulation]`.
+        cell: nominal, but simulated; what was varied is in its `[simulation]`.
         truth: planted parameters (p,) in the order of the model.
         assumed: what the arm has by assumption, in sentences.
         seed: of everything varied.
@@ -97,13 +96,7 @@ class Twin:
 
     @classmethod
     def of(cls, cell: Cell, *, seed: int, repetitions: int) -> Twin:
-        """Draw an arm for a cell.
-
-        Args:
-            cell: of any robot, with or without `[simulation]`.
-            seed: of what is varied.
-            repetitions: at most so many.
-        """
+        """Draw an arm for a cell."""
         rng = np.random.default_rng(seed)
         planted = _varied(cell, rng)
         settings, assumed = _simulation(cell, planted, seed)
@@ -117,18 +110,15 @@ class Twin:
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool, drive: SimulatedDrive | None = None) -> Link:
-        """A link in virtual time to the arm, with faults now and then.
-
-        Args:
-            seconds: of motion that are to be run on it.
-            effects: switch on what the model leaves out.
-            drive: the arm's gears and motors, where they shall not be those of the cell.
-        """
+        """A link in virtual time to the arm, with faults now and then."""
+        table = self.cell.controller
+        # A current loop as late as the cell says that its currents are.
+        lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
         settings = replace(
             controller_settings(self.cell, effects=effects),
-            servo=_servo(self.cell),
+            servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP))),
             # Packets in a row that the cell says a motion survives.
-            missed_replies=self.cell.controller.max_gap + 1,
+            missed_replies=table.max_gap + 1,
             while_silent="continue",
         )
         controller = simulated_controller(
@@ -232,47 +222,35 @@ def _simulation(
 
 
 def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
-    """Effects at their default sizes, with springs that suit the size of the arm."""
-    n = len(cell.joint_names)
-    links = _inertia(cell, cell.home).diagonal()
-    reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
-    main = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
-    compliance = np.zeros(n)
-    compliance[main] = 1.0 / (reduced[main] * RESONANCE**2)
-    if main.any():
-        compliance *= max(1.0, _fastest(cell, rotors, compliance) / FASTEST) ** 2
-    return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))
+    """Effects at their default sizes, with springs that suit the size of the arm.
 
-
-def _inertia(cell: Cell, posture: Array) -> Array:
-    """Inertia matrix of the links (n, n) [kg m²]."""
-    model = pinocchio.buildModelFromXML(cell.urdf)
-    upper = np.triu(pinocchio.crba(model, model.createData(), posture))
-    return np.asarray(upper + np.triu(upper, 1).T)
-
-
-def _fastest(cell: Cell, rotors: Array, compliance: Array) -> float:
-    """Fastest resonance of springs (n,) in any of some postures within the limits [rad/s].
-
-    Where axes are almost parallel, as the first and the third of an arm with seven, the link beyond
-    a spring is much lighter than its own inertia says: the next axis gives way.
+    None is stiffer than resonates at `FASTEST` in any of some postures within the limits. Where
+    axes are almost parallel, as the first and the third of an arm with seven, the link beyond a
+    spring is much lighter than its own inertia says: the next axis gives way.
     """
-    limits, soft = cell.joint_limits, compliance > 0.0
-    shares = np.random.default_rng(0).random((POSTURES, len(rotors)))
-    postures = [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]
-    root = 1.0 / np.sqrt(compliance[soft])
-    found = 0.0
-    for posture in postures:
-        inertia = _inertia(cell, posture) + np.diag(np.where(soft, 0.0, rotors))
-        mobility = np.linalg.inv(inertia)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
-        found = max(found, float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1]))
-    return float(np.sqrt(found))
+    n, limits = len(rotors), cell.joint_limits
+    model = pinocchio.buildModelFromXML(cell.urdf)
+    data = model.createData()
 
+    def inertia(posture: Array) -> Array:
+        upper = np.triu(pinocchio.crba(model, data, posture))
+        return np.asarray(upper + np.triu(upper, 1).T)
 
-def _servo(cell: Cell) -> ServoSettings:
-    """A current loop as late as the cell says that its currents are."""
-    lag = (LOOP_CYCLES - cell.controller.current_delay_cycles) * cell.period
-    return ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP)))
+    links = inertia(cell.home).diagonal()
+    reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
+    soft = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
+    compliance = np.zeros(n)
+    compliance[soft] = 1.0 / (reduced[soft] * RESONANCE**2)
+    root, fastest = 1.0 / np.sqrt(compliance[soft]), 0.0
+    shares = np.random.default_rng(0).random((POSTURES, n))
+    for posture in [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]:
+        if soft.any():
+            whole = inertia(posture) + np.diag(np.where(soft, 0.0, rotors))
+            mobility = np.linalg.inv(whole)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
+            found = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
+            fastest = max(fastest, found)
+    compliance *= max(1.0, float(np.sqrt(fastest)) / FASTEST) ** 2
+    return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))
 
 
 MOST_SIGMA: Final = 4.0
@@ -284,151 +262,103 @@ SATURATED: Final = 0.99
 _NAMED: Final = 3
 
 
-@dataclass(frozen=True)
-class Ran:
-    """How the motions went on one twin.
+def judged(name: str, value: float | None, bound: float, good: str, bad: str = "") -> Criterion:
+    """A criterion that is met by a finite value up to `bound`.
 
-    Attributes:
-        name: of the run, in words.
-        failures: what went wrong, in sentences.
+    Args:
+        name: of the criterion.
+        value: what was found; None where it cannot be determined.
+        bound: the largest value that passes.
+        good: what was found, in words.
+        bad: the same of what does not pass, where that is more.
     """
-
-    name: str
-    failures: tuple[str, ...]
-
-
-def of_motions(ran: Ran) -> Criterion:
-    """Every motion was accepted, and none refused, lost or stopped."""
-    good = not ran.failures
+    known = value is not None and np.isfinite(value)
+    passed = value is not None and known and value <= bound
     return Criterion(
-        name=f"motions ({ran.name})",
-        value=float(len(ran.failures)),
-        bound=0.0,
-        passed=good,
-        sentence=(
-            f"{ran.name}: every motion ran to its end, none was refused by the guard or tripped"
-            if good
-            else f"{ran.name}: {'; '.join(ran.failures)}"
-        ),
+        name=name,
+        value=value if known else None,
+        bound=bound,
+        passed=bool(passed),
+        sentence=good if passed else bad or good,
     )
 
 
-def of_currents(twin: Twin, folder: CampaignFolder, name: str, bound: float) -> Criterion:
+def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
     """The largest current of any motor, as a share of its limit."""
     worst, motor, where = 0.0, 0, ""
-    limit = twin.cell.drive_train.current_limit
+    limit = cell.drive_train.current_limit
     for entry in folder.manifest():
         current = np.abs(open_archive(folder.archives / entry.name).columns["target_current"])
         share = np.nan_to_num(current).max(axis=0, initial=0.0) / limit
         if share.max() > worst:
             worst, motor, where = float(share.max()), int(share.argmax()), entry.name
-    return Criterion(
-        name=f"current ({name})",
-        value=worst,
-        bound=bound,
-        passed=worst <= bound,
-        sentence=f"{name}: the largest current is {worst:.0%} of its limit (motor of "
-        f"{twin.cell.joint_names[motor]}, {where}), at most {bound:.0%} is wanted",
+    return judged(
+        f"current ({name})",
+        worst,
+        bound,
+        f"{name}: the largest current is {worst:.0%} of its limit (motor of "
+        f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is wanted",
     )
 
 
-def of_estimate(
-    twin: Twin, folder: CampaignFolder, reporter: Reporter
-) -> tuple[Criterion, Criterion, Criterion]:
+def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
     """What identification makes of the archives: determined, found again, predicting."""
-    paths = [
-        path
-        for kind in ("excitation", "validation", "standstill")
-        for path in folder.completed(kind)
-    ]
-    options = FIXED
+    bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
+    kinds = ("excitation", "validation", "standstill")
+    paths = [path for kind in kinds for path in folder.completed(kind)]
     try:
-        prepared = prepare_sources(gather_sources(paths, options.split), options, reporter)
-        estimation = estimate_with(prepared, options, reporter)
+        prepared = prepare_sources(gather_sources(paths, FIXED.split), FIXED, reporter)
+        estimation = estimate_with(prepared, FIXED, reporter)
     except (InputError, IdentificationError, RecordingError) as error:
-        return _unjudged(str(error))
+        why = f"cannot be determined, for nothing can be identified ({error})"
+        return [judged(name, None, bound, f"{name}: {why}") for name, bound in bounds.items()]
     model, found = twin.cell.model, estimation.result.pooled
-    factor = found.interval_factor / normal_limit(0.025)
+    undetermined = found.undetermined
+    deviation = found.interval_factor / normal_limit(0.025) * found.std
+    apart = np.abs(found.values - twin.truth) / deviation
+    distance = np.where(np.isfinite(apart), apart, 0.0)
+    known = int(np.isfinite(apart).sum())
+    far = [found.names[k] for k in np.argsort(-distance) if distance[k] > MOST_SIGMA]
+    sigma, asked = float(distance.max()) if known else None, f"{MOST_SIGMA:g} standard deviations"
     ours, theirs = (
         over_all(prediction_error(model, values, prepared.held_out)).rms
         for values in (found.values, twin.truth)
     )
-    return (
-        _determined(found.undetermined),
-        _found_again(found.names, (found.values - twin.truth) / (factor * found.std)),
-        _predicting(twin.cell.joint_names, ours / np.maximum(theirs, np.finfo(np.float64).tiny)),
+    ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)
+    joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
+    error_is = (
+        f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
+        f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is wanted"
     )
-
-
-def _unjudged(why: str) -> tuple[Criterion, Criterion, Criterion]:
-    def missing(name: str, bound: float) -> Criterion:
-        sentence = f"{name}: cannot be determined, for nothing can be identified ({why})"
-        return Criterion(name=name, value=None, bound=bound, passed=False, sentence=sentence)
-
-    return (
-        missing("excitation", 0.0),
-        missing("parameters", MOST_SIGMA),
-        missing("unseen motion", MOST_ERROR),
-    )
-
-
-def _determined(undetermined: Sequence[str]) -> Criterion:
-    count = len(undetermined)
-    return Criterion(
-        name="excitation",
-        value=float(count),
-        bound=0.0,
-        passed=count == 0,
-        sentence=(
-            "the excitation determines every parameter"
-            if count == 0
-            else f"the excitation says nothing about {count} parameters "
-            f"({_some(undetermined)}): design a motion that moves every joint"
+    return [
+        judged(
+            "excitation",
+            float(len(undetermined)),
+            bounds["excitation"],
+            "the excitation determines every parameter",
+            f"the excitation says nothing about {len(undetermined)} parameters "
+            f"({_some(undetermined)}): design a motion that moves every joint",
         ),
-    )
-
-
-def _found_again(names: Sequence[str], apart: Array) -> Criterion:
-    """`apart`: of each parameter from what was planted, in standard deviations (p,)."""
-    known = np.isfinite(apart)
-    if not known.any():
-        return _unjudged("no parameter has a standard deviation")[1]
-    distance = np.where(known, np.abs(apart), 0.0)
-    beyond = [names[i] for i in np.argsort(-distance) if distance[i] > MOST_SIGMA]
-    worst = float(distance.max())
-    return Criterion(
-        name="parameters",
-        value=worst,
-        bound=MOST_SIGMA,
-        passed=not beyond,
-        sentence=(
-            f"all {int(known.sum())} parameters were found within {worst:.1f} standard deviations "
-            f"of what was planted, {MOST_SIGMA:g} are allowed"
-            if not beyond
-            else f"{len(beyond)} of {int(known.sum())} parameters ({_some(beyond)}) are more than "
-            f"{MOST_SIGMA:g} standard deviations, up to {worst:.3g}, from what was planted: the "
-            "drive train or the model of the cell file is not that of the arm"
+        judged(
+            "parameters",
+            sigma,
+            MOST_SIGMA,
+            f"all {known} parameters were found within {sigma or 0.0:.1f} standard deviations of "
+            f"what was planted, {MOST_SIGMA:g} are allowed",
+            f"{len(far)} of {known} parameters ({_some(far)}) are more than {asked}, up to "
+            f"{sigma:.3g}, from what was planted: the drive train or the model of the cell file is "
+            "not that of the arm"
+            if sigma is not None
+            else "parameters: no parameter has a standard deviation",
         ),
-    )
-
-
-def _predicting(joints: Sequence[str], ratio: Array) -> Criterion:
-    """`ratio`: error on unseen motion over that of the planted parameters (n,)."""
-    worst = int(np.nanargmax(ratio)) if np.isfinite(ratio).any() else 0
-    value = float(ratio[worst])
-    passed = bool(np.isfinite(ratio).all()) and value <= MOST_ERROR
-    found = (
-        f"on unseen motion the torque error is {value:.2f} times what noise leaves "
-        f"({joints[worst]}), at most {MOST_ERROR:g} is wanted"
-    )
-    remedy = ": the excitation teaches too little; search a better one (`hil design`)"
-    return Criterion(
-        name="unseen motion",
-        value=value if np.isfinite(value) else None,
-        bound=MOST_ERROR,
-        passed=passed,
-        sentence=found if passed else found + remedy,
-    )
+        judged(
+            "unseen motion",
+            float(ratio[joint]),
+            MOST_ERROR,
+            error_is,
+            f"{error_is}: the excitation teaches too little; search a better one (`hil design`)",
+        ),
+    ]
 
 
 def _some(names: Sequence[str]) -> str:
@@ -454,19 +384,9 @@ def rehearse(
 ) -> Rehearsal:
     """Run the plan on the twin, twice, and judge it; the result is in `rehearsal.json`.
 
-    A rehearsal of the same plan and seed that passed is not repeated; one that was stopped goes
-    on where it was. Until something has been recorded in the campaign, changes of its cell file
-    are taken in when it is opened; later they are refused. Whatever is edited meanwhile, the
+    See `Campaign.rehearse`. Until something has been recorded in the campaign, changes of its cell
+    file are taken in when it is opened; later they are refused. Whatever is edited meanwhile, the
     result is of the cell and plan that were rehearsed, or there is none.
-
-    Args:
-        campaign: what is rehearsed.
-        reporter: of progress.
-        seed: of what is planted, the noise and the link's faults.
-        stop: ends the rehearsal early.
-        again: rehearse once more even if it passed.
-        drive: the simulated arm's gears and motors, where they shall not be those of the cell
-            file; the result is returned and not written down, for it is not of this cell.
 
     Raises:
         MotionRefusedError: a motion breaks a limit of the cell; nothing was rehearsed.
@@ -523,14 +443,24 @@ def _rehearsed(
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = _campaign(root / where, replace(campaign, cell=cell))
         reporter.say(f"rehearsing on a simulated arm, {name}")
-        link = twin.link(_seconds(rehearsal), effects=effects, drive=drive)
-        ran = _run(rehearsal, link, twin.provenance, reporter, stop, name)
+        motions = wanted(rehearsal.cell, rehearsal.plan)
+        planned = sum(one.trajectory.duration for one in motions)
+        link = twin.link(planned, effects=effects, drive=drive)
+        failure = _failure(rehearsal, link, twin, reporter, stop)
         seconds += link.cycles * cell.period
-        criteria.append(of_motions(ran))
+        criteria.append(
+            judged(
+                f"motions ({name})",
+                float(bool(failure)),
+                0.0,
+                f"{name}: every motion ran to its end, none was refused by the guard or tripped",
+                f"{name}: {failure}",
+            )
+        )
         if rehearsal.folder.manifest():
             bound = SATURATED if effects else PLANNED_CURRENT
-            criteria.append(of_currents(twin, rehearsal.folder, name, bound))
-        if ran.failures:
+            criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))
+        if failure:
             break  # the rest would say the same in other words
         if not effects:
             criteria += of_estimate(twin, rehearsal.folder, reporter)
@@ -563,36 +493,21 @@ def _campaign(root: Path, like: Campaign) -> Campaign:
     return Campaign.create(root, like.cell, like.plan)
 
 
-def _seconds(rehearsal: Campaign) -> float:
-    """Length of all motions of a plan, without the moves between them."""
-    return sum(one.trajectory.duration for one in wanted(rehearsal.cell, rehearsal.plan))
-
-
-def _run(
-    rehearsal: Campaign,
-    link: Link,
-    provenance: Mapping[str, str],
-    reporter: Reporter,
-    stop: Stop,
-    name: str,
-) -> Ran:
-    """Run what is missing, and say how it went."""
-    failures: list[str] = []
+def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, stop: Stop) -> str:
+    """Run what is missing; what went wrong, in words."""
     try:
-        rehearsal.run(link, stop, reporter, provenance=provenance, durable=False, unrehearsed=True)
+        rehearsal.run(
+            link, stop, reporter, provenance=twin.provenance, durable=False, unrehearsed=True
+        )
     except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
             raise OperatorStopError(
                 "the rehearsal was stopped; the recordings remain, rehearse again to go on"
             ) from error
-        failures.append(_reason(error))
-    return Ran(name, tuple(failures))
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, MotionFailedError):
-        return error.sentence
-    return str(error).rstrip(".")
+        if isinstance(error, MotionFailedError):
+            return error.sentence
+        return str(error).rstrip(".")
+    return ""
 
 
 def _not_seen(cell: Cell) -> list[str]:

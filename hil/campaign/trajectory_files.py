@@ -20,8 +20,7 @@ from hil.motion_checks import MotionChecks
 from identification.excitation import Excitation
 from planner import Trajectory, to_csv
 
-from .plan import CampaignPlan
-from .quick_design import plan_around
+from .plan import CampaignPlan, plan_around
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,9 @@ planned motion: the same in each repetition, so that its error drops out of ever
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, Self
 
@@ -26,19 +25,15 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.files import write_or_tell
-from hil.reading import lies_there, text_of
 from planner import FourierSeries, PiecewiseCubic
 
-from .errors import CampaignFolderError
-from .folder import read_back
+from .folder import load_record, save_record
 from .intervals import Interval
 from .operator import DriftCurve
 from .quality import Problem
 
 if TYPE_CHECKING:
-    from .run import Run
-    from .runner import Runner
+    from .run import Run, Runner
 
 Array = NDArray[np.float64]
 
@@ -75,11 +70,9 @@ def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
 
 @dataclass(frozen=True)
 class WarmMotion:
-    """One motion of a warm-up.
+    """One motion of a warm-up: file name of its archive, and friction of each joint (n) [N·m].
 
-    Attributes:
-        archive: its file name.
-        friction: of each joint (n) [N·m], None for one that hardly moves.
+    None for a joint that hardly moves.
     """
 
     archive: str
@@ -120,15 +113,8 @@ class WarmUp:
         Raises:
             CampaignFolderError: the file is damaged.
         """
-        if not lies_there(path):
-            return None
-        try:
-            found = read_back(cls, text_of(path))
-        except (OSError, ValueError) as error:
-            raise CampaignFolderError(
-                path.parent, f"{path.name} is damaged ({error})", "remove that file"
-            ) from error
-        return found if found.plan_hash == plan_hash else None
+        found = load_record(cls, path, "is damaged", "remove that file")
+        return found if found is not None and found.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:
         """Write it.
@@ -136,8 +122,7 @@ class WarmUp:
         Raises:
             OutputError: the disk refuses.
         """
-        content = {"format_version": FORMAT_VERSION, **asdict(self)}
-        write_or_tell(path, json.dumps(content, indent=1) + "\n")
+        save_record(path, self, FORMAT_VERSION)
 
     @property
     def next_index(self) -> int:
@@ -160,14 +145,7 @@ class WarmUp:
         return DriftCurve(self.joint_names, friction, np.array(change), self.threshold)
 
     def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUp:
-        """This warm-up after one more motion, and what has come of it.
-
-        Args:
-            archive: file name.
-            friction: (n,) [N·m], NaN for a joint that hardly moves.
-            least: motions at least.
-            most: and at most.
-        """
+        """This warm-up after one more motion, with its friction (n,) [N·m], and what came of it."""
         known = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
         done, change = len(longer.motions), longer.curve.change[-1]
@@ -180,6 +158,25 @@ class WarmUp:
         """A new warm-up after this one was lost in a pause."""
         earlier = (*self.earlier, *self.motions)
         return replace(self, motions=(), outcome="going on", earlier=earlier)
+
+    @property
+    def sentence(self) -> str:
+        """Where it stands; it has had a motion."""
+        done, change = len(self.motions), float(self.curve.change[-1])
+        text = f"warm-up: friction changes by {change:.2%} a motion after {done} motions"
+        if self.outcome == "warm":
+            return f"{text}; below {self.threshold:.2%} counts as warm"
+        if self.outcome == "not warm":
+            return f"{text}; still not below {self.threshold:.2%}, and no more motions were allowed"
+        return text
+
+    def rested(self, now: float) -> str:
+        """How long the arm has rested, as the beginning of a sentence."""
+        if self.moved_at is None:
+            return "the arm had rested"
+        if now < self.moved_at:
+            return "the arm moved last at a time that is still to come (a clock was put back)"
+        return f"the arm had rested for {(now - self.moved_at) / 60.0:.0f} min"
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:
@@ -203,12 +200,7 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
 
 
 class FrictionMeter:
-    """Measures the friction of archived repetitions of one motion.
-
-    Args:
-        cell: with its nominal model.
-        trajectory: the motion.
-    """
+    """Measures the friction of archived repetitions of one motion."""
 
     def __init__(self, cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> None:
         self._period, self._trajectory = cell.period, trajectory
@@ -239,21 +231,13 @@ class FrictionMeter:
 
 
 class WarmUpStage:
-    """Repeats the excitation until friction hardly changes any more.
-
-    Args:
-        run: whose joints are to be warm.
-
-    Attributes:
-        pauses: after which this run warmed up anew, in sentences.
-        threshold: change per motion that counts as warm; 0 where no warm-up is wanted.
-    """
+    """Repeats the excitation until friction hardly changes any more."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._meter: FrictionMeter | None = None
-        self.pauses: list[str] = []
-        self.threshold = drift_wanted(run.cell, only_simulated=run.simulated)
+        self._pauses: list[str] = []
+        self._threshold = drift_wanted(run.cell, only_simulated=run.simulated)
 
     @property
     def outcome(self) -> str:
@@ -266,20 +250,17 @@ class WarmUpStage:
         """What a reader of the results must know."""
         found = self._found()
         if found is None or found.outcome != "not warm":
-            return self.pauses
-        cold = f"the arm was not warm when the repetitions began ({_sentence(found)})"
-        return [cold, *self.pauses]
+            return self._pauses
+        cold = f"the arm was not warm when the repetitions began ({found.sentence})"
+        return [cold, *self._pauses]
 
     def next_motion(self) -> Interval | None:
         """What a warm-up would run next, None where none is wanted."""
-        if self.threshold == 0.0:
-            return None
-        return self._interval(self._found() or self._new())
+        return self._interval(self._state()) if self._threshold else None
 
     def expected(self) -> list[float]:
         """Durations [s] of the motions that it runs at least."""
-        motion = self.next_motion()
-        state = self._found() or self._new()
+        state, motion = self._state(), self.next_motion()
         if motion is None or state.outcome != "going on":
             return []
         missing = self._run.cell.campaign.warmup_least - len(state.motions)
@@ -291,22 +272,19 @@ class WarmUpStage:
         Raises:
             RepetitionsRejectedError: a motion was slowed again and again.
         """
-        if self.threshold == 0.0:
+        if not self._threshold:
             return
-        state = self._present()
-        self._run.watch.drift = state.curve
+        run, state = self._run, self._present()
+        run.watch.warms(state.curve)
         while state.outcome == "going on":
-            interval = self._interval(state)
-            if len(state.motions) >= self._run.cell.campaign.warmup_least:
-                self._run.watch.expect(interval.trajectory.duration)
-            name = runner.play_until_good(
-                interval, len(state.motions) + 1, self._run.cell.campaign.warmup_most
-            )
-            state = replace(self._with(state, name), moved_at=time.time())
-            state.save(self._run.folder.warmup)
-            self._run.watch.drift = state.curve
-            self._run.watch.note(_sentence(state))
-        self._run.reporter.say(_sentence(state))
+            interval, done = self._interval(state), len(state.motions)
+            if done >= run.cell.campaign.warmup_least:
+                run.watch.expect([interval.trajectory.duration])
+            name = runner.play_until_good(interval, done + 1, run.cell.campaign.warmup_most)
+            state = self._saved(state, name, time.time())
+            run.watch.warms(state.curve)
+            run.watch.note(state.sentence)
+        run.reporter.say(state.sentence)
 
     def keep(self, runner: Runner) -> None:
         """Warm up anew where the joints have cooled down since they moved last.
@@ -314,8 +292,7 @@ class WarmUpStage:
         Raises:
             RepetitionsRejectedError: as `run`.
         """
-        found = self._found()
-        if self.threshold and found is not None and found.motions and found.cold(time.time()):
+        if self._cold(time.time()) is not None:
             self.run(runner)
 
     def lost(self, began: float) -> Problem | None:
@@ -323,10 +300,10 @@ class WarmUpStage:
 
         A hold before it may last as long as a person likes.
         """
-        found = self._found()
-        if not self.threshold or found is None or not found.motions or not found.cold(began):
+        found = self._cold(began)
+        if found is None:
             return None
-        return Problem(f"{_rested(found, began)} when it began and was assumed to be cold", True)
+        return Problem(f"{found.rested(began)} when it began and was assumed to be cold", True)
 
     def moved(self) -> None:
         """A motion has ended that keeps the joints warm."""
@@ -337,21 +314,29 @@ class WarmUpStage:
     def _found(self) -> WarmUp | None:
         return WarmUp.load(self._run.folder.warmup, self._run.plan_hash)
 
-    def _new(self) -> WarmUp:
-        return WarmUp(self._run.plan_hash, self._run.cell.joint_names, self.threshold)
+    def _state(self) -> WarmUp:
+        """As it was written down, or a new one."""
+        new = WarmUp(self._run.plan_hash, self._run.cell.joint_names, self._threshold)
+        return replace(self._found() or new, threshold=self._threshold)
+
+    def _cold(self, when: float) -> WarmUp | None:
+        """The warm-up whose warmth is lost by then [s since 1970]; None where none is."""
+        found = self._found() if self._threshold else None
+        return found if found is not None and found.motions and found.cold(when) else None
 
     def _interval(self, state: WarmUp) -> Interval:
         plan = self._run.plan
         return Interval("warmup", state.next_index, plan.excitation.trajectory, plan.moves)
 
-    def _with(self, state: WarmUp, name: str) -> WarmUp:
-        """The warm-up after the motion of an archive."""
-        settings = self._run.cell.campaign
-        self._meter = self._meter or FrictionMeter(
-            self._run.cell, self._run.plan.excitation.trajectory
-        )
-        friction = self._meter.measure(self._run.folder.archives / name)
-        return state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
+    def _saved(self, state: WarmUp, name: str, moved_at: float) -> WarmUp:
+        """The warm-up after the motion of an archive, written down."""
+        run, settings = self._run, self._run.cell.campaign
+        self._meter = self._meter or FrictionMeter(run.cell, run.plan.excitation.trajectory)
+        friction = self._meter.measure(run.folder.archives / name)
+        state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
+        state = replace(state, moved_at=moved_at)
+        state.save(run.folder.warmup)
+        return state
 
     def _present(self) -> WarmUp:
         """The warm-up to go on with; a new one where the joints have cooled down.
@@ -359,37 +344,15 @@ class WarmUpStage:
         A motion that is entered in the manifest and not here was the last one of a run that was
         killed between the two.
         """
-        state = replace(self._found() or self._new(), threshold=self.threshold)
-        index = state.next_index
-        name = self._run.folder.whole("warmup", index)
-        last = self._run.folder.whole("warmup", index + 1) is None
+        run, state = self._run, self._state()
+        name = run.folder.whole("warmup", state.next_index)
+        last = run.folder.whole("warmup", state.next_index + 1) is None
         if state.outcome == "going on" and name is not None and last:
-            written = (self._run.folder.archives / name).stat().st_mtime
-            state = replace(self._with(state, name), moved_at=max(state.moved_at or 0.0, written))
-            state.save(self._run.folder.warmup)
+            written = (run.folder.archives / name).stat().st_mtime
+            state = self._saved(state, name, max(state.moved_at or 0.0, written))
         if state.motions and state.cold(time.time()):
-            rested = _rested(state, time.time())
-            self._run.reporter.say(f"{rested} and is assumed to be cold: warming up anew")
-            self.pauses.append(f"{rested} during the campaign, and was warmed up anew")
-            state = state.cooled()
+            rested = state.rested(time.time())
+            run.reporter.say(f"{rested} and is assumed to be cold: warming up anew")
+            self._pauses.append(f"{rested} during the campaign, and was warmed up anew")
+            return state.cooled()
         return state
-
-
-def _rested(state: WarmUp, now: float) -> str:
-    """How long the arm has rested, as the beginning of a sentence."""
-    if state.moved_at is None:
-        return "the arm had rested"
-    if now < state.moved_at:
-        return "the arm moved last at a time that is still to come (a clock was put back)"
-    return f"the arm had rested for {(now - state.moved_at) / 60.0:.0f} min"
-
-
-def _sentence(state: WarmUp) -> str:
-    """Where a warm-up stands, in a sentence."""
-    done, change = len(state.motions), float(state.curve.change[-1])
-    text = f"warm-up: friction changes by {change:.2%} a motion after {done} motions"
-    if state.outcome == "warm":
-        return f"{text}; below {state.threshold:.2%} counts as warm"
-    if state.outcome == "not warm":
-        return f"{text}; still not below {state.threshold:.2%}, and no more motions were allowed"
-    return text

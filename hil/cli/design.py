@@ -16,7 +16,7 @@ import typer
 
 from hil.campaign.campaign import campaign_of_design, require_replaceable
 from hil.campaign.operator import Stop, stop_on_interrupt
-from hil.campaign.quick_design import quick_settings
+from hil.campaign.plan import quick_settings
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.controller_limits import checks_in_force, narrower_thresholds
+from hil.campaign.motion_link import checks_in_force, narrower_limits
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
@@ -220,7 +220,7 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
         f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
         f"limits, motor currents, floor, walls and the arm itself are respected; to {who}"
     )
-    below = narrower_thresholds(cell, link.connection)
+    below = narrower_limits(cell, link.connection, "following_error")
     lines += [f"the smaller following-error threshold counts, {note}" for note in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 

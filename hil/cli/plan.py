@@ -17,8 +17,8 @@ from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, exactly_one, print_json
 from hil.errors import InputError
 from hil.files import write_atomically, writing_to
+from hil.move import random_via_points
 from hil.plots import check_format, draw_plan, save
-from hil.random_motion import random_via_points
 from hil.reading import json_of, named_text
 from hil.terminal_text import printable
 from planner.errors import (

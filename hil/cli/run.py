@@ -21,9 +21,7 @@ from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.screen import Screen
-from hil.screen.keys import can_read
-from hil.screen.screen import confirmed
+from hil.screen import Screen, can_read, confirmed
 from hil.weighing import weigh
 
 

@@ -14,7 +14,7 @@ from hil.batch.types import Broken
 from hil.batch.workers import ArchiveTask, LocalWorkers
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.campaign.quick_design import plan_around
+from hil.campaign.plan import plan_around
 from hil.cell import Cell
 from hil.design import DesignResult, DesignSettings, preset, problem_of
 from hil.design.advice import NoExcitationError

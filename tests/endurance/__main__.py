@@ -2,13 +2,12 @@
 
 A simulated controller sends a packet each millisecond over UDP on this computer. The product's own
 exchange and archive process answer and record, and campaigns of short motions run on one link one
-after another, about 26 archives in half a minute. Every 5 s memory, descriptors, threads and
-processor time of each process and the exchange's own histogram of its latencies go to the journal;
-each archive is checked, and removed when three newer campaigns are there. Campaigns whose archives
-are not whole stay.
+after another, about 26 archives in half a minute. Every 5 s memory and threads of each process and
+the exchange's own histogram of its latencies go to the journal; each archive is checked, and
+removed when three newer campaigns are there. Campaigns whose archives are not whole stay.
 
-Each call is a piece with processes of its own and appends to the journal; --merge only prints what
-all pieces together have shown. Ctrl-C or SIGTERM ends a piece properly, SIGKILL costs the last 5 s.
+Each call is a piece and appends to the journal; --merge only prints what each of them has shown.
+Ctrl-C or SIGTERM ends a piece properly, SIGKILL costs the last 5 s.
 Four hours in three pieces:
 
     for piece in 1 2 3; do
@@ -30,16 +29,16 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
 from tests.arguments import time_above_0
 from tests.endurance.journal import Piece, read_journal
 from tests.endurance.piece import run_piece
-from tests.endurance.verdict import SHARES, Verdict, judge
+from tests.endurance.verdict import Verdict, judge
 from tests.journal import COMPRESSED, JournalError
 
 LONGEST = 90.0
@@ -63,8 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     verdict = judge(pieces)
     if given.json:
-        facts = {"good": not verdict.faults, "faults": verdict.faults, "doubts": verdict.doubts}
-        sys.stdout.write(json.dumps({**facts, **verdict.figures}) + "\n")
+        facts = {"good": not verdict.faults, **asdict(verdict)}
+        sys.stdout.write(json.dumps(facts) + "\n")
     else:
         sys.stdout.write("\n".join(_lines(verdict)) + "\n")
     return 1 if verdict.faults else 0
@@ -109,55 +108,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _lines(verdict: Verdict) -> list[str]:
-    figures: dict[str, Any] = verdict.figures
-    archives, latency = figures["archives"], figures["latency"]
-    lines = [
-        f"{figures['minutes']:g} minutes in {figures['pieces']} pieces ({figures['killed']} killed)"
-        f", {', '.join(figures['scheduling'])}",
-        f"processor: {figures['processor_share']} of a core",
-        f"campaigns: {archives['campaigns']} ({archives['complete']} complete, "
-        f"{archives['given_up']} given up, {archives['restarts']} restarts), "
-        f"{archives['motions']} motions, {archives['archives']} archives {archives['outcomes']}, "
-        f"{archives['records']} records",
-        f"exchange: {latency['answered']} answered, {latency['missed']} missed, "
-        f"{latency['late']} late, longest {latency['worst_us']:.0f} µs",
-        "",
-        "memory        first MiB  last MiB   own memory, MiB/h (99 % interval)   resident, MiB/h",
-    ]
-    for name, one in figures["memory"].items():
-        growth = one["growth"]
-        lines.append(
-            f"{name:12} {one['first']:10.1f} {one['last']:9.1f} {growth['value']:9.3f}  "
-            f"({growth['low']:.3f} to {growth['high']:.3f}) {one['rss_growth']['value']:12.3f}"
-        )
-    lines += [
-        f"the supervisor holds {one['first']:.0f} {name}, per hour {one['value']:.0f} more "
-        f"({one['low']:.0f} to {one['high']:.0f})"
-        for name, one in figures["held"].items()
-    ]
-    lines += ["", f"descriptors, most in each half: {figures['descriptors']}", ""]
-    lines.append("latency, µs   first minute   last   least   median   most   rise of others")
-    for number, piece in enumerate(latency["pieces"], 1):
-        for name in SHARES:
-            one = piece[name]
-            lines.append(
-                f"{number:3} {name:8} {one['first_us']:13.0f} {one['last_us']:6.0f} "
-                f"{one['least_us']:7.0f} {one['median_us']:8.0f} {one['most_us']:6.0f} "
-                f"{one['rise_of_others'] - 1.0:12.0%}"
-            )
-    lines += ["", "blocks of 10 minutes, µs (load)   first          last"]
-    for number, piece in enumerate(latency["pieces"], 1):
-        for name in SHARES:
-            one = piece[name]
-            lines.append(
-                f"{number:3} {name:8} {one['first_block_us']:19.0f} "
-                f"({one['first_block_load']:.1f}) {one['last_block_us']:8.0f} "
-                f"({one['last_block_load']:.1f})"
-            )
-    lines += ["", *(f"doubt: {text}" for text in verdict.doubts)]
-    lines += [f"WRONG: {text}" for text in verdict.faults] or ["nothing is wrong"]
-    return lines
+def _lines(verdict: Verdict) -> Iterator[str]:
+    for number, piece in enumerate(verdict.figures, 1):
+        yield f"piece {number}"
+        for name, value in piece.items():
+            yield f"  {name:40} {value}"
+    yield from (f"doubt: {text}" for text in verdict.doubts)
+    yield from [f"WRONG: {text}" for text in verdict.faults] or ["nothing is wrong"]
 
 
 if __name__ == "__main__":

@@ -18,21 +18,10 @@ SYNC_EVERY: Final = 60.0
 
 @dataclass(frozen=True)
 class Use:
-    """What a process takes.
+    """What a process takes: bytes behind which is no file (swapped ones too), and threads."""
 
-    Attributes:
-        rss: bytes, resident.
-        own: bytes behind which is no file, swapped ones too.
-        fds: open descriptors.
-        threads: of it.
-        cpu: processor time [s].
-    """
-
-    rss: int
     own: int
-    fds: int
     threads: int
-    cpu: float
 
 
 @dataclass(frozen=True)
@@ -45,10 +34,9 @@ class Sample:
         processes: by name.
         shared: files in /dev/shm, of whoever.
         counters: of the exchange, since it began.
-        latencies: answers by duration, in the bins of `drivers.exchange.control`, likewise.
-        stalls: of the machine since the piece began, see `tests.endurance.stalls`; 0 where nobody
-            could look.
-        stood: s that they lasted.
+        stalls, stood: of the machine since the piece began, see `tests.endurance.stalls`, and the
+            s that they lasted; 0 where nobody could look.
+        latencies: answers by duration, in the bins of `drivers.exchange.control`.
     """
 
     t: float
@@ -56,9 +44,9 @@ class Sample:
     processes: Mapping[str, Use]
     shared: int
     counters: Mapping[str, float]
-    latencies: Sequence[int]
     stalls: int = 0
     stood: float = 0.0
+    latencies: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -73,11 +61,9 @@ class Ran:
             complete was given up after some restarts.
         restarts: how often it was resumed, with the errors.
         motions: that ended on the link meanwhile, as the exchange counted them.
-        archives: files.
+        archives, records, records_lost: files, what is in them, and what they say is not.
         faulty: those that do not keep the archive profile, with what is wrong.
         outcomes: archives by outcome.
-        records: in them.
-        records_lost: as they state.
         descriptors: open ones by process, with no archive open.
         held: by the supervisor of its memory: bytes of malloc, blocks of Python's own allocator.
     """
@@ -104,14 +90,7 @@ class Ran:
 
 @dataclass(frozen=True)
 class Piece:
-    """One call of the command.
-
-    Attributes:
-        begun: what was known at its beginning.
-        samples: in order.
-        campaigns: in order.
-        ended: what was known at its end; None if it was killed.
-    """
+    """One call of the command; `ended` is None if it was killed."""
 
     begun: Mapping[str, Any]
     samples: list[Sample] = field(default_factory=list)

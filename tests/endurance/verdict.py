@@ -1,380 +1,294 @@
-"""What a long run has shown: figures over all its pieces, and what is wrong, in sentences."""
+"""What a long run has shown: figures of each piece, and what is wrong, in sentences.
+
+Nothing here assumes a distribution: trends are those of Theil and Sen, blocks are compared by Mann
+and Whitney. Samples that follow each other resemble each other, which makes intervals somewhat too
+narrow; so a judgement asks for the size of a trend and not only for its sign.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, theilslopes
 
-from tests.endurance.course import judge_course
-from tests.endurance.journal import Piece, Ran, Sample
-from tests.endurance.trends import Slope, largest_rise, quantile, slope
-
-Told = TypeVar("Told", Sample, Ran)
+from drivers.exchange.control import quantile
+from tests.endurance.journal import Piece, Sample
 
 PROCESSES: Final = ("exchange", "archive", "supervisor", "controller")
 WARM_UP: Final = 300.0
-"""s of a piece after which memory is to be flat. The exchange holds 32 MiB of heap in reserve from
-its beginning: a leak shows in its memory only when that is used up."""
+"""s of a piece after which nothing is to be added to a process any more. The exchange holds 32 MiB
+of heap in reserve from its beginning: a leak shows in its memory only when that is used up."""
 LONG: Final = 4.0
 """h that a leak is projected to."""
 CONFIDENCE: Final = 0.99
 SHARE: Final = 0.05
-"""Of a process's memory that it may grow by in `LONG`; the upper end of the interval counts."""
+"""Of a process's memory that it may grow by in `LONG`."""
 SHARES: Final = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99.9": 0.999}
-RARE: Final = 0.01
-"""Chance of one false alarm among all comparisons of first and last blocks."""
 BLOCK: Final = 10
-"""Minutes at each end of a piece that are compared as well: a change some time before the end shows
-there and not in two minutes."""
+"""Minutes at each end of a piece whose latencies are compared."""
+RARE: Final = 0.01
+"""Chance of one false alarm among all comparisons of blocks."""
 BUSIER: Final = 0.5
 """By which a load has to be larger to explain that answers are slower."""
 BIN: Final = 2.0**0.25
 """Ratio of two latencies that the exchange's own histogram just tells apart."""
+GIVEN_UP: Final = 0.5
+"""Of the campaigns of a piece that may be given up, whatever stood still: with more of them it has
+hardly shown anything."""
+NOT_IN_TIME: Final = 0.01
+"""Of the answers of a piece that may be missed, or late, whatever stood still. The exchange stops a
+motion that loses 3 of 100: with a third of that all the time next to no motion comes to its end."""
+OTHERWISE: Final = 1e-4
+"""Of the answers of a piece that may be missed, or late, while no core stood still."""
 
 
-@dataclass(frozen=True)
-class Minute:
-    """One minute of the exchange, and how busy the machine was with whatever."""
-
-    load: float
-    answered: int
-    missed: int
-    late: int
-    quantiles: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Memory:
-    """One process over all pieces: MiB of resident memory at the first and last, MiB/h.
-
-    What grows is judged by memory of its own, behind which is no file. The resident memory also
-    grows while the rings between the processes are gone through for the first time, and by no more
-    than their size.
-    """
-
-    process: str
-    first: float
-    last: float
-    growth: Slope
-    rss_growth: Slope
-    share: float
-    """Of its memory, by which it grows in `LONG` at most (the upper end of the interval)."""
-    least: float
-    """The same, of the lower end."""
-
-
-@dataclass(frozen=True)
+@dataclass
 class Verdict:
-    """All figures, and what is wrong."""
+    """Figures of each piece, what is wrong, and what the machine explains or nobody can tell."""
 
-    faults: list[str]
-    doubts: list[str]
-    figures: dict[str, Any]
-
-
-def minutes_of(piece: Piece) -> list[Minute]:
-    """Each full minute of a piece, from samples at its ends."""
-    ends: list[Sample] = []
-    for sample in piece.samples:
-        if not ends or sample.t - ends[-1].t >= 59.0:
-            ends.append(sample)
-    return [_minute(before, after) for before, after in pairwise(ends)]
-
-
-def _minute(before: Sample, after: Sample) -> Minute:
-    counts = np.subtract(after.latencies, before.latencies)
-    counted = {
-        name: int(after.counters[name] - before.counters[name])
-        for name in ("answered", "missed", "late")
-    }
-    found = {name: quantile(counts, share) for name, share in SHARES.items()}
-    return Minute(load=after.load, quantiles=found, **counted)
-
-
-def memory_of(pieces: Sequence[Piece], process: str) -> Memory | None:
-    """How the memory of a process went after the warm-up; None if it was too short to tell."""
-    settled = _settled((piece.samples for piece in pieces), lambda one: process in one.processes)
-    if not settled:
-        return None
-    growth = {
-        name: _growth(settled, partial(_mib, process=process, name=name)) for name in ("rss", "own")
-    }
-    first = settled[0][0].processes[process].rss / 2**20
-    last = settled[-1][-1].processes[process].rss / 2**20
-    own = growth["own"]
-    share, least = LONG * own.high / first, LONG * own.low / first
-    return Memory(process, first, last, own, growth["rss"], share, least)
-
-
-def _mib(sample: Sample, process: str, name: str) -> float:
-    return float(getattr(sample.processes[process], name)) / 2**20
-
-
-def _settled(told: Iterable[Sequence[Told]], tells: Callable[[Told], object]) -> list[list[Told]]:
-    """Of each piece what was told after its warm-up and tells something; none of a single one."""
-    found = [[one for one in piece if one.t >= WARM_UP and tells(one)] for piece in told]
-    return [settled for settled in found if len(settled) >= 2]
-
-
-def _growth(settled: Sequence[Sequence[Told]], value: Callable[[Told], float]) -> Slope:
-    return slope([_by_minute(one, value) for one in settled], CONFIDENCE)
-
-
-def _by_minute(
-    told: Sequence[Told], value: Callable[[Told], float]
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Hours, and the median of each minute: a sample is much like the one before."""
-    minute = np.array([int(one.t // 60.0) for one in told])
-    values = np.array([value(one) for one in told])
-    present = np.unique(minute)
-    return present / 60.0, np.array([np.median(values[minute == one]) for one in present])
+    faults: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
 
 
 def judge(pieces: Sequence[Piece]) -> Verdict:
     """The verdict over all pieces of a journal."""
-    faults: list[str] = []
-    doubts: list[str] = []
-    figures: dict[str, Any] = {
-        "pieces": len(pieces),
-        "minutes": round(sum(piece.seconds for piece in pieces) / 60.0, 1),
-        "killed": sum(piece.ended is None for piece in pieces),
-        "scheduling": sorted({str(piece.begun.get("scheduling")) for piece in pieces}),
-        "processor_share": _processor_share(pieces),
-    }
-    judge_course(pieces, WARM_UP, faults, doubts)
-    figures["held"] = _judge_held(pieces, faults)
-    figures["memory"] = _judge_memory(pieces, faults, doubts)
-    figures["descriptors"] = _judge_descriptors(pieces, faults, doubts)
-    figures["archives"] = _judge_archives(pieces, faults)
-    figures["latency"] = _judge_latency(pieces, faults, doubts)
-    return Verdict(faults, doubts, figures)
-
-
-def _processor_share(pieces: Sequence[Piece]) -> dict[str, float]:
-    """Of one core, by process."""
-    spent: Counter[str] = Counter()
-    seconds = 0.0
-    for piece in pieces:
-        if len(piece.samples) < 2:
-            continue
-        first, last = piece.samples[0], piece.samples[-1]
-        seconds += last.t - first.t
-        for name in PROCESSES:
-            if name in first.processes and name in last.processes:
-                spent[name] += last.processes[name].cpu - first.processes[name].cpu  # type: ignore[assignment]
-    return {name: round(spent[name] / seconds, 3) for name in spent} if seconds else {}
-
-
-def _judge_memory(
-    pieces: Sequence[Piece], faults: list[str], doubts: list[str]
-) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for name in PROCESSES:
-        memory = memory_of(pieces, name)
-        if memory is None:
-            doubts.append(f"memory of the {name}: too short to tell (warm-up is {WARM_UP:g} s)")
-            continue
-        found[name] = asdict(memory)
-        if memory.least > 0.0 and memory.growth.value * LONG / memory.first > SHARE:
-            faults.append(
-                f"the {name}'s memory grows: {memory.growth.value:.3f} MiB/h "
-                f"({memory.growth.low:.3f} to {memory.growth.high:.3f})"
-            )
-        elif memory.share > SHARE:
-            doubts.append(
-                f"memory of the {name}: too short to tell, it may grow by "
-                f"{memory.share:.0%} in {LONG:g} h"
-            )
-    return found
-
-
-def _judge_held(pieces: Sequence[Piece], faults: list[str]) -> dict[str, dict[str, float]]:
-    """What the supervisor holds of its memory, per hour: a leak that pages do not show yet."""
-    found: dict[str, dict[str, float]] = {}
-    for name in ("bytes", "blocks"):
-        settled = _settled((piece.campaigns for piece in pieces), partial(_tells, name=name))
-        if not settled:
-            continue
-        growth = _growth(settled, partial(_held, name=name))
-        first = _held(settled[0][0], name)
-        found[name] = {"first": first, **asdict(growth)}
-        if growth.low > 0.0 and growth.value * LONG > SHARE * first:
-            faults.append(
-                f"what the supervisor holds grows: {growth.value:.0f} {name} an hour "
-                f"({growth.low:.0f} to {growth.high:.0f}), of {first:.0f}"
-            )
-    return found
-
-
-def _tells(ran: Ran, name: str) -> bool:
-    return name in ran.held
-
-
-def _held(ran: Ran, name: str) -> float:
-    return float(ran.held[name])
-
-
-def _judge_descriptors(
-    pieces: Sequence[Piece], faults: list[str], doubts: list[str]
-) -> list[dict[str, list[int]]]:
-    found = []
+    verdict = Verdict()
+    if not any(piece.campaigns for piece in pieces):
+        verdict.faults.append("no campaign was run")
     for number, piece in enumerate(pieces, 1):
-        idle = [ran.descriptors for ran in piece.campaigns if not ran.stopped]
-        if len(idle) < 2:
-            doubts.append(f"descriptors in piece {number}: fewer than two campaigns were run")
-            continue
-        # The exchange keeps the table of the last motion open, or not, as that one ended.
-        half = len(idle) // 2
-        most = {
-            name: [max(one[name] for one in part) for part in (idle[:half], idle[half:])]
-            for name in PROCESSES
-        }
-        found.append(most)
-        faults += [
-            f"the {name} has {last} descriptors in the second half of piece {number}, {first} in "
-            "the first"
-            for name, (first, last) in most.items()
-            if last > first
-        ]
-    return found
+        one = _Judge(piece)
+        one.ending()
+        one.campaigns()
+        one.answers()
+        one.counts()
+        one.memory()
+        one.latency()
+        verdict.faults += [f"piece {number}: {text}" for text in one.faults]
+        verdict.doubts += [f"piece {number}: {text}" for text in one.doubts]
+        verdict.figures.append(one.figures)
+    return verdict
 
 
-def _judge_archives(pieces: Sequence[Piece], faults: list[str]) -> dict[str, Any]:
-    ran = [one for piece in pieces for one in piece.campaigns]
-    outcomes: Counter[str] = Counter()
-    for one in ran:
-        outcomes.update(one.outcomes)
-        faults += [f"campaign {one.number}: {text}" for text in one.faulty]
-        moved = one.archives - one.outcomes.get("void", 0)
-        if not one.stopped and moved != one.motions:
-            faults.append(
-                f"campaign {one.number}: {one.motions} motions ended and there are {moved} archives"
-            )
-        if one.records_lost:
-            faults.append(f"campaign {one.number}: {one.records_lost} records lost")
-    return {
-        "campaigns": len(ran),
-        "complete": sum(one.complete for one in ran),
-        "given_up": sum(one.given_up for one in ran),
-        "restarts": sum(len(one.restarts) for one in ran),
-        "motions": sum(one.motions for one in ran),
-        "archives": sum(one.archives for one in ran),
-        "outcomes": dict(outcomes),
-        "records": sum(one.records for one in ran),
-    }
+class _Judge:
+    """Judges one piece.
 
-
-def _judge_latency(pieces: Sequence[Piece], faults: list[str], doubts: list[str]) -> dict[str, Any]:
-    """Per piece its first and last minute among all, its first and last block; the trend of all."""
-    every = [minutes_of(piece) for piece in pieces]
-    long_enough = sum(len(minutes) >= 2 * BLOCK for minutes in every)
-    if not long_enough:
-        doubts.append(f"latency: no piece has {2 * BLOCK} full minutes, too short to tell")
-    chance = RARE / (len(SHARES) * max(1, long_enough))
-    of_pieces = []
-    for number, minutes in enumerate(every, 1):
-        if not minutes:
-            continue
-        compared = {name: _compared(minutes, name) for name in SHARES}
-        of_pieces.append(compared)
-        if len(minutes) < 2 * BLOCK:
-            continue
-        for name, one in compared.items():
-            _judge_ends(f"piece {number}: {name} of the latency", one, chance, faults, doubts)
-    return {
-        "pieces": of_pieces,
-        "ratio_in_4_h": _trends(every, faults, doubts),
-        "minutes": [[asdict(one) for one in minutes] for minutes in every],
-        "worst_us": max(
-            (s.counters["worst_turnaround_us"] for p in pieces for s in p.samples[-1:]), default=0.0
-        ),
-        "answered": _summed(every, "answered"),
-        "missed": _summed(every, "missed"),
-        "late": _summed(every, "late"),
-    }
-
-
-def _compared(minutes: Sequence[Minute], name: str) -> dict[str, float]:
-    """First and last minute among all, and first and last block of minutes; µs."""
-    scale = [1e6 * one.quantiles[name] for one in minutes]
-    block = min(BLOCK, max(1, len(scale) // 2))
-    early, late = scale[:block], scale[-block:]
-    return {
-        "first_us": scale[0],
-        "last_us": scale[-1],
-        "least_us": min(scale),
-        "median_us": float(np.median(scale)),
-        "most_us": max(scale),
-        "rise_of_others": 2.0 ** largest_rise(np.log2(scale[:-1])),
-        "first_load": minutes[0].load,
-        "last_load": minutes[-1].load,
-        "first_block_us": float(np.median(early)),
-        "last_block_us": float(np.median(late)),
-        "first_block_load": float(np.median([one.load for one in minutes[:block]])),
-        "last_block_load": float(np.median([one.load for one in minutes[-block:]])),
-        "block_chance": float(mannwhitneyu(late, early, alternative="greater").pvalue),
-    }
-
-
-def _judge_ends(
-    what: str, one: Mapping[str, float], chance: float, faults: list[str], doubts: list[str]
-) -> None:
-    """A last minute or block slower than the first, by more than minutes differ anyway.
-
-    Of N like minutes the last is at most once in N so much slower than the first that no other two
-    show such a rise. The machine is not alone: more load beside it explains slower answers as well.
+    The machine explains what goes wrong where its cores stand still (`tests.endurance.stalls`); no
+    load does, as exchange and controller run before whatever else there is to do.
     """
-    minute = one["last_us"] / one["first_us"] > max(BIN, one["rise_of_others"])
-    block = one["block_chance"] < chance and one["last_block_us"] > BIN * one["first_block_us"]
-    for found, key, words in ((minute, "", "minute"), (block, "_block", f"{BLOCK} minutes")):
-        if found:
-            busier = one[f"last{key}_load"] > one[f"first{key}_load"] + BUSIER
-            (doubts if busier else faults).append(
-                f"{what} is {one[f'last{key}_us']:.0f} µs in its last {words} and "
-                f"{one[f'first{key}_us']:.0f} µs in its first, at loads of "
-                f"{one[f'last{key}_load']:.1f} and {one[f'first{key}_load']:.1f}"
+
+    def __init__(self, piece: Piece) -> None:
+        self.faults: list[str] = []
+        self.doubts: list[str] = []
+        ran, samples = piece.campaigns, piece.samples
+        outcomes: Counter[str] = Counter()
+        for one in ran:
+            outcomes.update(one.outcomes)
+        counters = samples[-1].counters if samples else {}
+        self.figures: dict[str, Any] = {
+            "minutes": round(piece.seconds / 60.0, 1),
+            "killed": piece.ended is None,
+            "scheduling": piece.begun.get("scheduling"),
+            "campaigns": len(ran),
+            "complete": sum(one.complete for one in ran),
+            "given_up": sum(one.given_up for one in ran),
+            "restarts": sum(len(one.restarts) for one in ran),
+            "motions": sum(one.motions for one in ran),
+            "archives": sum(one.archives for one in ran),
+            "outcomes": dict(outcomes),
+            "records": sum(one.records for one in ran),
+            "counters": dict(counters),
+        }
+        self._piece = piece
+        self._settled = [one for one in samples if one.t >= WARM_UP]
+
+    def ending(self) -> None:
+        """How the piece ended."""
+        piece = self._piece
+        if not piece.campaigns and piece.seconds >= WARM_UP:
+            self.faults.append(f"{piece.seconds:.0f} s without one campaign")
+        if piece.ended is None:
+            self.doubts.append("no end: it was killed, or it still runs")
+            return
+        if (reason := piece.ended.get("reason", "")) not in ("", "interrupted"):
+            self.faults.append(f"ended early: {reason}")
+
+    def campaigns(self) -> None:
+        """Campaigns that were given up or resumed, and archives that are not whole.
+
+        A controller that misses some answers in a row ends open mode, as it should. Where that is
+        not the machine's doing, nothing excuses it.
+        """
+        ran = self._piece.campaigns
+        for one in ran:
+            what = [*one.faulty]
+            moved = one.archives - one.outcomes.get("void", 0)
+            if not one.stopped and moved != one.motions:
+                what.append(f"{one.motions} motions ended and there are {moved} archives")
+            if one.records_lost:
+                what.append(f"{one.records_lost} records lost")
+            self.faults += [f"campaign {one.number}: {text}" for text in what]
+        given_up = [one for one in ran if one.given_up]
+        if len(given_up) > GIVEN_UP * len(ran):
+            self.faults.append(f"{len(given_up)} of {len(ran)} campaigns were given up")
+            return
+        excused = set(self._excused())
+        self.faults += [
+            f"campaign {one.number} was given up, and no core stood still"
+            for one in given_up
+            if one.number not in excused
+        ]
+        if count := sum(one.number in excused for one in given_up):
+            self.doubts.append(
+                f"{count} of {len(ran)} campaigns were given up, as cores stood still"
+            )
+        calm = [one for one in ran if one.number not in excused and one.complete]
+        if resumed := sum(len(one.restarts) for one in calm):
+            self.doubts.append(f"{resumed} restarts of campaigns, and no core stood still")
+
+    def _excused(self) -> Iterator[int]:
+        """Campaigns in which answers were missed, and cores stood still for as long."""
+        begun = 0.0
+        for one in self._piece.campaigns:
+            samples = [sample for sample in self._piece.samples if begun <= sample.t <= one.t]
+            begun = one.t
+            if samples:
+                missed = samples[-1].counters["missed"] - samples[0].counters["missed"]
+                if missed and not self._otherwise(samples, "missed"):
+                    yield one.number
+
+    def answers(self) -> None:
+        """Answers that were missed or late: too many, or any while no core stood still."""
+        samples = self._piece.samples
+        if not samples:
+            return
+        counters = samples[-1].counters
+        answered = max(1.0, counters["answered"])
+        for name in ("missed", "late"):
+            if (count := counters[name]) > NOT_IN_TIME * answered:
+                self.faults.append(f"{count / answered:.1%} of the answers were {name}")
+            elif count := self._otherwise(samples, name):
+                (self.faults if count > OTHERWISE * answered else self.doubts).append(
+                    f"{count:.0f} of {answered:.0f} answers were {name} while no core stood still"
+                )
+
+    def _otherwise(self, samples: Sequence[Sample], name: str) -> float:
+        """How far a counter rose beyond the time, from sample to sample, that cores stood still.
+
+        A stall costs the cycles that it lasts, and the one in which it begins.
+        """
+        rate = float(self._piece.begun.get("rate", 0.0))
+        return sum(
+            max(0.0, after.counters[name] - before.counters[name] - stood)
+            for before, after in pairwise(samples)
+            for stood in (after.stalls - before.stalls + rate * (after.stood - before.stood),)
+        )
+
+    def counts(self) -> None:
+        """Threads and descriptors of each process, and files of shared memory.
+
+        More of a process in the second half is growth. The files are of whoever, and those of
+        others come and go; what is never given back shows in the fewest of each quarter.
+        """
+        idle = [one.descriptors for one in self._piece.campaigns if not one.stopped]
+        threads = [
+            {name: use.threads for name, use in one.processes.items()} for one in self._settled
+        ]
+        for what, each in (("descriptors", idle), ("threads", threads)):
+            if len(each) < 2:
+                self.doubts.append(f"{what}: too short to tell")
+                continue
+            first, second = each[: len(each) // 2], each[len(each) // 2 :]
+            for name in PROCESSES:
+                before, after = (max(one.get(name, 0) for one in half) for half in (first, second))
+                if after > before:
+                    self.faults.append(
+                        f"the {name} has {after} {what} in the second half, {before} in the first"
+                    )
+        fewest = [min(part) for part in np.array_split([s.shared for s in self._settled], 4) if
+                  len(part)]  # fmt: skip
+        if len(fewest) == 4 and all(after > before for before, after in pairwise(fewest)):
+            self.faults.append(
+                f"files in shared memory grow in number: {', '.join(map(str, fewest))} at least in "
+                "the quarters"
             )
 
+    def memory(self) -> None:
+        """Memory of each process behind which is no file, and what the supervisor holds of its own.
 
-def _trends(
-    every: Sequence[Sequence[Minute]], faults: list[str], doubts: list[str]
-) -> dict[str, dict[str, float]]:
-    """By how much each quantile grows in `LONG`, as a factor; a load that grows explains it."""
-    trends = {}
-    rises = [_rise_of_load(minutes) for minutes in every if len(minutes) >= 2 * BLOCK]
-    busier = bool(rises) and float(np.median(rises)) > BUSIER
-    for name in SHARES:
-        logs = [np.log2([one.quantiles[name] for one in minutes]) for minutes in every]
-        found = slope([(np.arange(len(one)) / 60.0, one) for one in logs], CONFIDENCE)
-        factors = {key: _factor(LONG * value) for key, value in asdict(found).items()}
-        trends[name] = factors
-        long_enough = sum(len(one) for one in logs) >= 2 * BLOCK
-        if long_enough and factors["low"] > BIN:
-            grows = f"{name} of the latency grows {factors['value']:.2f}-fold in {LONG:g} h"
-            if busier:
-                doubts.append(f"{grows}, as the load grew by {np.median(rises):.1f}")
-            else:
-                faults.append(grows)
-    return trends
+        The resident memory also grows while the rings between the processes are gone through for
+        the first time, and by no more than their size.
+        """
+        for name in PROCESSES:
+            used = [
+                (one.t, one.processes[name].own) for one in self._settled if name in one.processes
+            ]
+            self._growth(f"the {name}'s memory", used)
+        for name in ("bytes", "blocks"):
+            ran = [
+                (one.t, one.held[name])
+                for one in self._piece.campaigns
+                if one.t >= WARM_UP and name in one.held
+            ]
+            if ran:  # else it is another C library
+                self._growth(f"what the supervisor holds ({name})", ran)
+
+    def _growth(self, what: str, told: Sequence[tuple[float, int]]) -> None:
+        """A leak: by the median of each minute, as a sample is much like the one before."""
+        minutes = np.array([int(t // 60.0) for t, _ in told])
+        values = np.array([value for _, value in told], dtype=np.float64)
+        present = np.unique(minutes)
+        if len(present) < BLOCK:
+            self.doubts.append(f"{what}: too short to tell (warm-up is {WARM_UP:g} s)")
+            return
+        medians = [np.median(values[minutes == one]) for one in present]
+        found = theilslopes(medians, present / 60.0, CONFIDENCE)
+        slope, low, high = (LONG * float(one) / values[0] for one in (found[0], found[2], found[3]))
+        self.figures[what] = {"first": values[0], "growth": slope, "low": low, "high": high}
+        words = f"{what} grows by {slope:.1%} in {LONG:g} h ({low:.1%} to {high:.1%})"
+        if low > 0.0 and slope > SHARE:
+            self.faults.append(words)
+        elif high > SHARE:
+            self.doubts.append(f"too short to tell whether {words}")
+
+    def latency(self) -> None:
+        """The last minutes against the first ones; more load beside it explains slower answers."""
+        minutes = list(minutes_of(self._piece))
+        if len(minutes) < 2 * BLOCK:
+            self.doubts.append(f"latency: no {2 * BLOCK} full minutes, too short to tell")
+            return
+        loads = [float(np.median([m[0] for m in part])) for part in _ends(minutes)]
+        for name in SHARES:
+            early, late = ([m[1][name] for m in part] for part in _ends(minutes))
+            first, last = 1e6 * float(np.median(early)), 1e6 * float(np.median(late))
+            self.figures[f"{name} of the latency (µs)"] = {"first": first, "last": last}
+            chance = mannwhitneyu(late, early, alternative="greater").pvalue
+            if chance < RARE / len(SHARES) and last > BIN * first:
+                busier = loads[1] > loads[0] + BUSIER
+                (self.doubts if busier else self.faults).append(
+                    f"{name} of the latency is {last:.0f} µs in the last {BLOCK} minutes and "
+                    f"{first:.0f} µs in the first, at loads of {loads[1]:.1f} and {loads[0]:.1f}"
+                )
 
 
-def _rise_of_load(minutes: Sequence[Minute]) -> float:
-    """From the first block of a piece to its last."""
-    early, late = ([one.load for one in part] for part in (minutes[:BLOCK], minutes[-BLOCK:]))
-    return float(np.median(late) - np.median(early))
+def _ends(minutes: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+    return minutes[:BLOCK], minutes[-BLOCK:]
 
 
-def _factor(doublings: float) -> float:
-    return 2.0**doublings if doublings < 1000.0 else math.inf
-
-
-def _summed(pieces: Sequence[Sequence[Minute]], name: str) -> int:
-    return sum(getattr(one, name) for minutes in pieces for one in minutes)
+def minutes_of(piece: Piece) -> Iterator[tuple[float, dict[str, float]]]:
+    """Load and quantiles of the latency [s] of each full minute of a piece."""
+    last: Sample | None = None
+    for sample in piece.samples:
+        if last is None:
+            last = sample
+        elif sample.t - last.t >= 59.0:
+            counts = np.subtract(sample.latencies, last.latencies).tolist()
+            found = {name: quantile(counts, share) for name, share in SHARES.items()}
+            yield sample.load, {n: math.nan if q is None else q for n, q in found.items()}
+            last = sample

@@ -16,7 +16,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from benchmarks.published import Published
-from hil.campaign.quick_design import design
+from hil.campaign.plan import design
 from hil.cli import app
 from hil.progress import Silent
 from hil.results import Results

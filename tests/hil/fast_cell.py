@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hil.campaign import Campaign
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.quick_design import design
+from hil.campaign.plan import design
 from hil.campaign.rehearsal import CRITERIA, Criterion, Rehearsal
 from hil.cell import Cell
 from hil.cell.text import with_values

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import hil
-from hil import Campaign, Cell
-from hil.campaign import MotionRefusedError, NotRehearsedError
+from hil import Campaign
+from hil.campaign import MotionRefusedError
 from hil.campaign.intervals import at_limit, way
 from hil.motion_checks import MotionChecks
 from hil.move import straight_way
@@ -142,18 +142,7 @@ def test_one_seed_gives_the_same_bytes_whatever_the_folder_is_called(
     assert len(checksums(done)) >= 4
 
 
-# --- gates
-
-
-def test_a_cell_edited_after_the_rehearsal_is_refused_as_unsafe(campaign: Campaign) -> None:
-    pass_rehearsal(campaign.folder)
-    path = campaign.folder.cell
-    text = path.read_text("utf-8")
-    path.write_text(text.replace("coulomb = [6.0, 3.0]", "coulomb = [6.0, 3.5]", 1), "utf-8")
-    with pytest.raises(NotRehearsedError, match=r"cell\.toml is not the one") as refused:
-        Campaign.open(campaign.folder.root).run(accept_dry_run=True)
-    assert refused.value.exit_code == 3
-    assert campaign.folder.manifest() == []
+# --- ways
 
 
 def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(designed: Campaign) -> None:
@@ -239,7 +228,3 @@ def test_a_torn_archive_that_was_replaced_is_nothing_to_run_again(
         "excitation_000_a1.mcap was left by a run that was killed; nothing is missing without it",
         "move_000_a1.mcap was left by a run that was killed; nothing is missing without it",
     )
-
-
-def test_a_cell_may_be_loaded_from_text(designed: Campaign) -> None:
-    assert Cell.load(str(designed.folder.cell)).name == "fast"

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from hil.batch.types import Arm, LevelEstimate
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
-from hil.campaign.quick_design import design
+from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.compare import Comparison, compare_campaigns, gather

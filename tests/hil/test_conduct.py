@@ -53,7 +53,7 @@ def test_every_archive_is_told_with_its_cycles(ran: Campaign) -> None:
 
 def test_what_was_left_out_is_said(ran: Campaign) -> None:
     steps = {one.step: one for one in conduct_of(ran.folder).steps}
-    assert not steps["rehearsal"].done and steps["rehearsal"].words == "none on record"
+    assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
     assert not steps["dry run"].done
     assert steps["repetitions"].words.startswith("2 whole")
 

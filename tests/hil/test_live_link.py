@@ -22,7 +22,6 @@ from hil.archive import ArchiveSpec, open_archive
 from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import (
     Campaign,
-    CampaignFolderError,
     CampaignPlan,
     MotionFailedError,
     NotRehearsedError,
@@ -31,7 +30,7 @@ from hil.campaign import (
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
-from hil.campaign.quick_design import design
+from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cell.cell import stays_here
 from hil.cli.record import record
@@ -39,7 +38,6 @@ from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.move import send, straight_way
 from hil.progress import Silent
-from hil.simulation import simulated_link
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
@@ -112,16 +110,6 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
     assert not list(campaign.folder.archives.iterdir())
 
 
-def test_two_runs_of_one_campaign_are_one_too_many(
-    tmp_path: Path, cell: Cell, plan: CampaignPlan
-) -> None:
-    campaign = campaign_of(tmp_path / "twice", cell, plan)
-    with campaign.folder.locked(), pytest.raises(CampaignFolderError, match="another run"):
-        campaign.run(simulated_link(cell), Stop(), Silent(), provenance={}, unrehearsed=True)
-    with campaign.folder.locked():
-        pass  # it was let go of
-
-
 def test_each_difference_of_the_init_packet_is_named_before_anything_moves(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
@@ -187,14 +175,6 @@ def test_a_refusal_comes_with_its_flight_recorder(
     assert archive.outcome.entries["outcome"] == "refused"
     assert any(event.name == "Refused" for event in archive.events)
     assert recorder["cycle"][-1] in archive.columns["cycle"]
-
-
-def test_a_stop_before_the_connection_moves_nothing(cell: Cell) -> None:
-    with (
-        loopback_link(on_loopback(cell), options=PATIENT) as link,
-        pytest.raises(ControllerFault, match="before anything moved"),
-    ):
-        link.connect(Stop(requested=True))
 
 
 # --- A motion on a real link that is watched, steered and looked at by a viewer from elsewhere

@@ -13,7 +13,7 @@ import pytest
 
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan, design, plan_around
-from hil.campaign.quick_design import LEAST, quick_settings
+from hil.campaign.plan import LEAST, quick_settings
 from hil.cell import Cell
 from hil.design import load_design, preset
 from hil.design.run import DesignFolder, run_design

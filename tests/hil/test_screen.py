@@ -26,6 +26,7 @@ import pytest
 from rich.console import Console, Group
 
 from drivers.states import State
+from hil import screen as layout
 from hil.campaign.operator import (
     DriftCurve,
     Latency,
@@ -37,10 +38,18 @@ from hil.campaign.operator import (
 from hil.cell import Cell
 from hil.cell.schema import CanTable
 from hil.progress import put
-from hil.screen import Screen, layout
-from hil.screen.keys import Keyboard, after, single_keys, typed
-from hil.screen.layout import Shown, lines
-from hil.screen.screen import Pace, ScreenError, far_end_of
+from hil.screen import (
+    Keyboard,
+    Pace,
+    Screen,
+    ScreenError,
+    Shown,
+    after,
+    far_end_of,
+    lines,
+    single_keys,
+    typed,
+)
 from sim_fixtures.ns16 import CELL_PATH
 
 RIG = Path(__file__).with_name("screen_rig.py")
@@ -102,10 +111,10 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
 @pytest.mark.parametrize("width", [20, 40, 48, 63, 64, 79, 80, 132, 300])
 @pytest.mark.parametrize("height", [3, 8, 12, 24, 60])
 def test_at_any_size_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -> None:
-    hot = status(temperature=np.full(6, 41.0))
+    whole = status()
     nothing = status(following_error=None, following_share=None, current=None, current_share=None)
     between = RunStatus("move", 1, 3, 1.0)
-    for at in (hot, nothing, between, None):
+    for at in (whole, nothing, between, None):
         screen = drawn(width, height, Shown("a title that is long " * 4, NAMES, at, stopping=True))
         assert len(screen) <= height
         assert max(map(len, screen)) <= width
@@ -176,12 +185,6 @@ def test_a_terminal_breaks_lines_between_words_and_a_file_gets_them_whole() -> N
         rows = out.getvalue().splitlines()
         assert " ".join(row.strip() for row in rows) == sentence
         assert (len(rows) > 1) is terminal
-
-
-def test_a_temperature_is_shown_if_there_is_one() -> None:
-    hot = status(temperature=np.array([41.0, 42.0, 43.0, 44.0, 45.0, 46.0]))
-    assert any("43°C" in line for line in drawn(80, 24, Shown("x", NAMES, hot)))
-    assert not any("°C" in line for line in drawn(80, 24))
 
 
 def test_a_bar_is_as_long_as_its_share() -> None:
@@ -468,7 +471,7 @@ def test_a_terminal_that_takes_nothing_more_delays_no_stop(tmp_path: Path) -> No
 
 def test_keys_that_are_cut_in_two_are_put_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow line the parts of an arrow come one by one; none of them is a key."""
-    monkeypatch.setattr("hil.screen.keys._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
+    monkeypatch.setattr("hil.screen._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
     near, far = pty.openpty()
     pressed: list[str] = []
     keyboard = Keyboard(pressed.append)

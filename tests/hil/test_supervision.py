@@ -1,20 +1,27 @@
-"""What supervises a run: its view of the exchange, its own pace, and a screen that fails."""
+"""What supervises a run: its view of the exchange, its own pace, a screen that fails, and rest."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers.events import MotionStarted
 from drivers.exchange import control as control_memory
 from drivers.exchange.event_log import NO_SUPERVISOR, EventsLost
+from drivers.record import cycle_dtype
 from drivers.states import State
-from hil.campaign import exchange_view
-from hil.campaign.exchange_view import ExchangeView
-from hil.campaign.live_link import STALL, Heartbeat
+from hil.archive import open_archive
+from hil.campaign import live_link
+from hil.campaign.live_link import STALL, ExchangeView, Heartbeat, Standstill
 from hil.campaign.operator import OperatorRequest, RunStatus, RunWatch, Stop
+from hil.testing import faulty_link
+from tests.hil.fast_cell import fast_campaign, fast_cell
 
 
 class Exchange:
@@ -37,48 +44,58 @@ class Exchange:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     at = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(exchange_view, "time", SimpleNamespace(monotonic=lambda: at.now))
+    monkeypatch.setattr(live_link, "time", SimpleNamespace(monotonic=lambda: at.now))
     return at
 
 
-def test_a_motion_is_not_waited_for_once_the_drive_is_off(clock: SimpleNamespace) -> None:
-    exchange = Exchange()
+@pytest.fixture
+def exchange(clock: SimpleNamespace) -> Exchange:
+    return Exchange()
+
+
+@pytest.fixture
+def view(exchange: Exchange) -> ExchangeView:
     view = ExchangeView(exchange)  # type: ignore[arg-type]
     view.forget_motion()
-    assert view.not_begun() is None
-    exchange.state = State.DRIVE_OFF
-    clock.now += 1.0
-    assert view.not_begun() is None
-    clock.now += 1.5
-    assert view.not_begun() == "the drive went off before the motion began"
+    return view
 
 
-def test_a_motion_that_does_not_begin_is_given_up_after_a_minute(clock: SimpleNamespace) -> None:
-    view = ExchangeView(Exchange())  # type: ignore[arg-type]
-    view.forget_motion()
-    clock.now += 59.0
+@pytest.mark.parametrize(
+    ("state", "waits", "words"),
+    [
+        (State.DRIVE_OFF, 1.9, "the drive went off before the motion began"),
+        (State.FAULTED, 1.9, "a refusal came before the motion began"),
+        (State.CLOSED, 59.0, r"did not begin within 60 s"),
+    ],
+)
+def test_a_motion_that_does_not_begin_is_given_up(
+    view: ExchangeView,
+    exchange: Exchange,
+    clock: SimpleNamespace,
+    state: State,
+    waits: float,
+    words: str,
+) -> None:
+    exchange.state = state
+    clock.now += waits
     assert view.not_begun() is None
     clock.now += 2.0
-    assert "did not begin within 60 s" in (view.not_begun() or "")
+    assert words in (view.not_begun() or "")
 
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
 def test_a_motion_that_began_or_may_have_is_not_given_up(
-    clock: SimpleNamespace, event: MotionStarted | EventsLost
+    view: ExchangeView, exchange: Exchange, clock: SimpleNamespace, event: Any
 ) -> None:
-    exchange = Exchange()
-    view = ExchangeView(exchange)  # type: ignore[arg-type]
-    view.forget_motion()
     exchange.said.append(event)
     view.look()
     clock.now += 3600.0
     assert view.not_begun() is None
 
 
-def test_the_count_tells_the_end_of_a_motion_whose_event_was_lost(clock: SimpleNamespace) -> None:
-    exchange = Exchange()
-    view = ExchangeView(exchange)  # type: ignore[arg-type]
-    view.forget_motion()
+def test_the_count_tells_an_end_whose_event_was_lost(
+    view: ExchangeView, exchange: Exchange
+) -> None:
     assert not view.motion_ended
     exchange.ended_count += 1
     assert view.motion_ended
@@ -104,7 +121,7 @@ def beats_in(heart: Heartbeat, clock: Clock, given: list[float], seconds: float)
     return len(given) - before
 
 
-def test_beats_end_where_a_motion_is_supervised_and_its_loop_stands_still() -> None:
+def test_beats_end_where_the_supervising_loop_stands_still() -> None:
     clock, given = Clock(), list[float]()
     heart = Heartbeat(lambda: given.append(clock.now), clock)
     assert beats_in(heart, clock, given, 600.0) >= 11_999, "between motions work may take long"
@@ -121,7 +138,7 @@ def test_beats_end_where_a_motion_is_supervised_and_its_loop_stands_still() -> N
     assert beats_in(heart, clock, given, 60.0) >= 1_199
 
 
-def test_a_program_that_got_no_processor_is_told_so_and_other_ends_are_not_explained() -> None:
+def test_a_program_that_got_no_processor_is_named() -> None:
     clock = Clock()
     heart = Heartbeat(lambda: None, clock)
     assert heart.explained(NO_SUPERVISOR) == NO_SUPERVISOR
@@ -139,7 +156,8 @@ class Failing:
     can_answer = False
 
     def __init__(self) -> None:
-        self.shown, self.answer, self.fails = 0, OperatorRequest(), False
+        self.shown, self.fails = 0, False
+        self.answer: Any = OperatorRequest()
 
     def show(self, _: RunStatus) -> None:
         self.shown += 1
@@ -147,46 +165,104 @@ class Failing:
             raise RuntimeError("no picture")
 
     def request(self) -> OperatorRequest:
-        return self.answer
+        return self.answer  # type: ignore[no-any-return]
 
     def accept_dry_run(self, _: object) -> bool:
         return False
 
 
-def test_a_screen_that_shows_nothing_is_still_asked_for_wishes() -> None:
-    operator, stop = Failing(), Stop()
-    watch = RunWatch(operator, stop)
+@pytest.fixture
+def operator() -> Failing:
+    return Failing()
+
+
+@pytest.fixture
+def watch(operator: Failing) -> RunWatch:
+    return RunWatch(operator, Stop())
+
+
+def test_a_screen_that_shows_nothing_is_still_asked(operator: Failing, watch: RunWatch) -> None:
     operator.fails = True
     for _ in range(3):
         watch.note("good")
     assert operator.shown == 1
     operator.answer = OperatorRequest(0.4, held=True)
-    assert watch.request() == OperatorRequest(0.4, held=True)
-    assert not stop.requested
-    assert len(watch.troubles) == 1
-    assert "no picture" in watch.troubles[0]
+    assert watch.request() == operator.answer
+    assert not watch.stop.requested
+    (trouble,) = watch.troubles
+    assert "no picture" in trouble
 
 
-def test_a_wish_that_is_none_leaves_the_last_and_is_asked_for_anew() -> None:
-    operator, stop = Failing(), Stop()
-    watch = RunWatch(operator, stop)
-    operator.answer = OperatorRequest(0.4)
-    watch.request()
-    operator.answer = None  # type: ignore[assignment]
-    assert watch.request() == OperatorRequest(0.4)
-    operator.answer = OperatorRequest(0.3)
-    assert watch.request() == OperatorRequest(0.3)
+def test_a_request_that_is_none_leaves_the_last(operator: Failing, watch: RunWatch) -> None:
+    for answer, expected in ((0.4, 0.4), (None, 0.4), (0.3, 0.3)):
+        operator.answer = None if answer is None else OperatorRequest(answer)
+        assert watch.request() == OperatorRequest(expected)
     assert "None is no OperatorRequest" in watch.troubles[0]
-    assert not stop.requested
+    assert not watch.stop.requested
 
 
-def test_a_hold_that_nobody_can_release_becomes_a_stop() -> None:
-    operator, stop = Failing(), Stop()
-    watch = RunWatch(operator, stop)
+def test_a_hold_that_nobody_can_release_becomes_a_stop(operator: Failing, watch: RunWatch) -> None:
     operator.answer = OperatorRequest(held=True)
     watch.request()
-    assert not stop.requested
-    operator.answer = None  # type: ignore[assignment]
+    assert not watch.stop.requested
+    operator.answer = None
     assert watch.request().held
-    assert stop.requested
+    assert watch.stop.requested
     assert "the run was stopped" in watch.troubles[0]
+
+
+# --- When an arm that the controller moves counts as being at rest
+
+PERIOD = 0.002
+SECOND = round(1.0 / PERIOD)
+
+
+def records(
+    first: int, count: int, velocity: float = 0.0, noise: float = 0.0, *, known: bool = True
+) -> NDArray[np.void]:
+    rows = np.zeros(count, cycle_dtype(2))
+    rows["cycle"] = first + np.arange(count)
+    rows["target_position"][:, 1] = velocity * PERIOD * rows["cycle"]
+    rows["position"] = rows["target_position"] + noise * (-1.0) ** rows["cycle"][:, None]
+    if not known:
+        rows["position"][:, 0] = np.nan
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("portions", "rests"),
+    [
+        ([records(0, SECOND)], False),
+        ([records(0, SECOND), records(SECOND, 1)], True),
+        ([records(0, 10 * SECOND, velocity=1e-4)], False),
+        ([records(0, SECOND + 1, noise=1e-4)], True),
+        (
+            [records(0, SECOND), records(SECOND - 5, 10, 0.5), records(SECOND + 5, SECOND)],
+            False,
+        ),
+        ([records(SECOND - 5, 10, 0.5), records(SECOND + 5, SECOND + 10)], True),
+        ([records(0, 5 * SECOND, known=False)], False),
+        ([records(10_000, 10), records(0, 10)], False),
+    ],
+    ids=["less than a second", "a second", "creeping", "noise of an encoder", "motion between",
+         "a second after motion", "not seen", "another session"],
+)  # fmt: skip
+def test_a_second_without_motion_is_rest(portions: list[NDArray[np.void]], rests: bool) -> None:
+    still = Standstill(PERIOD)
+    assert [still.take(portion) for portion in portions][-1] is rests
+
+
+def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) -> None:
+    cell = fast_cell(tmp_path)
+    quiet = fast_campaign(tmp_path / "quiet", cell)
+    assert not quiet.run(unrehearsed=True).rejected
+    (archive,) = quiet.folder.completed("standstill")
+    cycle = int(open_archive(archive).columns["cycle"].mean())
+
+    pushed = fast_campaign(tmp_path / "pushed", cell)
+    result = pushed.run(faulty_link(cell, f"push@{cycle}x20:axis=1"), unrehearsed=True)
+    (rejected,) = result.rejected
+    assert rejected.archive == "standstill_000_a1.mcap"
+    assert re.search(r"moved at .* rad/s while the arm was to stand still", rejected.reason)
+    again = [path.name for path in pushed.folder.completed("standstill")]
+    assert again == ["standstill_000_a2.mcap"]

@@ -11,9 +11,6 @@ next run complete the campaign? The number of a round is its seed.
 Rounds that the journal knows are not run again, so the first command may be interrupted and
 repeated. Exit status 1 if a law was broken; the folders of such rounds are kept. Exit status 2 if
 the journal is none of these.
-
-`loss_waived` counts rounds that lost more than the bound with the archive process, by no more
-cycles than the controller had waited for it in vain just before it died.
 """
 
 from __future__ import annotations
@@ -173,7 +170,6 @@ def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "archives_torn": len(lost),
         "lost_at_most": lost[-1] if lost else 0,
         "lost_within_promise": sum(count <= PROMISED for count in lost),
-        "loss_waived": sum("waived" in one for one in results),
         "estimates_apart_at_most": max((one.get("apart", 0.0) for one in results), default=0.0),
         "seconds": sum(one["seconds"] for one in results),
         "processor_seconds": sum(one["processor"] for one in results),

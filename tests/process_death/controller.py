@@ -12,7 +12,6 @@ import os
 import select
 import signal
 import time
-from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
@@ -26,7 +25,7 @@ from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import Request, Tally, UdpFarEnd
-from tests.process_death.product import ArchivedSoFar, listening
+from tests.process_death.product import listening
 from tests.process_death.rounds import Round
 
 Rows = NDArray[np.void]
@@ -37,26 +36,19 @@ ROW: Final = np.dtype(
         ("phase", "u1"),
         ("replied", "?"),
         ("deserted", "?"),
-        ("lagged", "?"),
         ("rejected", "<i4"),
         ("position", "<f8", (2,)),
         ("velocity", "<f8", (2,)),
     ]
 )
 """One cycle: wire number of its packet, phase after it, whether a valid answer came, whether the
-exchange process was found dead, whether the archive process was waited for in vain before it was
-sent, answers rejected so far, and the plant's joints after it [rad,
+exchange process was found dead, answers rejected so far, and the plant's joints after it [rad,
 rad/s]."""
 CAPACITY: Final = 40_000
 _HEADER: Final = 128
-_ROWS, _FINISH, _GIVE_UP, _EXCHANGE, _ARCHIVE, _LAGGED = range(6)
+_ROWS, _FINISH, _GIVE_UP, _EXCHANGE = range(4)
 WAIT: Final = 60.0
 """s that a living PC is waited for."""
-LAG: Final = 12
-"""Records that the archive process may be behind before the controller waits for it, too: it looks
-for records every 20 ms, which are 10."""
-LONGEST_LAG: Final = 0.7
-"""s that it is waited for in one cycle; to a session a longer silence is the end of the link."""
 REST: Final = 10
 """Cycles of standing after which an arm is at rest."""
 _PDEATHSIG: Final = 1
@@ -110,23 +102,9 @@ class Page:
         """Process id of the exchange, 0 as long as there is none."""
         return int(self._words[_EXCHANGE])
 
-    @property
-    def archive(self) -> int:
-        """Process id of the archive process, likewise."""
-        return int(self._words[_ARCHIVE])
-
-    def tell(self, exchange: int, archive: int) -> None:
+    def tell(self, exchange: int) -> None:
         """Say whom the controller is to wait for."""
-        self._words[_ARCHIVE], self._words[_EXCHANGE] = archive, exchange
-
-    @property
-    def lagged(self) -> int:
-        """Cycles in which the archive process was waited for in vain."""
-        return int(self._words[_LAGGED])
-
-    def lag(self) -> None:
-        """Count such a cycle."""
-        self._words[_LAGGED] += 1
+        self._words[_EXCHANGE] = exchange
 
 
 class _Life:
@@ -154,19 +132,16 @@ class WaitingEnd:
 
     def __init__(self, host: str, port: int, page: Page) -> None:
         self.number = 0
-        self.deserted = self.lagged = False
+        self.deserted = self._began = False
         self._link, self._port, self._page = UdpFarEnd(host, port), port, page
-        self._exchange, self._archive = _Life(), _Life()
-        self._began = False
-        self._progress: ArchivedSoFar | None = None
+        self._exchange = _Life()
 
     def send(self, packet: bytes) -> None:
-        """Send, once somebody listens and the archive process is not far behind."""
+        """Send, once somebody listens."""
         self.number = packet_number(packet)
         while not (self._began or self._page.given_up):
             self._began = listening(self._port)
             time.sleep(0.005)
-        self.lagged = self._wait_for_archive()
         self._link.send(packet)
 
     def receive(self, timeout: float) -> bytes | None:
@@ -185,27 +160,6 @@ class WaitingEnd:
     def close(self) -> None:
         """Close the link."""
         self._link.close()
-
-    def _wait_for_archive(self) -> bool:
-        """Until the archive process is not far behind; whether that was in vain."""
-        page = self._page
-        if not page.archive or self.deserted:
-            return False
-        if self._progress is None:
-            with suppress(OSError):
-                self._progress = ArchivedSoFar(page.exchange)
-            return False
-        until = time.monotonic() + LONGEST_LAG
-        while (
-            self._progress.begun
-            and self._progress.behind > LAG
-            and not self._archive.over(page.archive)
-        ):
-            if time.monotonic() > until or self._exchange.over(page.exchange):
-                page.lag()
-                return True
-            time.sleep(0.0005)
-        return False
 
 
 class _Wishes(Buttons):
@@ -243,7 +197,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
         plant = controller.plant
         rejected = controller.rejected_replies + tally.rejected
         page.add((
-            end.number, controller.phase, replied, end.deserted, end.lagged, rejected,
+            end.number, controller.phase, replied, end.deserted, rejected,
             plant.position, plant.velocity,
         ))  # fmt: skip
 

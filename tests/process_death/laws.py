@@ -21,26 +21,22 @@ from hil.campaign import Campaign
 from hil.campaign.folder import Entry
 from hil.errors import ArchiveError
 from sim_fixtures.program import Phase
-from tests.process_death.controller import LAG, REST, at_rest
+from tests.process_death.controller import REST, at_rest
 from tests.process_death.rig import Seen
-from tests.process_death.watched import Death
 
 Records = NDArray[np.void]
 
 PROMISED: Final = 52
-"""Cycles that a dead archive process may cost on a machine that does not keep it waiting: a chunk
-of 100 ms, and the one or two that come while it is written. How many rounds kept to it is counted;
-it is no law of a single one, as a machine on which rounds are played beside each other does keep
-it waiting, and nobody can make the system run it."""
-MOST: Final = PROMISED - 1 + 2 * LAG
-"""Cycles that it may cost on any machine: what came between its last two looks for records, and
-since the last one, the controller waits for it each time after `LAG` of them. `LAG` cannot be less:
-the process may look every 10 records as long as no chunk is due."""
+"""Cycles that a dead archive process may cost beyond those that it had not taken: a chunk of
+100 ms, and the one or two that come while it is written."""
 COMPARED: Final = ("number", "position", "target_current", "commanded_position", "state", "gap")
 GONE: Final = ("ended", "is gone", "cannot be started")
 NAMED: Final = {
     "exchange": tuple(f"the exchange process {what}" for what in GONE),
-    "archive": tuple(f"the archive process {what}" for what in GONE),
+    "archive": (
+        *(f"the archive process {what}" for what in (*GONE, "gave no sign of life")),
+        "cannot be written further",
+    ),
     "controller": ("controller", "link", "silent", "nothing heard", "packet"),
 }
 """Words of which one at least stands in the error of a supervisor that survived one of these. Of
@@ -293,22 +289,9 @@ def _archived(kept: list[Kept], seen: Seen, figures: dict[str, int]) -> Iterator
     lost = int(np.count_nonzero(missing < records["cycle"][0] + death.written))
     if any(not one.archive.complete for one in kept) or lost:
         figures["lost"] = lost
-    if lost > MOST:
-        waited = _in_vain(seen, death, lost)
-        if lost > MOST + waited:
-            yield f"{lost} cycles of motion were lost with the archive process"
-        else:
-            figures["waived"] = waited
-
-
-def _in_vain(seen: Seen, death: Death, count: int) -> int:
-    """Of the last so many cycles before a death, those sent although the archive process lagged.
-
-    Each of them lets one record more be behind; what lagged earlier and was caught up with lets
-    none.
-    """
-    last = seen.records["number"][: death.written][-count:]
-    return int(np.count_nonzero(seen.rows["lagged"] & np.isin(seen.rows["number"], last)))
+    # Nobody can make the system run a process: what it had no time to take is not its loss.
+    if lost > PROMISED + death.behind:
+        yield f"{lost} cycles of motion were lost with the archive process"
 
 
 def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
@@ -323,7 +306,14 @@ def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
             case _:
                 continue
         rows = _rows_of(one, seen.records) if one.cycles.size else None
-        if rows is None or (interval := int(rows["interval"].max())) < 0:
+        if rows is None:
+            continue
+        # An archive that is closed late may hold the begin of the next interval as well.
+        began = [event.time for event in one.archive.events if event.name == "MotionStarted"]
+        cycles = rows["cycle"] * campaign.cell.period
+        first = np.searchsorted(cycles, began[-1] - 1e-6) if began else rows["interval"].argmax()
+        interval = int(rows["interval"][min(first, len(rows) - 1)])
+        if interval < 0:
             continue
         every = seen.records[seen.records["interval"] == interval]
         commanded = every["commanded_position"]

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, Link, Stop
-from hil.campaign.quick_design import design
+from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.identify import identify_campaign
 from hil.identify.options import FIXED
@@ -136,10 +136,9 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
             "status": seen.status,
             "said": seen.said.get("text", ""),
             "cycles": len(seen.rows),
-            "lagged": seen.lagged,
             **figures,
         }
-        broken += _finished(campaign, played, seen, folder)
+        broken += finished(campaign, played, seen, folder)
         if not broken and number % ESTIMATED == 0:
             apart = estimate_of(campaign).apart(stage.undisturbed)
             result["apart"] = apart
@@ -157,7 +156,7 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
     return result
 
 
-def _finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
+def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
     """Finish the campaign; what was broken."""
     earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
     before = campaign.folder.manifest()

@@ -65,29 +65,6 @@ def _descriptor(exchange: int, place: int) -> int:
     return os.open(f"/proc/{exchange}/fd/{number}", os.O_RDWR)
 
 
-class ArchivedSoFar:
-    """How far the archive process has read the records of an exchange.
-
-    Raises:
-        OSError: there is no such exchange any more.
-    """
-
-    def __init__(self, exchange: int) -> None:
-        descriptor = _descriptor(exchange, _RING)
-        self._words = memoryview(mmap.mmap(descriptor, 4096)).cast("B").cast("q")
-        os.close(descriptor)
-
-    @property
-    def begun(self) -> bool:
-        """Whether it has begun to."""
-        return bool(self._words[record._READ])
-
-    @property
-    def behind(self) -> int:
-        """Records written and not taken yet."""
-        return int(self._words[record._WRITTEN] - self._words[record._READ])
-
-
 class Memory:
     """The shared memory of an exchange, kept beyond its death.
 
@@ -106,6 +83,12 @@ class Memory:
     def written(self) -> int:
         """Records written so far."""
         return int(self._words[record._WRITTEN])
+
+    @property
+    def behind(self) -> int:
+        """Records written that the archive process has not taken; 0 before it has begun to."""
+        read = int(self._words[record._READ])
+        return self.written - read if read else 0
 
     def records(self) -> NDArray[np.void]:
         """All records of the session: the ring is larger than any of these."""

@@ -10,20 +10,24 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
+import select
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
+from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
 from hil.campaign.folder import Entry
 from hil.cell import Cell
@@ -33,10 +37,151 @@ from hil.progress import Silent
 from tests.process_death import product
 from tests.process_death.controller import Page, Rows, at_rest, forked
 from tests.process_death.rounds import Round, Trigger, Victim
-from tests.process_death.watched import LOOK, PATIENCE, Death, NeverHappenedError, Watched
 
 MARK: Final = "HIL_PROCESS_DEATH"
 """Variable in the environment of every process that a supervisor starts."""
+
+
+PATIENCE: Final = 90.0
+"""s for anything that has to happen, on a machine that does other things as well."""
+LOOK: Final = 0.001
+"""s between two looks."""
+NOTICED: Final = 100
+"""Cycles within which an exchange has noticed the death of its supervisor."""
+MAY_MOVE: Final = (State.OPENING, State.OPEN, State.EXITING)
+
+
+Strike = Literal["SIGKILL", "SIGSTOP", "SIGINT", "SIGHUP", "full disk"]
+
+
+class NeverHappenedError(AssertionError):
+    """Something that has to happen did not."""
+
+
+@dataclass(eq=False)
+class Death:
+    """One kill.
+
+    Attributes:
+        victim: who died.
+        written: records that the exchange had written just before.
+        behind: of them, how many the archive process had not taken at some moment of the last
+            second.
+    """
+
+    victim: Victim
+    written: int
+    behind: int = 0
+
+
+class Watched:
+    """The processes of one run while it goes on."""
+
+    def __init__(self, page: Page, supervisor: int, controller: int, *, loops: bool) -> None:
+        self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
+        self.status: dict[int, int] = {}
+        self.memory: product.Memory | None = None
+        self._page, self._loops = page, loops
+        self._ends: dict[int, int] = {}
+        self._leaving: int | None = None
+        self._behind: deque[int] = deque(maxlen=round(1.0 / LOOK))
+        self._watch(supervisor)
+        self._watch(controller)
+
+    def _watch(self, pid: int) -> None:
+        with suppress(ProcessLookupError):
+            self._ends[pid] = os.pidfd_open(pid)
+
+    def over(self, victim: Victim) -> bool:
+        """Whether a process has ended; one that never began counts as ended."""
+        pid = self.pids.get(victim, 0)
+        if pid not in self._ends:
+            return True
+        if not select.select([self._ends[pid]], [], [], 0.0)[0]:
+            return False
+        if victim in ("supervisor", "controller") and pid not in self.status:
+            self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        return True
+
+    def look(self) -> None:
+        """Find what the supervisor has started meanwhile."""
+        modules: tuple[tuple[Victim, str], ...] = (
+            ("exchange", product.EXCHANGE),
+            ("archive", product.ARCHIVE),
+        )
+        for victim, module in modules:
+            if victim not in self.pids and (
+                pid := product.started_by(self.pids["supervisor"], module)
+            ):
+                self._watch(pid)
+                self.pids[victim] = pid
+                self._page.tell(self.pids.get("exchange", 0))
+        if self.memory is None and "exchange" in self.pids:
+            with suppress(OSError):
+                self.memory = product.Memory(self.pids["exchange"])
+        if self.memory is not None:
+            self._behind.append(self.memory.behind)
+        if not self._loops and self._left_alone():
+            self._page.finish()  # as whoever stands at the cabinet would
+
+    def _left_alone(self) -> bool:
+        """Whether nobody wants anything to move any more, and nothing does.
+
+        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
+        meanwhile. A controller that is told to end closes its axes as soon as their targets stand,
+        which they also do at the begin of a motion.
+        """
+        control = None if self.memory is None else self.memory.control
+        if not (self.over("supervisor") or (control is not None and control.finish)):
+            return False
+        if self._leaving is None:
+            self._leaving = self._page.count
+        moves = control is not None and control.state in MAY_MOVE and not self.over("exchange")
+        return not moves and self._page.count - self._leaving > NOTICED
+
+    def wait(self, *victims: Victim) -> None:
+        """Until they have ended.
+
+        Raises:
+            NeverHappenedError: one did not.
+        """
+        deadline = time.monotonic() + PATIENCE
+        for victim in victims:
+            while not self.over(victim):
+                self.look()
+                if time.monotonic() > deadline:
+                    raise NeverHappenedError(f"the {victim} never ended")
+                time.sleep(5 * LOOK)
+
+    def strike(self, victim: Victim, how: Strike, archives: Path) -> Death:
+        """Kill a process, or do something else to it."""
+        pid, written = self.pids[victim], 0 if self.memory is None else self.memory.written
+        with suppress(ProcessLookupError):
+            match how:
+                case "full disk":
+                    newest = max(archives.iterdir(), key=lambda one: one.stat().st_mtime_ns)
+                    most = newest.stat().st_size + 1000
+                    resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
+                case "SIGINT" | "SIGHUP":  # as a terminal sends them
+                    os.killpg(pid, signal.Signals[how])
+                case _:
+                    os.kill(pid, signal.Signals[how])
+        return Death(victim, written, max(self._behind, default=0))
+
+    def close(self) -> None:
+        """End whatever is left, and let go."""
+        for victim, pid in self.pids.items():
+            if not self.over(victim):
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        for victim in ("supervisor", "controller"):
+            pid = self.pids[victim]
+            if pid not in self.status:
+                self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        for end in self._ends.values():
+            os.close(end)
+        if self.memory is not None:
+            self.memory.close()
 
 
 @dataclass(eq=False)
@@ -50,7 +195,6 @@ class Seen:
         rows: the controller's account up to when everything else had ended.
         records: the exchange's, from its memory.
         entered: manifest as it was before the first kill.
-        lagged: cycles in which the controller waited for the archive process in vain.
         left: process ids that were still there when all should have ended.
         port_taken: whether nobody else could have had the port afterwards.
     """
@@ -61,7 +205,6 @@ class Seen:
     rows: Rows
     records: NDArray[np.void]
     entered: list[Entry]
-    lagged: int
     left: list[int] = field(default_factory=list)
     port_taken: bool = False
 
@@ -182,8 +325,9 @@ def run(
     victims: tuple[Victim, ...],
     said: Path,
     planted: Path | None = None,
+    how: Strike = "SIGKILL",
 ) -> Seen:
-    """Run a campaign with a controller of its own, and kill those `victims` when it is time.
+    """Run a campaign with a controller of its own, and strike those `victims` when it is time.
 
     Raises:
         NeverHappenedError: something did not end.
@@ -191,7 +335,7 @@ def run(
     page = Page()
     with _started(campaign, played, page, said, planted) as watched:
         deaths: list[Death] = []
-        entered = _killed(watched, campaign, played, page, victims, deaths)
+        entered = _struck(watched, campaign, played, page, victims, how, deaths)
         watched.wait("supervisor", "exchange", "archive")
         rows = _until_the_arm_rests(watched, page)
         memory = watched.memory
@@ -206,21 +350,21 @@ def run(
             rows,
             records,
             campaign.folder.manifest() if entered is None else entered,
-            page.lagged,
             left=_left(campaign),
             port_taken=_port_taken(campaign.cell.controller.port or 0),
         )
 
 
-def _killed(
+def _struck(
     watched: Watched,
     campaign: Campaign,
     played: Round,
     page: Page,
     victims: tuple[Victim, ...],
+    how: Strike,
     deaths: list[Death],
 ) -> list[Entry] | None:
-    """Wait for the moment and kill; the manifest as it was before, None if it never came."""
+    """Wait for the moment and strike; the manifest as it was before, None if it never came."""
     due = _Due(played.trigger, campaign, page)
     deadline = time.monotonic() + PATIENCE
     while not (watched.over("supervisor") or (victims and due.now(watched.memory))):
@@ -242,7 +386,9 @@ def _killed(
             watched.look()
             time.sleep(LOOK)
         if victim in watched.pids and not watched.over(victim):
-            deaths.append(watched.kill(victim))
+            death = watched.strike(victim, how, campaign.folder.archives)
+            if how not in ("SIGINT", "SIGHUP"):  # which nobody dies of
+                deaths.append(death)
     return entered
 
 

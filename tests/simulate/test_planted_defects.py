@@ -19,7 +19,7 @@ from drivers.session import Sequence
 from drivers.state_machine import Machine
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder, Entry
-from hil.campaign.runner import Runner
+from hil.campaign.run import Runner
 from planner import TrajectoryPlayer
 from tests.simulate.judging import judged
 from tests.simulate.many import stage_folder

@@ -16,7 +16,7 @@ import pytest
 
 from hil.archive import ArchiveName, Samples, open_archive, write_samples
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.dry_run import Acceptance, DryRun, GravityCheck
+from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.quality import Played
 from hil.campaign.rehearsal import Criterion, Rehearsal
@@ -113,7 +113,6 @@ def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, fold
         lambda: DryRun.of(campaign.folder, cell, names, plan_hash="", simulated=True),
         lambda: Played.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
-        lambda: GravityCheck.of(cell, [imported]),
     ):
         with pytest.raises(ArchiveError, match="is no recording of a motion of hil's own"):
             way()

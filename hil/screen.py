@@ -1,0 +1,826 @@
+"""The one screen of a run: what is shown of it, the keys of its person, and plain lines elsewhere.
+
+What it looks like is a pure function of what is known and how much room there is (`lines`). Eighty
+columns and twenty-four lines hold everything of a six-joint arm; with less room, bars get shorter,
+then go; the last events go before the drift curve, that before the joints. It is drawn by a thread
+of its own: a terminal that takes nothing more (a connection that broke, a pipe that is full) delays
+neither the motion nor a stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import select
+import sys
+import termios
+import textwrap
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal, TextIO
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from hil.campaign.dry_run import DryRun
+from hil.campaign.operator import DriftCurve, MotionProgress, OperatorRequest, RunStatus, Stop
+from hil.cell import Cell
+from hil.progress import Silent, Task, put
+from hil.terminal_text import plural, printable
+
+# --- keys
+
+STEP: Final = 0.1
+"""Of override, per key."""
+LEAST: Final = 0.1
+"""Override that keys go down to; to rest, there is the hold."""
+LONGEST_TYPED: Final = 3
+"""Keys that come at once from a person; more of them are pasted, and make nothing faster."""
+HELP: Final = "h hold   space resume   s stop   + - override   1…9: 10…90 %   0: 100 %"
+SHORT_HELP: Final = "h hold  r resume  s stop  + - 1…0 %"
+_ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
+    **dict.fromkeys("hH\x1b", "hold"),
+    **dict.fromkeys(" rR", "resume"),
+    **dict.fromkeys("sSqQ", "stop"),
+}
+_SEQUENCES: Final = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]?|\x1bO.?", re.DOTALL)
+"""What a terminal sends of arrows and the like; the last may be cut off."""
+_AFTER_ESCAPE: Final = re.compile(r"\x1b([^\x1b])", re.DOTALL)
+_UNFINISHED: Final = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?\Z")
+_SEQUENCE_WAIT: Final = 0.05
+"""s for the rest of such a sequence; after that the key Esc was meant."""
+_CHUNK: Final = 256
+_LOCAL, _CONTROL, _INPUT = 3, 6, 0
+
+
+def typed(chunk: str) -> str:
+    """Keys among what a terminal sent: arrows and the like come as several characters.
+
+    Esc holds. With whatever comes together with it (so a terminal sends Alt, too) it never does
+    less: a stop or a hold counts as itself, any other key as the hold.
+    """
+
+    def urgent(key: str) -> bool:
+        return _ACTIONS.get(key) in ("stop", "hold")
+
+    keys = _AFTER_ESCAPE.sub(
+        lambda found: found[1] if urgent(found[1]) else "\x1b", _SEQUENCES.sub("", chunk)
+    )
+    return keys if len(keys) <= LONGEST_TYPED else "".join(filter(urgent, keys))
+
+
+def after(request: OperatorRequest, key: str, override: float) -> OperatorRequest:
+    """The request after a key.
+
+    Args:
+        request: before it.
+        key: one character.
+        override: of the motion that is going on; it may be below what is requested.
+    """
+    action = _ACTIONS.get(key)
+    if action in ("hold", "resume"):
+        return replace(request, held=action == "hold")
+    if key in "+=-_":
+        tenths = round((override + (STEP if key in "+=" else -STEP)) / STEP)
+        return replace(request, override=min(1.0, max(LEAST, tenths * STEP)))
+    if key.isascii() and key.isdigit():
+        return replace(request, override=(int(key) or 10) * STEP)
+    return request
+
+
+def can_read(stream: TextIO) -> bool:
+    """Whether single keys can be read: a terminal, with this program in its foreground."""
+    try:
+        fd = stream.fileno()
+        return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def single_keys(fd: int) -> Iterator[None]:
+    r"""Give keys as they are pressed and unseen; the terminal is put back on every way out.
+
+    Ctrl-C and Ctrl-\ stay signals. Ctrl-Z does nothing: a program that is suspended gives no sign
+    of life, and the arm would be stopped. Nor does Ctrl-S, which would freeze the screen.
+    """
+    before = termios.tcgetattr(fd)
+    settings: list[Any] = [part[:] if isinstance(part, list) else part for part in before]
+    settings[_LOCAL] &= ~(termios.ICANON | termios.ECHO)
+    settings[_INPUT] &= ~termios.IXON
+    settings[_CONTROL][termios.VMIN], settings[_CONTROL][termios.VTIME] = 1, 0
+    settings[_CONTROL][termios.VSUSP] = os.fpathconf(fd, "PC_VDISABLE").to_bytes(1, "little")
+    termios.tcsetattr(fd, termios.TCSADRAIN, settings)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(termios.error):  # the terminal may be gone
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+class Keyboard:
+    """Reads keys of the terminal in a thread of its own; a context manager.
+
+    Attributes:
+        attached: whether keys are read; not where standard input is no terminal.
+        failure: why they are not read any more, None for nothing.
+    """
+
+    def __init__(self, take: Callable[[str], None]) -> None:
+        self._take = take
+        self._undo = contextlib.ExitStack()
+        self._over = threading.Event()
+        self.attached = False
+        self.failure: Exception | None = None
+
+    def __enter__(self) -> Keyboard:
+        if can_read(sys.stdin):
+            fd = sys.stdin.fileno()
+            self._undo.enter_context(single_keys(fd))
+            thread = threading.Thread(target=self._read, args=(fd,), daemon=True)
+            self._undo.callback(thread.join)
+            self._undo.callback(self._over.set)
+            self.attached = True
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+        self.attached = False
+
+    def _read(self, fd: int) -> None:
+        try:
+            while not self._over.is_set():
+                if select.select([fd], [], [], _LOOK)[0]:
+                    for key in typed(_chunk(fd).decode(errors="replace")):
+                        self._take(key)
+        except Exception as error:  # whatever it is, the person is to know that keys do nothing
+            self.failure, self.attached = error, False
+
+
+def _chunk(fd: int) -> bytes:
+    """What a terminal sent at once.
+
+    Raises:
+        EOFError: it is gone.
+    """
+    chunk = os.read(fd, _CHUNK)
+    if not chunk:
+        raise EOFError("the terminal is gone")
+    while _UNFINISHED.search(chunk) and select.select([fd], [], [], _SEQUENCE_WAIT)[0]:
+        more = os.read(fd, _CHUNK)
+        if not more:
+            break
+        chunk += more
+    return chunk
+
+
+# --- what it looks like
+
+WIDE: Final = 64
+"""Columns from which on there are bars beside the numbers."""
+STALE: Final = 1.0
+"""s without news after which the screen says so."""
+SIMULATED: Final = "SIMULATED"
+"""What the first line says where nothing but a simulated arm can move."""
+_LEAST_TITLE: Final = 8
+"""Columns of the title that stay whatever stands behind it."""
+_NUMBERS: Final = 28
+"""Columns of a joint's numbers beside its name and bars."""
+_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
+WARNING: Final = 0.8
+"""Share of a limit from which on it is coloured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Everything that is shown.
+
+    Attributes:
+        title: of the run.
+        joint_names: of the n joints.
+        status: where the run stands; None before the first.
+        request: the person's.
+        stopping: whether a stop was asked for.
+        age: s since the status came.
+        said: lines that the run said, oldest first.
+        keys: whether keys are read.
+        far_end: what is moved: "SIMULATED", or the controller's address.
+        left: time to the end as a person waits for it, in words; that of motion if left out.
+    """
+
+    title: str
+    joint_names: tuple[str, ...]
+    status: RunStatus | None = None
+    request: OperatorRequest = field(default_factory=OperatorRequest)
+    stopping: bool = False
+    age: float = 0.0
+    said: tuple[str, ...] = ()
+    keys: bool = True
+    far_end: str = ""
+    left: str = ""
+
+
+def lines(shown: Shown, width: int, height: int) -> list[Text]:
+    """The screen, at most `height` lines of at most `width` columns."""
+    status = shown.status
+    motion = None if status is None else status.motion
+    head = [
+        _heading(shown, width),
+        _bar_of_motion(motion, width),
+        _state(shown, motion, width),
+        _health(motion, width),
+    ]
+    room = height - len(head) - 1
+    joints = _joints(shown.joint_names, motion, width)
+    body = [Text(), *joints] if len(joints) < room else joints[:room]
+    drift = None if status is None else status.drift
+    if drift is not None and len(body) + 2 <= room:
+        body += [Text(), _drift(drift, width)]
+    news = [
+        *shown.said,
+        *(() if status is None else status.notes),
+        *(() if motion is None else motion.events),
+    ]
+    rows = [
+        row
+        for line in news
+        for row in textwrap.wrap(printable(line, keep=""), max(8, width), subsequent_indent="  ")
+    ]
+    left = room - len(body) - 1
+    if left > 0 and rows:
+        body += [Text(), *(Text(row, style="dim") for row in rows[-left:])]
+    keys = next((text for text in (HELP, SHORT_HELP) if len(text) <= width), "h ␣ s + - 1…0")
+    help_ = Text((keys if shown.keys else "Ctrl-C stops on the path").ljust(width), style="reverse")
+    screen = [*head, *body, *[Text()] * max(0, room - len(body)), help_][:height]
+    for line in screen:
+        line.truncate(width, overflow="ellipsis")
+    return screen
+
+
+def status_line(status: RunStatus, left: str = "") -> str:
+    """Where a run stands, in one line; `left` says in words how long a person waits."""
+    parts = [f"{status.phase} {status.number} of {status.total}"]
+    motion = status.motion
+    if motion is not None:
+        if motion.motion_time is not None and motion.duration:
+            parts.append(f"{motion.motion_time:.1f} of {motion.duration:.1f} s")
+        if motion.held:
+            parts.append("held")
+        if motion.override != 1.0:
+            parts.append(f"override {100.0 * motion.override:.0f} %")
+        parts += [f"{motion.missed} missed", f"{motion.late} late"]
+        if motion.untaken:
+            parts.append(f"{motion.untaken} not accepted")
+        if motion.latency is not None:
+            parts.append(f"latency {duration(motion.latency.p99)} (99 %)")
+        if motion.following_share is not None:
+            parts.append(
+                f"following error {100.0 * motion.following_share.max():.0f} % of its limit"
+            )
+        if motion.current_share is not None:
+            parts.append(f"current {100.0 * motion.current_share.max():.0f} % of its limit")
+    drift = status.drift
+    if drift is not None and len(drift.change) > 1:
+        parts.append(
+            f"friction changed by {100.0 * drift.change[-1]:.1f} % "
+            f"(warm below {100.0 * drift.threshold:g} %)"
+        )
+    parts.append(left or f"{clock(status.time_left)} left")
+    return ", ".join(parts)
+
+
+def _heading(shown: Shown, width: int) -> Text:
+    status, where, left = shown.status, Text(), ""
+    if shown.far_end:
+        style = "bold green" if shown.far_end == SIMULATED else "bold yellow"
+        where.append("  ").append(shown.far_end, style=style)
+    if status is None:
+        where.append("  beginning", style="dim")
+    else:
+        where.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
+        left = shown.left or f"{clock(status.time_left)} left"
+    room = max(0, width - len(left) - 2)
+    text = Text(printable(shown.title), style="bold")
+    # The title gives way to what is moved and what it is doing.
+    text.truncate(max(min(_LEAST_TITLE, room), room - where.cell_len), overflow="ellipsis")
+    text.append_text(where)
+    text.truncate(room, overflow="ellipsis")
+    return text.append(left.rjust(width - text.cell_len))
+
+
+def _bar_of_motion(motion: MotionProgress | None, width: int) -> Text:
+    """How far the motion is."""
+    if motion is None:
+        return Text("nothing moves", style="dim")
+    if motion.motion_time is None or not motion.duration:
+        return Text(f"{motion.state.name.lower()}, {motion.cycles} cycles")
+    times = f"{motion.motion_time:.1f} of {motion.duration:.1f} s"
+    room = width - len(times) - 1
+    if room < 10:
+        return Text(times)
+    filled = round(room * min(1.0, motion.motion_time / motion.duration))
+    text = Text("━" * filled, style="cyan").append("─" * (room - filled), style="dim")
+    return Text().append_text(text).append(f" {times}")
+
+
+def _state(shown: Shown, motion: MotionProgress | None, width: int) -> Text:
+    """Whether it moves, and how fast."""
+    text = Text()
+    if shown.stopping:
+        text.append(" STOPPING ", style="bold red reverse").append("  ")
+    elif shown.request.held:
+        text.append(" HELD ", style="bold yellow reverse").append("  ")
+    if shown.age > STALE and shown.status is not None:
+        text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
+    override = shown.request.override if motion is None else motion.override
+    style = "" if override >= 1.0 else "bold yellow"
+    text.append(f"override {100.0 * override:.0f} %", style=style)
+    if motion is not None and motion.rate is not None:
+        text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")
+    if motion is not None and width >= WIDE:
+        text.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
+    return text
+
+
+def _health(motion: MotionProgress | None, width: int) -> Text:
+    """Regularity of the cycle."""
+    text = Text().append("cycles ", style="bold")
+    if motion is None:
+        return text.append("-", style="dim")
+    text.append(f"{motion.cycles}")
+    for count, what in (
+        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not accepted")
+    ):  # fmt: skip
+        if count or width >= WIDE:
+            text.append(f"  {count} {what}", style="bold yellow" if count else "green")
+    if (latency := motion.latency) is not None:
+        worst = duration(latency.worst)
+        usual = f"{duration(latency.median)}, 99 % {duration(latency.p99)}, worst "
+        text.append(f"  {usual if width >= WIDE else ''}{worst}")
+    return text
+
+
+def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> list[Text]:
+    """A line of each joint: following error and current, each against its limit."""
+    if motion is None or motion.following_error is None or motion.current is None:
+        return []
+    assert motion.following_share is not None
+    assert motion.current_share is not None
+    name_width = min(max(map(len, [*names, "joint"])), max(5, width // 5))
+    bars = max(0, (width - name_width - _NUMBERS) // 2) if width >= WIDE else 0
+    titles = (
+        ("following error / threshold", "current / limit") if bars else ("following", "current")
+    )
+    rule = "".join(f"  {title}".ljust(14 + bars) for title in titles)
+    rows = [Text("joint".ljust(name_width) + rule, style="bold")]
+    for index, name in enumerate(names):
+        line = Text(name[:name_width].ljust(name_width))
+        for value, share in (
+            (f"{np.degrees(motion.following_error[index]):8.3f}°", motion.following_share[index]),
+            (f"{motion.current[index]:7.2f} A", motion.current_share[index]),
+        ):
+            line.append(value).append(" ")
+            if bars:
+                line.append(bar(share, bars - 1)).append(" ")
+            line.append(percent(share), style=colour(share))
+        rows.append(line)
+    return rows
+
+
+def _drift(drift: DriftCurve, width: int) -> Text:
+    """Friction from motion to motion while the joints warm up."""
+    known = [float(value) for value in drift.change if np.isfinite(value)]
+    text = Text("warm-up: friction changed by ")
+    if not known:
+        return text.append("… (one motion so far)")
+    style = "green" if known[-1] < drift.threshold else "yellow"
+    text.append(f"{100.0 * known[-1]:.1f} %", style=style)
+    text.append(f", warm below {100.0 * drift.threshold:g} %  ")
+    return text.append(curve(known, max(0, width - text.cell_len)), style="cyan")
+
+
+def bar(share: float, width: int) -> Text:
+    """A share of a limit; above `WARNING` it is marked by colour, above 1 by the last character."""
+    if not math.isfinite(share):
+        return Text("?".ljust(width), style="bold red")
+    if share > 1.0:
+        return Text("█" * (width - 1) + "▶", style=colour(share))
+    whole, rest = divmod(round(8 * width * max(share, 0.0)), 8)
+    blocks = "█" * whole + " ▏▎▍▌▋▊▉"[rest].strip()
+    return Text(blocks, style=colour(share)).append("·" * (width - len(blocks)), style="dim")
+
+
+def colour(share: float) -> str:
+    """Style of a share of a limit; the number beside it says the same without colours."""
+    if share > 1.0:
+        return "bold red"
+    return "yellow" if share > WARNING else "green"
+
+
+def percent(share: float) -> str:
+    """A share in four characters."""
+    if not math.isfinite(share):
+        return "  ?%"
+    value = min(100.0 * share, 999.0)
+    return f"{value:3.1f}%" if value < 9.95 else f"{value:3.0f}%"
+
+
+def curve(values: Sequence[float], width: int) -> str:
+    """The last `width` values as a row of blocks, from 0 to the largest of them."""
+    shown = [max(value, 0.0) for value in values if math.isfinite(value)][-width:]
+    step = (max(shown, default=0.0) or 1.0) / len(_HEIGHTS)
+    return "".join(_HEIGHTS[min(len(_HEIGHTS) - 1, int(value / step))] for value in shown)
+
+
+def clock(seconds: float | None) -> str:
+    """A time as h:mm:ss or m:ss."""
+    if seconds is None or not math.isfinite(seconds):
+        return "?"
+    minutes, rest = divmod(max(0, round(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def duration(seconds: float) -> str:
+    """A latency."""
+    if not math.isfinite(seconds):
+        return "> 5 ms"
+    return f"{1e3 * seconds:.1f} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} µs"
+
+
+# --- how long it takes
+
+_KNOWN_AFTER: Final = 2.0
+"""s of motion and of waiting after which the pace of virtual time is reported."""
+_BETWEEN: Final = 0.6
+"""s from motion to motion, as if seen once before: drives go off and on."""
+
+
+class Pace:
+    """Waiting time per second of motion, and between two motions.
+
+    Between two motions the drives go off and on, an archive is closed and a repetition judged.
+
+    Args:
+        virtual: whether the controller's time is virtual; else a second of motion takes one.
+    """
+
+    def __init__(self, *, virtual: bool) -> None:
+        self._virtual = virtual
+        self._waited = self._moved = 0.0
+        self._between = self._gaps = 0.0
+        self._last: tuple[float, RunStatus] | None = None
+
+    def take(self, status: RunStatus, now: float, *, held: bool) -> None:
+        """Learn from a status that came `now` [s, any monotonic clock]; not while it is held."""
+        if self._last is not None and not held:
+            came, last = self._last
+            waited, moved = now - came, last.time_left - status.time_left
+            between = status.motion is None or last.motion is None
+            self._gaps += 0.5 * ((status.motion is None) != (last.motion is None))  # begin, end
+            if between or moved == 0.0:
+                self._between += waited
+            elif moved > 0.0:  # another override makes what is left longer
+                self._waited += waited
+                self._moved += moved
+                self._between += 0.0 if self._virtual else waited - moved
+        self._last = (now, status)
+
+    def pause(self) -> None:
+        """What passes until the next status is a person's time."""
+        self._last = None
+
+    def left(self, status: RunStatus) -> float | None:
+        """Waiting time to the end of the run [s]; None where it cannot be determined yet."""
+        changes = status.motions_left + (status.motion is None)
+        between = changes * (_BETWEEN + self._between) / (1.0 + self._gaps)
+        if not self._virtual:
+            return status.time_left + between
+        if min(self._waited, self._moved) < _KNOWN_AFTER:
+            return None
+        return status.time_left * self._waited / self._moved + between
+
+
+# --- questions
+
+_LOOK: Final = 0.1
+"""s between two looks at the keys, and whether a stop was asked for."""
+
+
+def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
+    """Show what was measured and wait for an answer; only "yes" accepts.
+
+    Where torques contradict the model, only the names of the joints concerned do.
+
+    A stop asked for meanwhile is a refusal. It is looked for while nothing is typed, so that the
+    heartbeat of a real link goes on and Ctrl-C needs no answer.
+    """
+    table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
+    table.add_column("joint")
+    table.add_column("largest following error", justify="right")
+    table.add_column("largest current", justify="right")
+    table.add_column("torque and weight")
+    agree = {name: Text("not seen") for name in found.gravity_not_seen}
+    agree |= {name: Text("contradict", style="bold red") for name in found.against_gravity}
+    for name, error, share in zip(
+        found.joint_names, found.following_error, found.current_share, strict=True
+    ):
+        current = f"{100.0 * share:.0f} % of its limit"
+        weight = agree.get(name, Text("agree"))
+        table.add_row(Text(printable(name)), f"{math.degrees(error):.3f}°", current, weight)
+    link = f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late"
+    table.caption = Text(printable(f"{link}; {', '.join(found.archives)}"))
+    console.print(table)
+    for warning in found.warnings:
+        console.print(warning, style="bold red", markup=False, highlight=False)
+    what = "the simulated arm" if found.simulated else "the arm"
+    word = " ".join(found.against_gravity) or "yes"
+    known = f"If you know why, type {word}" if found.against_gravity else "Type yes"
+    return confirmed(
+        console,
+        f"Did {what} move as it should, with nothing in its way at {found.override:.0%} of full "
+        f"speed? {known} to accept; anything else ends the run: ",
+        word,
+        stop,
+    )
+
+
+def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
+    """Ask, and wait for an answer: whether it is the word. A stop asked for is a refusal."""
+    console.print(question, end="", markup=False, highlight=False)
+    sys.stdout.flush()
+    with contextlib.suppress(termios.error):  # what was typed before the question is no answer
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    while not stop.requested:
+        with contextlib.suppress(InterruptedError):
+            if select.select([sys.stdin], [], [], _LOOK)[0]:
+                return " ".join(sys.stdin.readline().split()).lower() == word.lower()
+    return False
+
+
+# --- the screen
+
+REFRESH_PERIOD: Final = 0.1
+"""s between two pictures."""
+LINE_EVERY: Final = 5.0
+"""s between two lines where there is no terminal."""
+FAREWELL: Final = 0.5
+"""s that a terminal may take for the last picture."""
+NEWEST: Final = 8
+"""Of the lines said meanwhile that are shown."""
+REMEMBERED: Final = 200
+"""Lines said meanwhile that are left on the terminal at the end."""
+
+
+def far_end_of(cell: Cell) -> str:
+    """What the first line says of the cell's own link."""
+    table = cell.controller
+    if cell.only_simulated:
+        return SIMULATED
+    if table.transport == "can" and table.can is not None:
+        return f"{table.can.interface}:{table.can.channel}"
+    return table.host
+
+
+class _LinesDisplay:
+    """A line now and then, and one for whatever begins."""
+
+    def __init__(self, console: Console, unsaid: deque[str]) -> None:
+        self._console, self._unsaid = console, unsaid
+        self._due = 0.0
+        self._at: tuple[str, int] | None = None
+
+    def draw(self, shown: Shown) -> None:
+        """Print what is new."""
+        self.close()
+        status = shown.status
+        if status is None or shown.age > LINE_EVERY:
+            return
+        at = (status.phase, status.number)
+        if at != self._at or time.monotonic() >= self._due:
+            self._at, self._due = at, time.monotonic() + LINE_EVERY
+            put(self._console, status_line(status, shown.left))
+
+    def close(self) -> None:
+        """Print what was said last."""
+        while self._unsaid:
+            put(self._console, self._unsaid.popleft())
+
+
+class _PageDisplay:
+    """A terminal's other page, so that the shell's own lines come back at the end."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, screen=True, auto_refresh=False)
+        self._live.start()
+        self.close = self._live.stop
+
+    def draw(self, shown: Shown) -> None:
+        """Show it at the size the terminal has now."""
+        width, height = self._console.size
+        self._live.update(Group(*lines(shown, width, height)), refresh=True)
+
+
+class ScreenError(RuntimeError):
+    """The screen does not show anything any more, or does not hear its keys."""
+
+
+class Screen:
+    """An `Operator` at a terminal, or a log; a `Reporter` too. A context manager.
+
+    Args:
+        joint_names: of the n joints.
+        stop: set by the keys s and q.
+        title: of the run.
+        far_end: what is moved, for the first line: `SIMULATED`, or the controller's address.
+        virtual: whether the controller's time is; the time left is that of waiting all the same.
+        quiet: show nothing; keys are not read either.
+        console: written to; standard output if left out.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        stop: Stop,
+        *,
+        title: str = "hil",
+        far_end: str = "",
+        virtual: bool = False,
+        quiet: bool = False,
+        console: Console | None = None,
+    ) -> None:
+        self._console = console or Console()
+        self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
+        self._quiet = quiet
+        self._stop = stop
+        self._request = OperatorRequest()
+        self._shown = Shown(title, tuple(joint_names), keys=False, far_end=far_end)
+        self._pace = Pace(virtual=virtual)
+        self._came = time.monotonic()
+        self._said: deque[str] = deque(maxlen=REMEMBERED)
+        self._undo = contextlib.ExitStack()
+        self._stuck = False
+        self._changing = threading.Lock()  # keys come in a thread of their own
+        self._slow_phase = False
+        self._keyboard: Keyboard | None = None
+        self._undrawn: Exception | None = None
+
+    @classmethod
+    def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
+        """The screen of a run on a cell's own link; `title` is the cell's name if left out."""
+        return cls(
+            cell.joint_names,
+            stop,
+            title=title or cell.name,
+            far_end=far_end_of(cell),
+            virtual=cell.controller.transport == "simulated",
+            quiet=quiet,
+        )
+
+    def __enter__(self) -> Screen:
+        self._open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+        self._leave_what_was_said()
+
+    def show(self, status: RunStatus) -> None:
+        """Show where the run stands; returns at once.
+
+        Raises:
+            ScreenError: nothing is drawn any more.
+        """
+        self._came = time.monotonic()
+        self._pace.take(status, self._came, held=self._request.held)
+        waiting = self._pace.left(status)
+        left = f"{clock(status.time_left)} of motion left"
+        left = left if waiting is None else f"{clock(waiting)} left"
+        self._shown = replace(self._shown, status=status, left=left)
+        self._leave_dry_run(status)
+        if self._undrawn is not None:
+            raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
+
+    def request(self) -> OperatorRequest:
+        """What the person requests.
+
+        Raises:
+            ScreenError: keys were read, and are not any more.
+        """
+        failure = None if self._keyboard is None else self._keyboard.failure
+        if failure is not None:
+            raise ScreenError(f"{type(failure).__name__}: {failure}")
+        return self._request
+
+    @property
+    def can_answer(self) -> bool:
+        """Whether somebody sits at the terminal."""
+        return self._full and can_read(sys.stdin)
+
+    def accept_dry_run(self, found: DryRun) -> bool:
+        """Ask on the terminal, on the shell's own page; False where nobody can answer."""
+        if not self.can_answer:
+            return False
+        self._undo.close()
+        self._pace.pause()
+        try:
+            self._leave_what_was_said()
+            return not self._stuck and ask(self._console, self._shown.title, found, self._stop)
+        finally:
+            try:
+                self._open()
+            except Exception as error:  # the run goes on, as without a terminal
+                self._undrawn = error
+
+    def say(self, text: str) -> None:
+        """One line that stays: after the end where there is a screen meanwhile."""
+        if not self._quiet:
+            self._said.append(text)
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """A piece of work; the screen shows it already."""
+        with Silent().task(title, total) as task:
+            yield task
+
+    def press(self, key: str) -> None:
+        """Take a key."""
+        if _ACTIONS.get(key) == "stop":
+            self._stop.requested = True
+            return
+        motion = None if self._shown.status is None else self._shown.status.motion
+        with self._changing:
+            override = self._request.override
+            if motion is not None:
+                override = min(override, motion.override)
+            self._request = after(self._request, key, override)
+
+    def shown(self) -> Shown:
+        """What is shown now."""
+        return replace(
+            self._shown,
+            request=self._request,
+            stopping=self._stop.requested,
+            age=time.monotonic() - self._came,
+            said=tuple(self._said)[-NEWEST:],
+            keys=self._keyboard is not None and self._keyboard.attached,
+        )
+
+    def _leave_dry_run(self, status: RunStatus) -> None:
+        """What the dry run was slowed to is not meant for what comes after; a hold is."""
+        if status.phase == "dry run":
+            self._slow_phase = True
+        elif self._slow_phase and status.phase != "move":
+            self._slow_phase = False
+            with self._changing:
+                slowed = self._request.override < 1.0
+                self._request = replace(self._request, override=1.0)
+            if slowed:
+                self.say("the dry run is over: the override is 100 % again")
+
+    def _open(self) -> None:
+        self._undo = contextlib.ExitStack()
+        over = threading.Event()
+        self._undrawn = self._keyboard = None
+        if self._quiet:
+            return
+        display: _PageDisplay | _LinesDisplay = _LinesDisplay(self._console, self._said)
+        if self._full:
+            self._keyboard = self._undo.enter_context(Keyboard(self.press))
+            display = _PageDisplay(self._console)
+
+        def draw() -> None:
+            try:
+                while not over.wait(REFRESH_PERIOD):
+                    display.draw(self.shown())
+            except Exception as error:  # it shows nothing more, and `show` says why
+                self._undrawn = error
+            with contextlib.suppress(Exception):
+                display.close()
+
+        thread = threading.Thread(target=draw, name="screen", daemon=True)
+        thread.start()
+
+        def close() -> None:
+            over.set()
+            thread.join(FAREWELL)
+            self._stuck = thread.is_alive()
+
+        self._undo.callback(close)
+
+    def _leave_what_was_said(self) -> None:
+        """Print it on the shell's page, unless the terminal takes nothing any more."""
+        while self._full and self._said and not self._stuck:
+            with contextlib.suppress(OSError, ValueError):
+                put(self._console, self._said.popleft())
