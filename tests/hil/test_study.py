@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hil.campaign.quick_design import design
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from typer.testing import CliRunner
 
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignFolder
+from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import InputError, OperatorStopError

@@ -311,7 +311,8 @@ def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
         # An archive that is closed late may hold the begin of the next interval as well.
         began = [event.time for event in one.archive.events if event.name == "MotionStarted"]
         cycles = rows["cycle"] * campaign.cell.period
-        first = np.searchsorted(cycles, began[-1] - 1e-6) if began else rows["interval"].argmax()
+        last = int(rows["interval"].argmax())
+        first = int(np.searchsorted(cycles, began[-1] - 1e-6)) if began else last
         interval = int(rows["interval"][min(first, len(rows) - 1)])
         if interval < 0:
             continue
