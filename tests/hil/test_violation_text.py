@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.campaign import quick_design
+from hil.campaign import plan as campaign_plan
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
@@ -177,4 +177,4 @@ def test_validation_motions_that_nothing_allows_are_told_in_these_angles(
 
     monkeypatch.setattr(quick_design, "random_validation_motions", nothing)
     with pytest.raises(NoExcitationError, match=r"J3 -90\.0.*teach pendant angles"):
-        quick_design._validation_motions(cell, MotionChecks.of(cell))
+        campaign_plan._validation_motions(cell, MotionChecks.of(cell))
