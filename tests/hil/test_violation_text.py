@@ -175,6 +175,6 @@ def test_validation_motions_that_nothing_allows_are_told_in_these_angles(
     def nothing(*_: object, **__: object) -> None:
         raise NoFeasibleMotionError({"collision": 3}, {"collision": contact})
 
-    monkeypatch.setattr(quick_design, "random_validation_motions", nothing)
+    monkeypatch.setattr(campaign_plan, "random_validation_motions", nothing)
     with pytest.raises(NoExcitationError, match=r"J3 -90\.0.*teach pendant angles"):
         campaign_plan._validation_motions(cell, MotionChecks.of(cell))
