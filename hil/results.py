@@ -12,9 +12,18 @@ import math
 from collections.abc import Iterator, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Annotated, Any, Final, Literal, Self, get_args
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from hil.errors import InputError
 from hil.files import write_atomically
@@ -24,11 +33,32 @@ from hil.reading import json_of, text_of
 class Frozen(BaseModel):
     """A section of a file: unchangeable, without unknown fields; no finite number is a word."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", ser_json_inf_nan="strings", from_attributes=True
+    )
+
+    @classmethod
+    def of(cls, source: object = None, **others: Any) -> Self:
+        """With what an object has under the names of fields, and others; arrays become lists."""
+        own = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
+        return cls.model_validate(
+            {
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in (own | others).items()
+            }
+        )
 
     def to_json(self) -> str:
         """As indented JSON, the text of a file."""
         return self.model_dump_json(indent=1) + "\n"
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+Known = Annotated[float | None, BeforeValidator(_known)]
+"""A number, or null where it is not a number."""
 
 
 class StepResult(Frozen):
@@ -102,26 +132,26 @@ class JointJudgement(Frozen):
     unit: Literal["N·m", "N"]
     rms: float
     """Root mean square of the torque error, in `unit`."""
-    relative: float | None
+    relative: Known
     """||e|| / ||tau||."""
-    fitted_relative: float | None = None
+    fitted_relative: Known = None
     """The same on the motion that was fitted."""
-    explained: float | None
+    explained: Known
     """Share of the torque's variance that is explained (R²): zero is no better than a constant."""
-    limit: float | None
+    limit: Known
     """Largest torque of the joint, in `unit`; of the drive, or the URDF's effort limit."""
-    share_of_limit: float | None
+    share_of_limit: Known
     """RMS error over `limit`."""
-    nominal_relative: float | None
+    nominal_relative: Known
     """||e|| / ||tau|| of the nominal (CAD) model on the same motion."""
-    controller_relative: float | None
+    controller_relative: Known
     """The same of the controller's own dynamic model."""
-    nominal_scale: float | None = None
+    nominal_scale: Known = None
     """Measured torque over what the nominal inertias ask for, friction set aside."""
-    controller_inertia: float | None = None
+    controller_inertia: Known = None
     """The controller's own diagonal inertia (joint side, rotor included) over the identified one:
     median over the recorded postures."""
-    controller_inertia_spread: float | None = None
+    controller_inertia_spread: Known = None
     """Standard deviation of that ratio over the postures."""
 
 
@@ -129,8 +159,8 @@ class ProfileResult(Frozen):
     """Mean residual of one joint over bins of its speed or position, all recordings."""
 
     centre: list[float]
-    mean: list[float | None]
-    std: list[float | None]
+    mean: list[Known]
+    std: list[Known]
     """Standard error that allows for the residual's correlation in time."""
 
 
@@ -150,11 +180,11 @@ class JudgementResult(Frozen):
     """Over rad or m."""
     lag: list[float]
     """Of `autocorrelation`, s."""
-    autocorrelation: list[list[float | None]]
+    autocorrelation: list[list[Known]]
     """Of each joint's residual."""
     effective_rows: list[float]
     """Independent samples that each joint's rows are worth."""
-    friction_over_time: list[list[float | None]] | None
+    friction_over_time: list[list[Known]] | None
     """Per joint: share by which friction was higher than estimated, in the order of recording."""
 
     @property
@@ -270,7 +300,7 @@ class ExportResult(Frozen):
     """File name and why it was not written."""
 
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION: Final = 2
 
 
 class CriteriaResult(Frozen):
@@ -318,7 +348,7 @@ class ParameterResult(Frozen):
     repetition_mean: float
     repetition_std: float | None
     """Standard deviation over the repetitions (of one repetition, not of their mean)."""
-    truth: float | None
+    truth: Known
     """Planted value; only a simulated cell has one."""
     undetermined: bool = False
     """Whether the motion says nothing about it, alone or as part of a combination."""
@@ -426,9 +456,9 @@ class CalibrationResult(Frozen):
     """Share of them inside: 0.95 if the intervals are honest."""
     white_inside: float
     """Share inside the intervals that white residuals would have."""
-    joint_inside: list[float | None]
+    joint_inside: list[Known]
     """Null for a joint whose intervals are not known."""
-    half_width: list[float | None]
+    half_width: list[Known]
     """Median of half the interval, N·m or N."""
 
     def words(self, joint_names: Sequence[str]) -> str:
@@ -447,9 +477,9 @@ class CalibrationResult(Frozen):
 class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
-    found: list[float | None]
+    found: list[Known]
     """Null where the recordings do not determine it."""
-    interval: list[float | None]
+    interval: list[Known]
     """Half a 95 % interval of it."""
     applied: list[float]
     """What the fit took it to be."""

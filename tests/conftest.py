@@ -34,9 +34,9 @@ _LONGEST = (
     "test_conversations.py",
     "test_record_command.py",
     "test_design_command.py",
-    "test_estimators.py",
+    "test_identify.py",
     "test_study.py",
-    "test_batch_reidentify.py",
+    "test_batch.py",
     "test_commands.py",
     "test_isolation.py",
 )

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from stat import S_ISREG
-from sys import intern
 from typing import Any, Final, NamedTuple
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
@@ -360,7 +359,7 @@ def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery
         if reason := _objection(ref, latest, seen):
             skipped.append(Broken(ref.location, reason))
         else:
-            refs.append(_small(ref))
+            refs.append(ref)
     refs.sort(key=lambda ref: ref.order)
     return Discovery(tuple(refs), tuple(broken), tuple(skipped))
 
@@ -434,12 +433,3 @@ def _objection(
             return f"is a copy of {first}, or was repaired from it"
     seen[ref.sha256] = ref.location
     return ""
-
-
-_SHARED: Final = ("use", "arm", "campaign", "cell", "motion", "when", "setup", "belief", "kind")
-
-
-def _small(ref: ArchiveRef) -> ArchiveRef:
-    """Texts that many archives share are held once: there may be very many archives."""
-    shared: dict[str, Any] = {name: intern(getattr(ref, name)) for name in _SHARED}
-    return replace(ref, record="", **shared)

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.identify.cad_prior import cad_prior, required
+from hil.identify.estimating import cad_prior, fit_of, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
-from identification.estimators.consistent import SolverError, consistent_estimate
+from identification.estimators.consistent import SolverError
 from identification.estimators.delay import with_uncertain_delay
-from identification.estimators.least_squares import Weighting, fit_least_squares, no_narrower
-from identification.estimators.prior import fit_with_prior, with_prior
+from identification.estimators.least_squares import Weighting, no_narrower
+from identification.estimators.prior import with_prior
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import (
     QR_CONDITION,
@@ -124,15 +124,8 @@ class Estimator:
         Raises:
             IdentificationError: there is no consistent solution.
         """
-        if centre is not None:
-            found = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=phase)
-        elif self._prior is not None:
-            found = fit_with_prior(self.model, (), self._prior, phase=phase).estimate
-        else:
-            found = fit_least_squares(self.model, (), self._weighting, phase=phase)
-        if self.name == "consistent":
-            found = consistent_estimate(self.model, phase.total, found).estimate
-        return found
+        fit = fit_of(self.model, self.name, self._shrinkage, centre, self._prior)
+        return fit((), phase)
 
     def weights(self, total: Factor) -> Array:
         """Weight of each joint's rows (n,)."""

@@ -9,49 +9,52 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, NamedTuple
 
 from hil.files import replacing
 from hil.reading import instant
 from hil.version import software
 
 from .estimates import relative_error
-from .types import Arm, BatchResult, LevelEstimate
+from .types import BatchResult, LevelEstimate
 
 SCHEMA_VERSION: Final = 1
 """Raised when a column changes its meaning or goes; new columns do not raise it."""
 
-Kind = Literal["text", "number", "count", "truth", "time", "numbers"]
 Row = dict[str, Any]
 
 # Rows in memory at a time, however large the batch.
 _PORTION = 20_000
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A table: its columns and where its rows come from.
 
     Attributes:
         name: of the files, without their endings.
-        columns: kind of each column by name.
+        columns: names, each with its kind behind a colon unless that is text.
         rows: of a result.
     """
 
     name: str
-    columns: Mapping[str, Kind]
+    columns: str
     rows: Callable[[BatchResult], Iterator[Row]]
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """Kind of each column by name."""
+        pairs = (one.partition(":") for one in self.columns.split())
+        return {name: kind or "text" for name, _, kind in pairs}
 
     @property
     def csv_columns(self) -> list[str]:
         """Those that CSV has: all but lists."""
-        return [name for name, kind in self.columns.items() if kind != "numbers"]
+        return [name for name, kind in self.kinds.items() if kind != "numbers"]
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
@@ -64,13 +67,10 @@ def write_tables(folder: Path, result: BatchResult) -> list[Path]:
     """
     written = []
     for table in TABLES:
-        path = folder / f"{table.name}.csv"
-        _write_csv(path, table, result)
-        written.append(path)
-        if has_parquet():
-            path = folder / f"{table.name}.parquet"
-            _write_parquet(path, table, result)
-            written.append(path)
+        for ending, write in ((".csv", _write_csv), (".parquet", _write_parquet)):
+            if ending == ".csv" or has_parquet():
+                written.append(folder / f"{table.name}{ending}")
+                write(written[-1], table, result)
     return written
 
 
@@ -79,31 +79,29 @@ def has_parquet() -> bool:
     return find_spec("pyarrow") is not None
 
 
-def _levels(result: BatchResult) -> Iterator[LevelEstimate]:
-    yield from result.repetitions
-    yield from result.campaigns
-    yield from result.pooled
-
-
-def _estimate_columns(arm: Arm, level: LevelEstimate) -> Row:
-    return {
-        "level": level.level,
-        "arm": arm.name,
-        "arm_digest": level.arm,
-        "campaign": level.campaign,
-        "setup": level.setup,
-        "archive": level.archive,
-        "archive_sha256": level.sha256,
-        "when": instant(level.when),
-    }
+def _levels(result: BatchResult) -> Iterator[tuple[LevelEstimate, Row]]:
+    """Estimates, each with what all its rows have."""
+    for level in (*result.repetitions, *result.campaigns, *result.pooled):
+        yield (
+            level,
+            {
+                "level": level.level,
+                "arm": result.arms[level.arm].name,
+                "arm_digest": level.arm,
+                "campaign": level.campaign,
+                "setup": level.setup,
+                "archive": level.archive,
+                "archive_sha256": level.sha256,
+                "when": instant(level.when),
+            },
+        )
 
 
 def _parameter_rows(result: BatchResult) -> Iterator[Row]:
     made_with = ", ".join(f"{name} {version}" for name, version in software().items())
-    for level in _levels(result):
+    for level, shared in _levels(result):
         model = result.arms[level.arm].cell.model
-        shared = {
-            **_estimate_columns(result.arms[level.arm], level),
+        shared |= {
             "archives": level.repetitions,
             "samples": int(level.samples.sum()),
             "condition": level.condition,
@@ -137,14 +135,13 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
 
 
 def _axis_rows(result: BatchResult) -> Iterator[Row]:
-    for level in _levels(result):
-        arm = result.arms[level.arm]
-        shared = _estimate_columns(arm, level)
-        for j, joint in enumerate(arm.cell.model.joint_names):
+    for level, shared in _levels(result):
+        model = result.arms[level.arm].cell.model
+        for j, joint in enumerate(model.joint_names):
             yield {
                 **shared,
                 "axis": joint,
-                "unit": "N·m" if arm.cell.model.chain.revolute[j] else "N",
+                "unit": "N·m" if model.chain.revolute[j] else "N",
                 "samples": int(level.samples[j]),
                 "torque_rms": float(level.torque_rms[j]),
                 "error_std": float(level.noise_std[j]),
@@ -159,33 +156,23 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
             yield {"path": one.path, "kind": kind, "reason": one.reason}
 
 
-def _columns(text: str) -> dict[str, Kind]:
-    """Columns from their names, each with its kind behind a colon unless that is text."""
-    pairs = (one.partition(":") for one in text.split())
-    return {name: cast(Kind, kind or "text") for name, _, kind in pairs}
-
-
 _ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when:time"
 TABLES: Final = (
     Table(
         "parameters",
-        _columns(
-            f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
-            "determined:truth archives:count samples:count condition:number relative_error:number "
-            "unseen_relative_error:number method warnings estimator settings code software "
-            "covariance:numbers"
-        ),
+        f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
+        "determined:truth archives:count samples:count condition:number relative_error:number "
+        "unseen_relative_error:number method warnings estimator settings code software "
+        "covariance:numbers",
         _parameter_rows,
     ),
     Table(
         "axes",
-        _columns(
-            f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
-            "unseen_torque_rms:number unseen_error_rms:number"
-        ),
+        f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
+        "unseen_torque_rms:number unseen_error_rms:number",
         _axis_rows,
     ),
-    Table("not_used", _columns("path kind reason"), _unused_rows),
+    Table("not_used", "path kind reason", _unused_rows),
 )
 
 
@@ -194,19 +181,16 @@ def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        for row in table.rows(result):
-            writer.writerow([_as_text(row[name]) for name in columns])
+        writer.writerows([_as_text(row[name]) for name in columns] for row in table.rows(result))
 
 
 def _as_text(value: Any) -> Any:
     """Numbers in full precision; time in ISO 8601; nothing for what is not known."""
-    if value is None:
-        return ""
     if isinstance(value, datetime):
         return value.isoformat()
     if isinstance(value, bool):
         return "true" if value else "false"
-    return _clean(value)
+    return "" if value is None else _clean(value)
 
 
 def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
@@ -224,20 +208,16 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
     }
     facts = {"schema_version": SCHEMA_VERSION, "code": result.code, "software": software()}
     schema = pyarrow.schema(
-        [(name, types[kind]) for name, kind in table.columns.items()],
+        [(name, types[kind]) for name, kind in table.kinds.items()],
         metadata={"hil": json.dumps(facts)},
     )
-    rows = table.rows(result)
+    rows = ({name: _clean(value) for name, value in row.items()} for row in table.rows(result))
     with (
         replacing(path) as temporary,
         pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
     ):
         while portion := list(islice(rows, _PORTION)):
-            arrays = [
-                pyarrow.array([_clean(row[name]) for row in portion], types[kind])
-                for name, kind in table.columns.items()
-            ]
-            writer.write_table(pyarrow.Table.from_arrays(arrays, schema=schema))
+            writer.write_table(pyarrow.Table.from_pylist(portion, schema=schema))
 
 
 def _clean(value: Any) -> Any:

@@ -6,6 +6,7 @@ Only what is fitted is looked at, and of very many recordings the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -28,11 +29,11 @@ from identification.validation.finding import Thresholds
 
 from .options import Options
 from .settings import Settings, samples_of, signals_of, stated_delay, stated_settings
-from .sources import Source, Sources
+from .sources import Sources
 
 MOST_READ: Final = 32
 """Recordings that settings are decided on: more say the same again."""
-# Repetitions of one motion that settings are chosen on, likewise.
+# Repetitions of one motion that settings are chosen on.
 _REPETITIONS: Final = 1
 # Where the delay is stated it is looked for all the same, to be reported: in so many samples.
 _DELAY_SAMPLES: Final = 8000
@@ -61,11 +62,8 @@ def with_noise(sources: Sources) -> tuple[Sources, str]:
     if sources.noise_variance is not None:
         return sources, "the noise of the positions was measured at standstill"
     if sources.same_motion and len(recordings) > 1:
-        try:
+        with suppress(IdentificationError):  # no two that could be compared
             noise = repetition_noise(recordings)
-        except IdentificationError:
-            pass  # no two that could be compared
-        else:
             torque = None if noise.torque is None else noise.torque.white
             return (
                 replace(sources, noise_variance=noise.position.white, torque_variance=torque),
@@ -177,19 +175,13 @@ def _chosen(
     options: Options,
     reporter: Reporter,
 ) -> Settings:
-    """Choose what is automatic.
-
-    Args:
-        sources: the recordings, with the stated friction law.
-        settings: what is known.
-        suggested: other delays of the torque [s].
-        options: what is automatic.
-        reporter: of progress.
-    """
+    """Choose what is automatic by inner prediction, with some delays of the torque tried [s]."""
     cell, questions = sources.cell, _questions(sources, options, suggested)
     if not questions:
         return settings
-    read = [signals_of(source, settings) for source in _read_to_choose(sources)]
+    # Repetitions of one motion say the same again.
+    read = sources.training[:_REPETITIONS] if sources.same_motion else sources.training
+    read = tuple(signals_of(source, settings) for source in read)
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         trial = replace(settings, preprocessing=how)
@@ -232,11 +224,6 @@ def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
         return []
     motors = cell.drive_train.motor_from_joint
     return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
-
-
-def _read_to_choose(sources: Sources) -> Sequence[Source]:
-    """Recordings that settings are chosen on."""
-    return sources.training[:_REPETITIONS] if sources.same_motion else sources.training
 
 
 def _delays(

@@ -1,4 +1,4 @@
-"""From samples to an estimate, by the estimator that was chosen."""
+"""From samples to an estimate, by the estimator that was chosen; and what is believed before."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
@@ -29,7 +30,12 @@ from identification.estimators.least_squares import (
     fit_least_squares,
 )
 from identification.estimators.losses import Huber, Loss, Tukey
-from identification.estimators.prior import GaussianPrior, PosteriorEstimate, fit_with_prior
+from identification.estimators.prior import (
+    GaussianPrior,
+    PosteriorEstimate,
+    fit_with_prior,
+    nominal_prior,
+)
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import QR_CONDITION, Estimate, joint_weights, nothing_usable
@@ -37,7 +43,6 @@ from identification.factor.phases import PhaseFactor, instrument_factor, total_p
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 
-from .cad_prior import cad_prior, required
 from .options import Estimator, Options
 from .prepared import Prepared
 from .settings import samples_of
@@ -47,12 +52,266 @@ from .settings import samples_of
 # variables at the bandwidth that suits least squares (7 to 14 Hz) were worse than least squares; at
 # 20 Hz they were better throughout.
 NARROWEST: Final = 20.0
+# Change by the data, in the deviations that the prior allows, beyond which one of the two is wrong.
+_SURPRISING: Final = 4.0
+_NAMED: Final = 6
+"""Parameters that a warning names."""
+FRICTION_SHARE: Final = 0.5
+"""Friction changes with temperature, lubricant and wear by tens of per cent (Bittencourt and
+Gunnarsson 2012): a data sheet's is no better than to half of itself."""
 
 Array = NDArray[np.float64]
+Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
+"""Of samples and the sum of their factors; without samples as far as the factor gives."""
 
 # Time since the origin and commanded positions of a motion; and the lag of each axis in it, which
 # is the same in every repetition.
 _Plan = tuple[tuple[Array, Array], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimation:
+    """An estimate, and what was computed beside it.
+
+    Attributes:
+        estimator: by name.
+        result: pooled and per repetition.
+        held_out: factors of what is predicted, one per recording.
+        posterior: the estimate with the prior from CAD, which says of each parameter whether it
+            was learned from the data; in words why there is none.
+        endogeneity: whether noise in the regressor has biased least squares; in words why that
+            could not be tested.
+        warnings: what a reader must know of the estimate.
+    """
+
+    estimator: Estimator
+    result: RepeatedEstimate
+    held_out: tuple[PhaseFactor, ...]
+    posterior: PosteriorEstimate | str
+    endogeneity: EndogeneityTest | str
+    warnings: tuple[str, ...]
+
+
+def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
+    """Estimate by `options.estimator`, and say beside it what can be said.
+
+    Raises:
+        InputError: the estimator needs something that the archives do not have.
+        ArchiveError: a recording without a usable row.
+    """
+    cell, name = prepared.sources.cell, options.estimator
+    model, variance = cell.model, prepared.settings.delay_variance
+    _require_usable(prepared, model)
+    with reporter.task("estimating", 4) as task:
+        # The test is of the very samples that least squares reads.
+        fitted = widely_smoothed(model, prepared) if name == "iv" else prepared.fitted
+        instrumental = fit_instrumental(model, prepared, fitted)
+        task.advance(1, name)
+        prior = cad_prior(cell)
+        if name == "iv":
+            result, warnings = _instrumental(model, fitted, instrumental)
+        elif name in _LOSSES:
+            result, warnings = _robust(model, fitted, name)
+        else:
+            result, warnings = _by_factor(model, fitted, name, prepared.settings.shrinkage, prior)
+        if prepared.sources.same_motion:
+            result = result.with_scatter()
+        if variance:
+            products = np.asarray(sum(rate_products(model, samples) for samples in fitted))
+            pooled = with_uncertain_delay(result.pooled, result.factor, products, variance)
+            result = replace(result, pooled=pooled)
+        task.advance(1, "prior")
+        posterior: PosteriorEstimate | str = ""
+        try:
+            posterior = (
+                prior
+                if isinstance(prior, str)
+                else fit_with_prior(model, fitted, prior, phase=result.phase)
+            )
+        except IdentificationError as error:
+            posterior = str(error)
+        if name == "prior" and isinstance(posterior, PosteriorEstimate):
+            warnings += _surprises(model, posterior)
+        task.advance(1, "held-out motion")
+        held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
+        task.advance(1)
+    warnings += _conditioning(result.pooled)
+    if isinstance(instrumental, str):
+        endogeneity: EndogeneityTest | str = (
+            "Whether noise in the positions biases least squares could not be tested:"
+            f" {instrumental}."
+        )
+    else:
+        endogeneity = instrumental.test
+        warnings += [] if name == "iv" else _bias(instrumental)
+    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
+
+
+def _require_usable(prepared: Prepared, model: RobotModel) -> None:
+    """Refuse a recording of which nothing can be fitted, such as the beginning of a torn one."""
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        if not samples.usable.any():
+            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
+            raise ArchiveError(
+                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
+            )
+
+
+# What is believed before any data
+
+
+def cad_prior(cell: Cell) -> GaussianPrior | str:
+    """Prior of a cell from its URDF and `[nominal]`; in words why it has none.
+
+    The URDF's inertias are believed to `[nominal] uncertainty` (10 % without that table), rotor
+    inertias of the table likewise, its friction to `FRICTION_SHARE`. Of what neither gives
+    nothing is believed.
+    """
+    model, table = cell.model, cell.file.nominal
+    known: dict[str, tuple[float, float]] = {}  # mean and standard deviation
+    if table is not None:
+        share = table.uncertainty or FRICTION_SHARE
+        known |= {
+            f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)
+        }
+        for name, term, owner, motor, _ in model.friction.terms:
+            values = getattr(table, term.option, None)
+            if values and not motor:
+                known[name] = values[owner], FRICTION_SHARE * abs(values[owner])
+    names = {*model.standard_names, *model.friction.names}
+    known = {name: one for name, one in known.items() if one[0] != 0.0 and name in names}
+    try:
+        if table is None or table.uncertainty == 0.0:
+            return nominal_prior(model, known=known)
+        return nominal_prior(model, table.uncertainty, known)
+    except IdentificationError as error:
+        return str(error)
+
+
+def required(prior: GaussianPrior | str) -> GaussianPrior:
+    """The prior of a cell, for an estimator that needs one.
+
+    Raises:
+        InputError: there is none.
+    """
+    if isinstance(prior, str):
+        raise InputError(
+            None,
+            f"there is no prior to be had: {prior}",
+            field="--estimator prior",
+            remedy="give inertias in the URDF, or use --estimator wls",
+        )
+    return prior
+
+
+# Estimators
+
+
+def fit_of(
+    model: RobotModel,
+    name: str,
+    shrinkage: Shrinkage = Shrinkage(),  # noqa: B008 - frozen
+    centre: Array | None = None,
+    prior: GaussianPrior | None = None,
+) -> Fit:
+    """How an estimator that needs nothing but factors fits.
+
+    Args:
+        model: the robot.
+        name: of the estimator.
+        shrinkage: towards the centre.
+        centre: consistent solution of all that is fitted together (p,); None for least squares.
+        prior: of the estimator of that name.
+    """
+
+    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        if centre is not None:
+            return fit_shrunk(model, some, shrinkage, centre=centre, phase=phase)
+        if prior is not None:
+            return fit_with_prior(model, some, prior, phase=phase).estimate
+        weighting: Weighting = "ordinary" if name == "ols" else "weighted"
+        found = fit_least_squares(model, some, weighting, phase=phase)
+        if name == "consistent":
+            found = consistent_estimate(model, phase.total, found).estimate
+        return found
+
+    return fit
+
+
+def _by_factor(
+    model: RobotModel,
+    fitted: Sequence[Samples],
+    name: Estimator,
+    shrinkage: Shrinkage,
+    prior: GaussianPrior | str,
+) -> tuple[RepeatedEstimate, list[str]]:
+    centre, warnings, free = None, list[str](), name == "consistent"
+    if name == "auto" and shrinkage.strength > 0.0:
+        total = total_phase(model, fitted).total
+        weight = shrinkage.prior_weight
+        try:
+            found = consistent_centre(model, total, joint_weights(total), weight)
+            centre, free = found.estimate.values, math.isinf(shrinkage.strength)
+        except SolverError as error:
+            warnings = [f"least squares is reported, for {error}"]
+    own = required(prior) if name == "prior" else None
+    fit = fit_of(model, name, shrinkage, centre, own)
+    try:
+        # The scatter over repetitions is about noise: no need of a program for each.
+        each = fit_of(model, "wls") if free else fit
+        return estimate_repetitions(model, fitted, fit, each=each), warnings
+    except IdentificationError as error:
+        if name != "consistent":
+            raise
+        raise InputError(
+            None,
+            f"no physically consistent parameters were found: {error}",
+            field="--estimator consistent",
+            remedy="use --estimator wls and read what its verdict says about consistency",
+        ) from error
+
+
+_LOSSES: Final[dict[str, Loss]] = {"huber": Huber(), "tukey": Tukey()}
+
+
+def _robust(
+    model: RobotModel, fitted: Sequence[Samples], name: str
+) -> tuple[RepeatedEstimate, list[str]]:
+    fits: list[RobustEstimate] = []
+
+    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+        fits.append(robust_estimate(model, some, _LOSSES[name], gram=phase.total))
+        return fits[-1].estimate
+
+    result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last is that of all
+    warnings = [
+        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
+        "deviations: that is no gross error but something the model leaves out, and a robust loss "
+        "looks away from it; use --estimator wls"
+        for joint in np.flatnonzero(found.doubtful)
+    ]
+    if not found.converged:
+        warnings.append(f"the reweighting had not settled after {found.iterations} passes")
+    return result, warnings
+
+
+def _surprises(model: RobotModel, posterior: PosteriorEstimate) -> list[str]:
+    far = np.flatnonzero(np.abs(np.nan_to_num(posterior.surprise)) > _SURPRISING)
+    if not far.size:
+        return []
+    return [
+        f"data and prior contradict each other in {_first([model.parameter_names[k] for k in far])}"
+        f" (more than {_SURPRISING:g} deviations): the CAD figures, or their uncertainty in"
+        " [nominal], are wrong"
+    ]
+
+
+def _first(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"
+
+
+# Instruments
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +327,6 @@ class InstrumentalFit:
     pooled: InstrumentalEstimate
     each: tuple[Estimate, ...]
     test: EndogeneityTest
-
-    @property
-    def bias_matters(self) -> bool:
-        """Whether least squares is biased, and predicts other torques for it than it should."""
-        return self.test.matters
 
 
 def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
@@ -119,218 +373,9 @@ def fit_instrumental(
     return InstrumentalFit(pooled, each, endogeneity_test(model, total, pooled))
 
 
-# Change by the data, in the deviations that the prior allows, beyond which one of the two is wrong.
-_SURPRISING: Final = 4.0
-_UNTESTED: Final = "Whether noise in the positions biases least squares could not be tested"
-
-
-@dataclass(frozen=True, eq=False)
-class Estimation:
-    """An estimate, and what was computed beside it.
-
-    Attributes:
-        estimator: by name.
-        result: pooled and per repetition.
-        held_out: factors of what is predicted, one per recording.
-        posterior: the estimate with the prior from CAD, which says of each parameter whether it
-            was learned from the data; in words why there is none.
-        endogeneity: whether noise in the regressor has biased least squares; in words why that
-            could not be tested.
-        warnings: what a reader must know of the estimate.
-    """
-
-    estimator: Estimator
-    result: RepeatedEstimate
-    held_out: tuple[PhaseFactor, ...]
-    posterior: PosteriorEstimate | str
-    endogeneity: EndogeneityTest | str
-    warnings: tuple[str, ...]
-
-
-class _Case:
-    """What estimators read: the recordings, and what else is known of them."""
-
-    def __init__(
-        self,
-        model: RobotModel,
-        fitted: Sequence[Samples],
-        prior: GaussianPrior | str,
-        instrumental: InstrumentalFit | str,
-        shrinkage: Shrinkage,
-    ) -> None:
-        self.model, self.fitted = model, fitted
-        self.prior, self.instrumental, self.shrinkage = prior, instrumental, shrinkage
-
-
-_Found = tuple[RepeatedEstimate, list[str]]
-
-
-def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
-    """Estimate by `options.estimator`, and say beside it what can be said.
-
-    Raises:
-        InputError: the estimator needs something that the archives do not have.
-        ArchiveError: a recording without a usable row.
-    """
-    model = prepared.sources.cell.model
-    _require_usable(prepared, model)
-    with reporter.task("estimating", 4) as task:
-        # The test is of the very samples that least squares reads.
-        fitted = prepared.fitted
-        if options.estimator == "iv":
-            fitted = widely_smoothed(model, prepared)
-        instrumental = fit_instrumental(model, prepared, fitted)
-        task.advance(1, options.estimator)
-        prior = cad_prior(prepared.sources.cell)
-        case = _Case(model, fitted, prior, instrumental, prepared.settings.shrinkage)
-        result, warnings = _ESTIMATORS[options.estimator](case)
-        if prepared.sources.same_motion:
-            result = result.with_scatter()
-        result = _with_delay_uncertainty(case, result, prepared.settings.delay_variance)
-        task.advance(1, "prior")
-        posterior = _posterior(case, result.phase)
-        task.advance(1, "held-out motion")
-        held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
-        task.advance(1)
-    return Estimation(
-        estimator=options.estimator,
-        result=result,
-        held_out=held_out,
-        posterior=posterior,
-        endogeneity=(
-            f"{_UNTESTED}: {instrumental}." if isinstance(instrumental, str) else instrumental.test
-        ),
-        warnings=(
-            *warnings,
-            *_conditioning(result.pooled),
-            *_bias(options.estimator, instrumental),
-        ),
-    )
-
-
-def _with_delay_uncertainty(
-    case: _Case, result: RepeatedEstimate, variance: float
-) -> RepeatedEstimate:
-    """The result with what an uncertain delay of the torque adds to its intervals."""
-    if variance == 0.0:
-        return result
-    products = sum(rate_products(case.model, samples) for samples in case.fitted)
-    pooled = with_uncertain_delay(result.pooled, result.factor, np.asarray(products), variance)
-    return replace(result, pooled=pooled)
-
-
-def _require_usable(prepared: Prepared, model: RobotModel) -> None:
-    """Refuse a recording of which nothing can be fitted, such as the beginning of a torn one."""
-    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
-        if not samples.usable.any():
-            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
-            raise ArchiveError(
-                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
-            )
-
-
-def _least_squares(weighting: Weighting) -> Callable[[_Case], _Found]:
-    def run(case: _Case) -> _Found:
-        def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-            return fit_least_squares(case.model, some, weighting, phase=phase)
-
-        return estimate_repetitions(case.model, case.fitted, fit), []
-
-    return run
-
-
-def _automatic(case: _Case) -> _Found:
-    """Least squares, or drawn towards one consistent solution, that of all repetitions."""
-    if case.shrinkage.strength == 0.0:
-        return _least_squares("weighted")(case)
-    total = total_phase(case.model, case.fitted).total
-    try:
-        centre = consistent_centre(
-            case.model, total, joint_weights(total), case.shrinkage.prior_weight
-        ).estimate.values
-    except SolverError as error:
-        found, warnings = _least_squares("weighted")(case)
-        return found, [*warnings, f"least squares is reported, for {error}"]
-
-    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        return fit_shrunk(case.model, some, case.shrinkage, centre=centre, phase=phase)
-
-    def free(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        return fit_least_squares(case.model, some, phase=phase)
-
-    each = free if math.isinf(case.shrinkage.strength) else fit
-    return estimate_repetitions(case.model, case.fitted, fit, each=each), []
-
-
-def _robust(loss: Loss) -> Callable[[_Case], _Found]:
-    def run(case: _Case) -> _Found:
-        fits: list[RobustEstimate] = []
-
-        def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-            fits.append(robust_estimate(case.model, some, loss, gram=phase.total))
-            return fits[-1].estimate
-
-        result = estimate_repetitions(case.model, case.fitted, fit)
-        return result, _robust_warnings(case.model, fits[-1])  # the last is that of all
-
-    return run
-
-
-def _robust_warnings(model: RobotModel, found: RobustEstimate) -> list[str]:
-    warnings = [
-        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
-        "deviations: that is no gross error but something the model leaves out, and a robust loss "
-        "looks away from it; use --estimator wls"
-        for joint in np.flatnonzero(found.doubtful)
-    ]
-    if not found.converged:
-        warnings.append(f"the reweighting had not settled after {found.iterations} passes")
-    return warnings
-
-
-def _with_prior(case: _Case) -> _Found:
-    prior = required(case.prior)
-    fits: list[PosteriorEstimate] = []
-
-    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        fits.append(fit_with_prior(case.model, some, prior, phase=phase))
-        return fits[-1].estimate
-
-    result = estimate_repetitions(case.model, case.fitted, fit)
-    surprise = np.nan_to_num(fits[-1].surprise)
-    far = np.flatnonzero(np.abs(surprise) > _SURPRISING)
-    if not far.size:
-        return result, []
-    names_far = ", ".join(case.model.parameter_names[k] for k in far[:6])
-    more = f" and {far.size - 6} more" if far.size > 6 else ""
-    return result, [
-        f"data and prior contradict each other in {names_far}{more} (more than {_SURPRISING:g} "
-        "deviations): the CAD figures, or their uncertainty in [nominal], are wrong"
-    ]
-
-
-def _consistent(case: _Case) -> _Found:
-    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        free = fit_least_squares(case.model, some, phase=phase)
-        return consistent_estimate(case.model, phase.total, free).estimate
-
-    def free(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        return fit_least_squares(case.model, some, phase=phase)
-
-    try:
-        # The scatter over repetitions is about noise: no need of a program for each.
-        return estimate_repetitions(case.model, case.fitted, fit, each=free), []
-    except IdentificationError as error:
-        raise InputError(
-            None,
-            f"no physically consistent parameters were found: {error}",
-            field="--estimator consistent",
-            remedy="use --estimator wls and read what its verdict says about consistency",
-        ) from error
-
-
-def _instrumental(case: _Case) -> _Found:
-    found = case.instrumental
+def _instrumental(
+    model: RobotModel, fitted: Sequence[Samples], found: InstrumentalFit | str
+) -> tuple[RepeatedEstimate, list[str]]:
     if isinstance(found, str):
         raise InputError(
             None,
@@ -338,36 +383,11 @@ def _instrumental(case: _Case) -> _Found:
             field="--estimator iv",
             remedy="record the commanded positions as well, or use --estimator wls",
         )
-    phase = PhaseFactor.zero(case.model)
-    for samples in case.fitted:
-        phase = phase + PhaseFactor.from_samples(case.model, samples)
-    result = RepeatedEstimate.of(case.model, found.pooled.estimate, found.each, phase)
+    result = RepeatedEstimate.of(
+        model, found.pooled.estimate, found.each, total_phase(model, fitted)
+    )
     weak = found.pooled.weak
-    if not weak:
-        return result, []
-    more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
-    return result, [f"the instruments are too weak for {', '.join(weak[:6])}{more}"]
-
-
-_ESTIMATORS: Final[dict[Estimator, Callable[[_Case], _Found]]] = {
-    "auto": _automatic,
-    "wls": _least_squares("weighted"),
-    "ols": _least_squares("ordinary"),
-    "huber": _robust(Huber()),
-    "tukey": _robust(Tukey()),
-    "prior": _with_prior,
-    "consistent": _consistent,
-    "iv": _instrumental,
-}
-
-
-def _posterior(case: _Case, phase: PhaseFactor) -> PosteriorEstimate | str:
-    if isinstance(case.prior, str):
-        return case.prior
-    try:
-        return fit_with_prior(case.model, case.fitted, case.prior, phase=phase)
-    except IdentificationError as error:
-        return str(error)
+    return result, [f"the instruments are too weak for {_first(weak)}"] if weak else []
 
 
 def _conditioning(pooled: Estimate) -> list[str]:
@@ -379,12 +399,11 @@ def _conditioning(pooled: Estimate) -> list[str]:
     ]
 
 
-def _bias(estimator: Estimator, found: InstrumentalFit | str) -> list[str]:
+def _bias(found: InstrumentalFit) -> list[str]:
     """That noise in the positions moves the result; figures of the test stand in the report."""
-    if estimator == "iv" or isinstance(found, str) or not found.bias_matters:
+    # What the motion does not determine differs by any amount.
+    if not found.test.matters or found.pooled.estimate.undetermined:
         return []
-    if found.pooled.estimate.undetermined:
-        return []  # what the motion does not determine differs by any amount
     moved = float(np.max(found.test.predicted))
     return [
         "noise in the measured positions biases least squares: instrumental variables differ from"

@@ -19,8 +19,8 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 
-from .currents import motor_from_joint
 from .options import FIXED
+from .prepared import motor_from_joint
 from .settings import samples_of, stated_settings
 from .sources import Source, cell_of, source_of
 

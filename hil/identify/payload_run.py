@@ -37,7 +37,6 @@ Array = NDArray[np.float64]
 # Frames in which controllers count, as ROS-Industrial names them.
 _FLANGES: Final = ("tool0", "flange")
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
-_PRINTED_DIGITS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +108,8 @@ class PayloadFound:
             if not low <= value <= high:
                 unit = _UNITS[name]
                 found.append(
-                    f"{name} {value:g} {unit} lies outside the 95 % interval"
-                    f" {low:.{_PRINTED_DIGITS}g} to {high:.{_PRINTED_DIGITS}g} {unit}"
+                    f"{name} {value:g} {unit} lies outside the 95 % interval {low:.4g} to"
+                    f" {high:.4g} {unit}"
                 )
         return found
 
@@ -126,7 +125,7 @@ class PayloadFound:
         torque = self.wrist_torque
         centre = ", ".join(f"{1e3 * part:.1f}" for part in body.centre)
         lines = [
-            f"The payload weighs {body.mass:.{_PRINTED_DIGITS}g} kg (95 %: {low:.4g} to"
+            f"The payload weighs {body.mass:.4g} kg (95 %: {low:.4g} to"
             f" {high:.4g} kg), its centre of mass is at {centre} mm in the frame {self.frame};"
             f" its weight loads the flange with up to {torque[0]:.3g} N·m"
             f" ({torque[1]:.3g} to {torque[2]:.3g})."
@@ -159,33 +158,26 @@ class PayloadFound:
     @property
     def controllers(self) -> dict[str, str]:
         """By controller, the figures as they are typed; units and frames stand in the manual."""
-        body = self._body
-        x, y, z = (f"{1e3 * part:.2f}" for part in body.centre)
-        metres = ", ".join(f"{part:.5f}" for part in body.centre)
+        mass, centre = f"{self._body.mass:.3f}", self._body.centre
+        millimetres = ", ".join(f"{1e3 * part:.2f}" for part in centre)
+        metres = ", ".join(f"{part:.5f}" for part in centre)
         xx, xy, xz, yy, yz, zz = (f"{part:.5f}" for part in self.figures[4:])
-        six = ", ".join((xx, yy, zz, xy, xz, yz))
-        columns = ", ".join((xx, xy, xz, xy, yy, yz, xz, yz, zz))
-        inertia = [
-            f"$TOOL_INERTIA[{k}] := {figure}"
-            for k, figure in enumerate((xx, yy, zz, xy, xz, yz), 1)
+        six, nine = (xx, yy, zz, xy, xz, yz), (xx, xy, xz, xy, yy, yz, xz, yz, zz)
+        comau = [
+            f"$TOOL_MASS := {mass}",
+            f"$TOOL_CNTR := POS({millimetres}, 0, 0, 0, '')",
+            *(f"$TOOL_INERTIA[{k}] := {figure}" for k, figure in enumerate(six, 1)),
         ]
         return {
-            "COMAU": "\n".join(
-                [
-                    f"$TOOL_MASS := {body.mass:.3f}",
-                    f"$TOOL_CNTR := POS({x}, {y}, {z}, 0, 0, 0, '')",
-                    *inertia,
-                ]
-            ),
-            "UR": f"set_target_payload({body.mass:.3f}, [{metres}], [{six}])",
-            "Franka": f"robot.setLoad({body.mass:.3f}, {{{metres}}}, {{{columns}}});",
+            "COMAU": "\n".join(comau),
+            "UR": f"set_target_payload({mass}, [{metres}], [{', '.join(six)}])",
+            "Franka": f"robot.setLoad({mass}, {{{metres}}}, {{{', '.join(nine)}}});",
         }
 
     @property
     def urdf(self) -> str:
         """A description with the frame's link and the payload fixed to it."""
-        body = self._body
-        xyz = " ".join(repr(float(part)) for part in body.centre)
+        xyz = " ".join(repr(float(part)) for part in self._body.centre)
         names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         tensor = " ".join(
             f'{name}="{float(part)!r}"' for name, part in zip(names, self.figures[4:], strict=True)
@@ -200,7 +192,7 @@ class PayloadFound:
   <link name="payload">
     <inertial>
       <origin xyz="{xyz}" rpy="0 0 0"/>
-      <mass value="{float(body.mass)!r}"/>
+      <mass value="{float(self._body.mass)!r}"/>
       <inertia {tensor}/>
     </inertial>
   </link>
@@ -210,17 +202,17 @@ class PayloadFound:
     def as_json(self) -> dict[str, Any]:
         """Everything, for other programs; infinite ends of intervals are null."""
         torque, estimate = self.wrist_torque, self.estimate
+
+        def figure(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
+            interval = [end if np.isfinite(end) else None for end in (low, high)]
+            return {"value": value, "interval": interval, "unit": unit}
+
         return {
             "frame": self.frame,
             "figures": {
-                name: {"value": value, "interval": [_finite(low), _finite(high)], "unit": unit}
-                for name, value, low, high, unit in self.table
+                name: figure(value, low, high, unit) for name, value, low, high, unit in self.table
             },
-            "wrist_torque": {
-                "value": torque[0],
-                "interval": [_finite(torque[1]), _finite(torque[2])],
-                "unit": "N·m",
-            },
+            "wrist_torque": figure(*torque, "N·m"),
             "undetermined": list(estimate.undetermined),
             "contradicted": estimate.contradicted,
             "least_squares": estimate.parameters.tolist(),
@@ -390,7 +382,3 @@ def _refuse_difference(found: Difference | None, paths: Mapping[str, Path]) -> N
         " bare",
         remedy="name it with --loaded, or leave it out",
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.errors import ArchiveError
 from hil.progress import Reporter
+from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.estimators.delay import DelayEstimate
 from identification.signals.clock import time_base
-from identification.signals.samples import Samples
+from identification.signals.recording import Recording
+from identification.signals.samples import Samples, smooth
+from planner.checked_data import numbers
 
-from .currents import with_torques
-from .deciding import Decided, decide, with_noise
+from .deciding import decide, with_noise
 from .options import Options
 from .settings import Settings, judged_samples, samples_of, signals_of
-from .sources import Source, Sources
+from .sources import Sources
 
 Array = NDArray[np.float64]
 
@@ -79,19 +83,13 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     notes = _time_bases(sources)
     sources, noise = with_noise(sources)
     sources = with_torques(sources)
-    return _applied(sources, decide(sources, options, reporter), (*notes, noise), reporter)
-
-
-def _applied(
-    sources: Sources, decided: Decided, notes: Sequence[str], reporter: Reporter
-) -> Prepared:
+    decided = decide(sources, options, reporter)
     settings, cell = decided.settings, decided.settings.law(sources.cell)
-
-    def signals(some: Sequence[Source]) -> tuple[Source, ...]:
-        return tuple(signals_of(source, settings) for source in some)
-
     sources = replace(
-        sources, cell=cell, training=signals(sources.training), held_out=signals(sources.held_out)
+        sources,
+        cell=cell,
+        training=tuple(signals_of(source, settings) for source in sources.training),
+        held_out=tuple(signals_of(source, settings) for source in sources.held_out),
     )
     unseen = () if sources.in_sample else sources.held_out
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
@@ -106,7 +104,11 @@ def _applied(
         training = [judged_samples(source, cell, settings) for source in sources.training]
     else:
         training = [samples.moving() for samples in fitted]
-    masked, rows = _masked(fitted), sum(len(one.torque) for one in fitted)
+    masked: dict[str, NDArray[np.intp]] = {}
+    for mask in (samples.mask for samples in fitted if samples.mask is not None):
+        for reason, counts in mask.counts.items():
+            masked[reason] = masked.get(reason, 0) + counts
+    rows = sum(len(one.torque) for one in fitted)
     return Prepared(
         sources=sources,
         fitted=tuple(fitted),
@@ -116,7 +118,7 @@ def _applied(
         delays=decided.delays,
         masked=masked,
         rows=rows,
-        notes=(*notes, *decided.notes, *_left_out(sources, masked, rows)),
+        notes=(*notes, noise, *decided.notes, *_left_out(sources, masked, rows)),
     )
 
 
@@ -136,15 +138,6 @@ def _time_bases(sources: Sources) -> list[str]:
     return notes
 
 
-def _masked(fitted: Sequence[Samples]) -> dict[str, NDArray[np.intp]]:
-    total: dict[str, NDArray[np.intp]] = {}
-    for samples in fitted:
-        if samples.mask is not None:
-            for reason, rows in samples.mask.counts.items():
-                total[reason] = total.get(reason, 0) + rows
-    return total
-
-
 def _left_out(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: int) -> list[str]:
     """What was left out in all, and why."""
     everything = rows * len(sources.cell.joint_names)
@@ -156,3 +149,92 @@ def _left_out(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: in
         f"of {everything} rows (one joint at one instant) "
         f"{1.0 - sum(left_out.values()) / everything:.1%} were fitted; left out: {parts}"
     ]
+
+
+# Torques of recordings that hold motor currents only
+
+
+def motor_from_joint(recording: Recording) -> Array:
+    """Motor angles per joint angle (n, n) as imported; the identity where none were given."""
+    stored = recording.provenance.get("motor_from_joint")
+    return np.eye(recording.n_joints) if stored is None else numbers(json.loads(stored), 2)
+
+
+def with_torques(sources: Sources) -> Sources:
+    """These sources with a torque in every recording.
+
+    Where there are currents only, the gains are read from the nominal masses of the URDF, and a
+    warning says so. Only what is fitted is looked at.
+
+    Raises:
+        ArchiveError: the URDF has no masses that the currents could be compared with.
+    """
+    everything = (*sources.training, *sources.held_out)
+    if all(source.recording.torque is not None for source in everything):
+        return sources
+    model, recordings = sources.cell.model, [source.recording for source in sources.training]
+    currents = [one.motor_current for one in recordings if one.motor_current is not None]
+    why = "the URDF has no masses to compare currents with"
+    if len(currents) == len(recordings) and np.any(model.nominal):
+        turns = motor_from_joint(recordings[0])
+        motions = [smooth(one, sources.noise_variance) for one in recordings]
+        scale = scale_from_nominal(model, motions, currents, turns)
+        why = "their currents do not look like the weight and inertia of the URDF on any axis"
+        why = "" if scale.determined.any() else why
+    if why:
+        raise ArchiveError(
+            None,
+            f"the recordings hold no torques, and {why}",
+            field="torque",
+            remedy="give drive.torque_constant in the column map, or find it by `hil gains`",
+        )
+
+    def with_torque(one: Recording) -> Recording:
+        if one.torque is not None or one.motor_current is None:
+            return one
+        return replace(one, torque=(one.motor_current * scale.values) @ turns)
+
+    sources = replace(
+        sources,
+        training=tuple(source.changed(with_torque) for source in sources.training),
+        held_out=tuple(source.changed(with_torque) for source in sources.held_out),
+    )
+    for warning in current_warnings(sources.cell.joint_names, scale):
+        sources = sources.with_warning(warning)
+    return sources
+
+
+def current_warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
+    """What a reader must know of torques that were made of currents."""
+
+    def those(chosen: NDArray[np.bool_]) -> str:
+        return ", ".join(name for name, one in zip(names, chosen, strict=True) if one)
+
+    figures = ", ".join(
+        f"{name} {value:.4g} ± {2.0 * std:.2g}"
+        for name, value, std in zip(names, scale.values, scale.std, strict=True)
+        if np.isfinite(std)
+    )
+    warnings = [
+        "only currents were recorded and no torque constants given: they were found by comparing "
+        f"the currents with the masses of the URDF ({figures} N·m/A), so every torque and "
+        "parameter is as right as those masses; `hil gains` with a known payload does without them"
+    ]
+    if turned := those(scale.turned):
+        warnings.append(
+            f"the torque constant of {turned} comes out negative: where the current is "
+            "positive the weight and inertia of the URDF need a negative torque. Either the sign "
+            "of the current or of the axis is turned in the recording, or the URDF's masses are "
+            "wrong there; the sign was used as found. Check it before using the torques"
+        )
+    if inertial := those(scale.inertial):
+        warnings.append(
+            f"weight hardly loads {inertial}: the torque constant there rests on "
+            "inertia and takes the rotor's for that of the links"
+        )
+    if unknown := those(~scale.determined):
+        warnings.append(
+            f"no torque constant could be found for {unknown}: its torque is the "
+            "current in A (times the gears), which predicts the current but no torque"
+        )
+    return warnings

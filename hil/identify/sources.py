@@ -140,51 +140,59 @@ def gather_sources(
         )
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
-    rejected = [archive for archive in archives if _rejected(archive)]
-    by_kind = _by_kind(
-        [archive for archive in archives[: len(paths)] if not _rejected(archive)],
-        [archive for archive in archives[len(paths) :] if not _rejected(archive)],
-    )
-    fitted = by_kind.get("excitation", [])
-    if in_sample:
-        fitted = [*fitted, *by_kind.pop("validation", [])]
+    by_use: dict[str, list[Archive]] = {"excitation": [], "validation": [], "standstill": []}
+    rejected = False
+    for k, archive in enumerate(archives):
+        if archive.outcome is not None and archive.outcome.outcome == REJECTED:
+            rejected = True
+            continue
+        use = archive.header.serves_as if k < len(paths) else "validation"
+        if use == "validation" and in_sample:
+            use = "excitation"
+        by_use.setdefault(use, []).append(archive)
+    fitted, predicted = by_use["excitation"], by_use["validation"]
+    if in_sample:  # excitations first
+        fitted.sort(key=lambda archive: archive.header.serves_as == "validation")
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
             "there is no excitation and no imported recording among the archives"
-            + ("" if not rejected else " but rejected ones"),
+            + (" but rejected ones" if rejected else ""),
             remedy="name archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
     _refuse_other_arms(archives)
-    rest = [source_of(archive, cell, to_fit=False) for archive in by_kind.get("standstill", [])]
+    rest = [source_of(archive, cell, to_fit=False) for archive in by_use["standstill"]]
     every = all_fitted(
         cell,
         [(archive, source_of(archive, cell)) for archive in fitted],
         rest[0].recording if rest else None,
     )
-    held_out = [source_of(archive, cell) for archive in by_kind.get("validation", [])]
+    held_out = [source_of(archive, cell) for archive in predicted]
     warnings = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     warnings += [
         f"{archive.path.name}: {warning}"
         for archive in archives
         for warning in archive.header.findings.warnings
     ]
-    warnings += filter(None, map(_not_judged, [*fitted, *by_kind.get("validation", [])]))
+    warnings += filter(None, map(_not_judged, [*fitted, *predicted]))
     if in_sample:
         return replace(every, warnings=tuple(warnings))
     training, tested_on = every.training, "unseen motion"
-    if not held_out:
-        whole = len(training) == 1
-        tested_on = (
-            "the rest of the same motion"
-            if whole
-            else "a repetition of the fitted motion"
-            if every.same_motion
-            else "another recording"
+    if not held_out and len(training) == 1:
+        tested_on = "the rest of the same motion"
+        training, held_out = _split(training[0], split)
+        warnings.append(
+            f"a temporal split: the first {split:.0%} of one recording were fitted, the rest of the"
+            " same motion was predicted; other motions would be a harder test"
         )
-        training, held_out, warning = _split(training, split)
-        warnings.append(warning)
+    elif not held_out:
+        repeated = every.same_motion
+        tested_on = "a repetition of the fitted motion" if repeated else "another recording"
+        training, held_out = training[:-1], [training[-1]]
+        warnings.append(
+            f"no validation run: the last recording, {held_out[0].name}, was held out instead"
+        )
     return replace(
         every,
         training=training,
@@ -209,12 +217,16 @@ def all_fitted(
         ArchiveError: the plan in the first archive is none.
     """
     archives, found = zip(*fitted, strict=True)
-    training, plan = tuple(found), _plan_of(archives[0])
-    same_motion = plan is not None and (
-        len({archive.attachments.get("plan.json") for archive in archives}) == 1
-    )
-    if plan is None:
+    training, plan, same_motion = tuple(found), None, False
+    if "plan.json" in archives[0].attachments:
+        plan = archives[0].table("plan.json")
+        same_motion = len({archive.attachments.get("plan.json") for archive in archives}) == 1
+    else:
         training, same_motion = aligned(training)
+    noise = torque = None
+    if rest is not None:
+        noise = position_noise(cell, rest)
+        torque = None if rest.torque is None else standstill_variance(rest.time, rest.torque)
     return Sources(
         cell=cell,
         header=archives[0].header,
@@ -222,8 +234,8 @@ def all_fitted(
         training=training,
         same_motion=same_motion,
         held_out=training,
-        noise_variance=None if rest is None else position_noise(cell, rest),
-        torque_variance=None if rest is None else _torque_variance(rest),
+        noise_variance=noise,
+        torque_variance=torque,
         warnings=(),
         tested_on="the motion that was fitted",
         in_sample=True,
@@ -243,26 +255,6 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
         replace(source, origin=float(latest + offset))
         for source, offset in zip(sources, offsets, strict=True)
     ), True
-
-
-def _plan_of(archive: Archive) -> dict[str, Any] | None:
-    """The plan that travels inside an archive, None where there is none."""
-    if "plan.json" not in archive.attachments:
-        return None
-    return archive.table("plan.json")
-
-
-def _by_kind(archives: Sequence[Archive], predicted: Sequence[Archive]) -> dict[str, list[Archive]]:
-    sorted_out: dict[str, list[Archive]] = {}
-    for archive in archives:
-        sorted_out.setdefault(_kind(archive), []).append(archive)
-    sorted_out.setdefault("validation", []).extend(predicted)
-    return sorted_out
-
-
-def _kind(archive: Archive) -> str:
-    """What an archive is for; an imported one says so beside its kind."""
-    return archive.header.serves_as
 
 
 def refuse_duplicates(paths: Sequence[Path]) -> None:
@@ -295,11 +287,12 @@ def _incomplete(archive: Archive) -> str | None:
     """What a reader must know about an archive that did not end as planned."""
     if archive.missing is not None:
         return archive.missing
-    outcome = "completed" if archive.outcome is None else archive.outcome.outcome
-    if archive.outcome is not None and outcome == REJECTED:
-        reason = archive.outcome.reason
-        return f"{archive.path.name} was rejected and left out: {reason}"
-    return None if outcome == "completed" else f"{archive.path.name} ended {outcome}"
+    name, outcome = archive.path.name, archive.outcome
+    if outcome is None or outcome.outcome == "completed":
+        return None
+    if outcome.outcome == REJECTED:
+        return f"{name} was rejected and left out: {outcome.reason}"
+    return f"{name} ended {outcome.outcome}"
 
 
 def _not_judged(archive: Archive) -> str | None:
@@ -315,11 +308,6 @@ def _not_judged(archive: Archive) -> str | None:
                 "was killed before it was judged"
             )
     return None
-
-
-def _rejected(archive: Archive) -> bool:
-    """Whether the run that made an archive found that it is of no use."""
-    return archive.outcome is not None and archive.outcome.outcome == REJECTED
 
 
 def known_warnings(cell: Cell, archive: Archive) -> list[str]:
@@ -395,49 +383,33 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     return range(int(commanded[0]), int(commanded[-1]) + 1)
 
 
-def _split(
-    sources: tuple[Source, ...], share: float
-) -> tuple[tuple[Source, ...], list[Source], str]:
-    if len(sources) > 1:
-        return (
-            sources[:-1],
-            [sources[-1]],
-            f"no validation run: the last recording, {sources[-1].name}, was held out instead",
+def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
+    """The first part of a recording, and the rest; each knows the motion beyond its ends."""
+    count = whole.recording.n_samples
+    cut = round(share * count)
+
+    def part(words: str, start: int, stop: int) -> Source:
+        recording = whole.recording
+        inside = np.zeros((count, 1), dtype=np.bool_)
+        inside[start:stop] = True
+
+        def silent(values: Array | None) -> Array | None:
+            return None if values is None else np.where(inside, values, 0.0)
+
+        context = replace(
+            recording,
+            torque=silent(recording.torque),
+            motor_current=silent(recording.motor_current),
         )
-    whole = sources[0]
-    cut = round(share * whole.recording.n_samples)
-    first = _part(whole, "first part", 0, cut)
-    last = _part(whole, "last part", cut, whole.recording.n_samples)
-    warning = (
-        f"a temporal split: the first {share:.0%} of one recording were fitted, the rest of the "
-        "same motion was predicted; other motions would be a harder test"
-    )
-    return (first,), [last], warning
+        return replace(
+            whole,
+            name=f"{whole.name} ({words})",
+            recording=recording.between(start, stop),
+            origin=float(recording.time[min(start, count - 1)]),
+            context=(context, start),
+        )
 
-
-def _part(whole: Source, words: str, start: int, stop: int) -> Source:
-    recording = whole.recording
-    outside = np.ones(recording.n_samples, dtype=np.bool_)
-    outside[start:stop] = False
-
-    def silent(values: Array | None) -> Array | None:
-        return None if values is None else np.where(outside[:, None], 0.0, values)
-
-    context = replace(
-        recording,
-        torque=silent(recording.torque),
-        motor_current=silent(recording.motor_current),
-    )
-    return Source(
-        whole.path,
-        f"{whole.name} ({words})",
-        recording.between(start, stop),
-        float(recording.time[min(start, recording.n_samples - 1)]),
-        whole.merged,
-        whole.clock,
-        whole.retimed,
-        (context, start),
-    )
+    return (part("first part", 0, cut),), [part("last part", cut, count)]
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:
@@ -448,7 +420,10 @@ def position_noise(cell: Cell, rest: Recording) -> Array:
     """
     measured = standstill_variance(rest.time, rest.position)
     if cell.file.drive_train is None:
-        return np.asarray(np.maximum(measured, _smallest_step(rest.position) ** 2 / 12.0))
+        # The least that two readings of a joint differ by, 0 where none do.
+        steps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in rest.position.T]
+        least = np.where(np.isfinite(steps), steps, 0.0)
+        return np.asarray(np.maximum(measured, least**2 / 12.0))
     drives = cell.drive_train
     revolutions = drives.motor_revolutions(rest.position)
     step = np.maximum(
@@ -458,17 +433,3 @@ def position_noise(cell: Cell, rest: Recording) -> Array:
     joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * step)
     resolution = (joint_step**2).sum(axis=1) / 12.0
     return np.asarray(np.maximum(measured, resolution))
-
-
-def _smallest_step(position: Array) -> Array:
-    """Resolution of each channel (n,): the least that two readings differ by, 0 for none."""
-    smallest = np.zeros(position.shape[1])
-    for joint, channel in enumerate(position.T):
-        steps = np.diff(np.unique(channel))
-        smallest[joint] = steps.min() if steps.size else 0.0
-    return smallest
-
-
-def _torque_variance(rest: Recording) -> Array | None:
-    """Variance of the torques at standstill (n,), None where none were recorded."""
-    return None if rest.torque is None else standstill_variance(rest.time, rest.torque)

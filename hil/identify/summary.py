@@ -1,10 +1,10 @@
-"""An identification as numbers: `results.json`."""
+"""An identification as numbers: `results.json`, and the series behind the figures of its report."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +12,25 @@ from numpy.typing import NDArray
 from hil.archive import ArchiveHeader
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.report import ReportSeries
 from hil.results import (
-    BlindResult,
     CalibrationResult,
     ChoiceResult,
     ConsistencyResult,
     CoverageResult,
     CriteriaResult,
     DelaysResult,
-    EliminationStepResult,
     EndogeneityResult,
     EssentialParameter,
     EssentialResult,
     EstimatorResult,
     ExcitationResult,
     FittedResult,
+    JointJudgement,
+    JudgementResult,
     LinkResult,
     ParameterResult,
+    ProfileResult,
     Results,
     UncertaintyResult,
     ValidationResult,
@@ -36,9 +38,7 @@ from hil.results import (
 )
 from hil.simulation import planted_values
 from hil.version import software
-from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.consistent import Consistency
-from identification.estimators.covariance import with_block_covariance
+from identification import Factor, IdentificationError, RobotModel
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.shrinkage import Shrinkage, fitted_values
 from identification.excitation import (
@@ -51,15 +51,21 @@ from identification.excitation import (
     information,
     log10_det,
 )
-from identification.factor.factor import joint_weights
-from identification.factor.phases import PhaseFactor
+from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.model.elements import TorqueRipple
-from identification.selection.essential import EssentialChoice, choose_essential
+from identification.selection.essential import EssentialChoice
+from identification.signals.noise import spectrum
 from identification.signals.samples import Samples
-from identification.validation.calibration import Calibration, TorqueMeans, calibrate
-from identification.validation.consistency import ConsistencyCheck, check_consistency
-from identification.validation.prediction import PredictionError, over_all, prediction_error
-from identification.validation.residuals import BLOCK
+from identification.validation.calibration import TorqueMeans, calibrate
+from identification.validation.consistency import ConsistencyCheck
+from identification.validation.evidence import Evidence
+from identification.validation.prediction import (
+    PredictionError,
+    for_figure,
+    over_all,
+    prediction_error,
+)
+from identification.validation.residuals import BLOCK, Profile
 from identification.validation.verdict import Verdict
 from planner import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
@@ -71,13 +77,115 @@ from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
+FIGURE_SAMPLES: Final = 4000
+"""Rows of a time series behind a figure, at most."""
+FRICTION_POINTS: Final = 600
+"""Points per joint behind a friction curve."""
+_RECORDINGS: Final = 4  # of those that were fitted: more say the same again
+_MARGIN: Final = 1.0  # s of rest that is shown before and after the motion
+_LAGS: Final = 150  # points of an autocorrelation that a figure needs
 
-def calibration_result(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
-    """Intervals of held-out torque; None without held-out motion, or too little fitted."""
+
+def summarise(
+    name: str,
+    prepared: Prepared,
+    estimation: Estimation,
+    verdict: Verdict,
+    evidence: Evidence,
+    nominal: str | None,
+    essential: EssentialChoice | str,
+    consistency: ConsistencyCheck | str,
+) -> Results:
+    """Everything that was found, as it goes into `results.json`.
+
+    Args:
+        name: of the result.
+        prepared: the recordings.
+        estimation: the estimate.
+        verdict: on it.
+        evidence: what that rests on.
+        nominal: what the nominal model is, in words.
+        essential: the essential parameters; in words why there are none.
+        consistency: parameters that a machine can have; in words why there are none.
+
+    Raises:
+        InputError: the plan in the archives cannot be read.
+        IdentificationError: the residuals were not checked.
+    """
+    sources, training, estimate = prepared.sources, prepared.training, estimation.result
+    cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
+    rows = [
+        executed_rows(source, samples)
+        for source, samples in zip(sources.training, training, strict=True)
+    ]
+    gram = information(_executed(cell.model, training, rows))
+    simulated = sources.header.only_simulated
+    truth = planted_in(cell, sources.header) if simulated else None
+    posterior, endogeneity = estimation.posterior, estimation.endogeneity
+    return Results(
+        name=name,
+        cell=cell.name,
+        simulated=simulated,
+        effects=[*sources.header.effects],
+        joint_names=list(model.joint_names),
+        period=_period(training[0]),
+        software=software(),
+        excitation=_excitation(sources, gram, training, rows),
+        estimator=EstimatorResult(
+            name=estimation.estimator,
+            words=pooled.method
+            if estimation.estimator == "auto"
+            else ESTIMATORS[estimation.estimator],
+            prior=posterior if isinstance(posterior, str) else posterior.words,
+            condition=pooled.condition,
+            grouping=model.base.explanation(),
+        ),
+        endogeneity=None
+        if isinstance(endogeneity, str)
+        else EndogeneityResult.of(
+            endogeneity, sentence=endogeneity.words, degrees_of_freedom=endogeneity.freedom
+        ),
+        endogeneity_untested=endogeneity if isinstance(endogeneity, str) else None,
+        notes=list(prepared.notes),
+        parameters=_parameters(cell, estimation, truth),
+        n_base=len(model.base.names),
+        uncertainty=uncertainty_result(estimation),
+        repetitions=[source.name for source in sources.training],
+        repetition_values=[one.values.tolist() for one in estimate.repetitions],
+        noise_std=pooled.noise_std.tolist(),
+        correlation=correlation(gram).tolist(),
+        validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
+        fitted=_fitted(model, pooled.values, prepared),
+        calibration=_calibration(prepared, estimation),
+        delays=_delays(prepared),
+        choices=[
+            ChoiceResult.of(
+                choice, errors=[error if np.isfinite(error) else None for error in choice.errors]
+            )
+            for choice in prepared.settings.choices
+        ],
+        coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
+        verdict=VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
+        essential=None if isinstance(essential, str) else essential_result(essential),
+        consistency=None
+        if isinstance(consistency, str)
+        else consistency_result(model, consistency),
+        judgement=_judgement(model.joint_names, evidence, verdict, nominal),
+    )
+
+
+def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
+    """Intervals of held-out torque; None without held-out motion, or too little fitted.
+
+    Folds are fitted by the estimator as far as it works on factors alone: by least squares where it
+    is a robust loss, instruments or a prior from CAD.
+    """
     if prepared.sources.in_sample:
         return None
     model, result = prepared.sources.cell.model, estimation.result
-    shrinkage = _fold_estimator(prepared, estimation)
+    shrinkage = prepared.settings.shrinkage if estimation.estimator == "auto" else Shrinkage()
+    if estimation.estimator == "consistent":
+        shrinkage = Shrinkage(strength=math.inf)
 
     def refit(factor: Factor) -> Array:
         return fitted_values(model, factor, shrinkage)
@@ -92,187 +200,56 @@ def calibration_result(prepared: Prepared, estimation: Estimation) -> Calibratio
         )
     except IdentificationError:
         return None
-    return None if math.isnan(found.overall) else _result(found)
-
-
-def _fold_estimator(prepared: Prepared, estimation: Estimation) -> Shrinkage:
-    """The estimator, as far as it works on factors alone.
-
-    Folds are fitted by least squares where it is a robust loss, instruments or a prior from CAD.
-    """
-    if estimation.estimator == "consistent":
-        return Shrinkage(strength=math.inf)
-    return prepared.settings.shrinkage if estimation.estimator == "auto" else Shrinkage()
-
-
-def _result(found: Calibration) -> CalibrationResult:
-    return CalibrationResult(
+    if math.isnan(found.overall):
+        return None
+    return CalibrationResult.of(
         block=BLOCK,
         means=int(found.blocks.sum()),
         inside=found.overall,
         white_inside=found.white_overall,
-        joint_inside=_known(found.inside),
-        half_width=_known(found.half_width),
+        joint_inside=found.inside,
+        half_width=found.half_width,
     )
 
 
-def _known(values: Array) -> list[float | None]:
-    return [None if math.isnan(value) else value for value in values.tolist()]
-
-
-def consistency_of(
-    model: RobotModel,
-    training: PhaseFactor,
-    held_out: Factor,
-    options: Consistency = Consistency(),  # noqa: B008 - frozen
-) -> ConsistencyCheck | str:
-    """Weighted least squares with the inequalities of a machine and without.
-
-    In words why there is none. It says what the inequalities cost whatever the estimator was.
-    """
-    total = training.total
-    try:
-        weights = joint_weights(total)
-        free = with_block_covariance(estimate(model, total, weights), training, weights)
-        return check_consistency(model, total, held_out, free, weights=weights, options=options)
-    except IdentificationError as error:
-        return str(error)
-
-
-def consistency_reasons(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
-    """Why a model must not be relied on: no machine predicts what it predicts."""
-    if isinstance(consistency, str) or not consistency.impossible:
-        return ()
-    return (
-        f"{consistency.sentence}: look there for a wrong sign, torque constant, coupling or"
-        " description",
-    )
-
-
-def consistency_warnings(consistency: ConsistencyCheck | str) -> tuple[str, ...]:
-    """What a reader of the verdict must know of it."""
-    if isinstance(consistency, str):
-        return (f"no physically consistent parameters were found: {consistency}",)
-    costly = consistency.costly and not consistency.impossible
-    return (consistency.sentence,) if costly else ()
-
-
-def consistency_result(
-    model: RobotModel, check: ConsistencyCheck | str
-) -> ConsistencyResult | None:
+def consistency_result(model: RobotModel, check: ConsistencyCheck) -> ConsistencyResult:
     """As it goes into `results.json`."""
-    if isinstance(check, str):
-        return None
     found = check.consistent
-    return ConsistencyResult(
-        sentence=check.sentence,
-        impossible=check.impossible,
-        costly=check.costly,
-        held_out=check.held_out,
-        unconstrained_held_out=check.unconstrained_held_out,
+    standard = dict(zip(model.standard_names, found.standard.tolist(), strict=True))
+    inertial = found.standard[model.layout.links]
+    return ConsistencyResult.of(
+        check,
         in_sample=found.relative_error,
         unconstrained_in_sample=found.unconstrained_relative_error,
-        moved=list(check.moved),
-        shift=found.shift.tolist(),
-        bounds=list(check.bounds),
-        links=_links(model, check),
+        shift=found.shift,
         status=found.status,
-    )
-
-
-def _links(model: RobotModel, check: ConsistencyCheck) -> list[LinkResult]:
-    standard = dict(zip(model.standard_names, check.consistent.standard.tolist(), strict=True))
-    inertial = check.consistent.standard[model.layout.links]
-    return [
-        LinkResult(
-            joint=joint,
-            mass=float(inertial[k, 9]),
-            centre=np.divide(inertial[k, 6:9], inertial[k, 9]).tolist(),
-            rotor_inertia=standard.get(f"I{k + 1}m"),
-            room=float(check.room[k]),
-            reference=check.consistent.reference[k],
-        )
-        for k, joint in enumerate(model.joint_names)
-    ]
-
-
-def essential_of(
-    model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
-) -> EssentialChoice | str:
-    """The essential parameters; in words why there are none."""
-    try:
-        return choose_essential(model, training, held_out)
-    except IdentificationError as error:
-        return str(error)
-
-
-def essential_warnings(choice: EssentialChoice | str) -> tuple[str, ...]:
-    """What a reader of the verdict must know of it."""
-    return (
-        (f"essential parameters were not looked for: {choice}",) if isinstance(choice, str) else ()
-    )
-
-
-def essential_result(choice: EssentialChoice | str) -> EssentialResult | None:
-    """As it goes into `results.json`."""
-    if isinstance(choice, str):
-        return None
-    elimination, blind = choice.elimination, choice.blind
-    estimate_left = elimination.estimate
-    return EssentialResult(
-        reason=elimination.reason,
-        cut=elimination.cut,
-        steps=[
-            EliminationStepResult.model_validate(step, from_attributes=True)
-            for step in elimination.steps
+        links=[
+            LinkResult.of(
+                joint=joint,
+                mass=float(inertial[k, 9]),
+                centre=np.divide(inertial[k, 6:9], inertial[k, 9]),
+                rotor_inertia=standard.get(f"I{k + 1}m"),
+                room=float(check.room[k]),
+                reference=found.reference[k],
+            )
+            for k, joint in enumerate(model.joint_names)
         ],
-        refused=list(elimination.refused),
+    )
+
+
+def essential_result(choice: EssentialChoice) -> EssentialResult:
+    """As it goes into `results.json`."""
+    left = choice.elimination.estimate
+    columns = left.names, left.units, left.values.tolist(), left.std.tolist()
+    return EssentialResult.of(
+        choice.elimination,
         parameters=[
             EssentialParameter(name=name, unit=unit, estimate=value, std=std)
-            for name, unit, value, std in zip(
-                estimate_left.names,
-                estimate_left.units,
-                estimate_left.values.tolist(),
-                estimate_left.std.tolist(),
-                strict=True,
-            )
+            for name, unit, value, std in zip(*columns, strict=True)
         ],
         by_spread_left=choice.by_spread.left,
         by_spread_held_out=choice.by_spread.held_out,
-        blind=None
-        if blind is None
-        else BlindResult(left=blind.left, essential=blind.essential, full=blind.full),
-    )
-
-
-def estimator_result(model: RobotModel, estimation: Estimation) -> EstimatorResult:
-    """Name, words, and the prior that "learned from the data" is measured against."""
-    posterior, pooled = estimation.posterior, estimation.result.pooled
-    return EstimatorResult(
-        name=estimation.estimator,
-        words=ESTIMATORS[estimation.estimator]
-        if estimation.estimator != "auto"
-        else estimation.result.pooled.method,
-        prior=posterior if isinstance(posterior, str) else posterior.words,
-        condition=pooled.condition,
-        grouping=model.base.explanation(),
-    )
-
-
-def endogeneity_result(estimation: Estimation) -> EndogeneityResult | None:
-    """Durbin-Wu-Hausman test, None where there was none."""
-    test = estimation.endogeneity
-    if isinstance(test, str):
-        return None
-    return EndogeneityResult(
-        sentence=test.words,
-        biased=test.biased,
-        statistic=test.statistic,
-        p_value=test.p_value,
-        degrees_of_freedom=test.freedom,
-        noise=test.noise.tolist(),
-        shifted=list(test.shifted),
-        shift=test.shift.tolist(),
+        blind=choice.blind,
     )
 
 
@@ -291,71 +268,6 @@ def uncertainty_result(estimation: Estimation) -> UncertaintyResult:
         phase_clustered=None if by_posterior else reported,
         scatter_of_mean=result.scatter_std.tolist() if many else None,
         posterior=reported if by_posterior else None,
-    )
-
-
-def summarise(
-    name: str,
-    prepared: Prepared,
-    estimation: Estimation,
-    verdict: Verdict,
-    essential: EssentialChoice | str,
-    consistency: ConsistencyCheck | str,
-) -> Results:
-    """Everything that was found, as it goes into `results.json`."""
-    sources, training, estimate = prepared.sources, prepared.training, estimation.result
-    cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    rows = [
-        executed_rows(source, samples)
-        for source, samples in zip(sources.training, training, strict=True)
-    ]
-    gram = information(_executed(cell.model, training, rows))
-    simulated = sources.header.only_simulated
-    truth = planted_in(cell, sources.header) if simulated else None
-    return Results(
-        name=name,
-        cell=cell.name,
-        simulated=simulated,
-        effects=[*sources.header.effects],
-        joint_names=list(model.joint_names),
-        period=_period(training[0]),
-        software=software(),
-        excitation=_excitation(sources, gram, training, rows),
-        estimator=estimator_result(model, estimation),
-        endogeneity=endogeneity_result(estimation),
-        endogeneity_untested=(
-            estimation.endogeneity if isinstance(estimation.endogeneity, str) else None
-        ),
-        notes=list(prepared.notes),
-        parameters=_parameters(cell, estimation, truth),
-        n_base=len(model.base.names),
-        uncertainty=uncertainty_result(estimation),
-        repetitions=[source.name for source in sources.training],
-        repetition_values=[one.values.tolist() for one in estimate.repetitions],
-        noise_std=pooled.noise_std.tolist(),
-        correlation=correlation(gram).tolist(),
-        validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
-        fitted=_fitted(model, pooled.values, prepared),
-        calibration=calibration_result(prepared, estimation),
-        delays=_delays(prepared),
-        choices=[
-            ChoiceResult(
-                name=choice.name,
-                candidates=[*choice.candidates],
-                errors=[error if np.isfinite(error) else None for error in choice.errors],
-                chosen=choice.chosen,
-            )
-            for choice in prepared.settings.choices
-        ],
-        coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
-        verdict=VerdictResult(
-            good=verdict.good,
-            line=verdict.line,
-            reasons=[*verdict.reasons],
-            warnings=[*verdict.warnings, *sources.warnings],
-        ),
-        essential=essential_result(essential),
-        consistency=consistency_result(model, consistency),
     )
 
 
@@ -396,27 +308,33 @@ def _excitation(
     sources: Sources, gram: Array, training: Sequence[Samples], rows: Sequence[slice]
 ) -> ExcitationResult:
     """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
-    lengths = [part.stop - part.start for part in rows]
-    executed = _criteria(gram, sum(lengths))
+    lengths, most = [part.stop - part.start for part in rows], coupling_index_max(len(gram))
+    executed = CriteriaResult(
+        log10_det=log10_det(gram, sum(lengths)),
+        coupling_index=coupling_index(gram),
+        coupling_index_max=most,
+        fitness=fitness_eq7(gram, sum(lengths)),
+        n_samples=sum(lengths),
+        condition=condition_number(gram, scaled=False),
+        scaled_condition=condition_number(gram, scaled=True),
+    )
     planned = _planned(sources)
     if planned is None:
+        duration = lengths[0] * _period(training[0])
         return ExcitationResult(
-            duration=lengths[0] * _period(training[0]),
-            n_via=None,
-            fly=None,
-            planned=None,
-            executed=executed,
+            duration=duration, n_via=None, fly=None, planned=None, executed=executed
         )
-    trajectory, criteria = planned.trajectory, planned.criteria
+    trajectory, via_points = planned.trajectory, planned.via_points
+    n_via = None
+    if via_points is not None:  # without the posture that a closed path begins and ends at
+        n_via = len(via_points) - 2 * np.array_equal(via_points[0], via_points[-1])
     return ExcitationResult(
         method=planned.method,
         duration=trajectory.duration,
-        n_via=_n_via(planned.via_points),
+        n_via=n_via,
         fly=planned.fly,
         n_sines=trajectory.amplitude.shape[1] if isinstance(trajectory, FourierSeries) else None,
-        planned=CriteriaResult(
-            **asdict(criteria), coupling_index_max=coupling_index_max(len(gram))
-        ),
+        planned=CriteriaResult.of(planned.criteria, coupling_index_max=most),
         executed=executed,
     )
 
@@ -432,14 +350,6 @@ def _planned(sources: Sources) -> Excitation | None:
             f"its plan.json holds no excitation that can be read ({error!r})",
             remedy="identify with the version of hil that recorded it",
         ) from error
-
-
-def _n_via(via_points: Array | None) -> int | None:
-    """Via points, without the posture that a closed path begins and ends at."""
-    if via_points is None:
-        return None
-    closed = np.array_equal(via_points[0], via_points[-1])
-    return len(via_points) - 2 if closed else len(via_points)
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
@@ -463,48 +373,46 @@ def moving_rows(samples: Samples) -> slice:
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
-def _criteria(gram: Array, n_samples: int) -> CriteriaResult:
-    return CriteriaResult(
-        log10_det=log10_det(gram, n_samples),
-        coupling_index=coupling_index(gram),
-        coupling_index_max=coupling_index_max(len(gram)),
-        fitness=fitness_eq7(gram, n_samples),
-        n_samples=n_samples,
-        condition=condition_number(gram, scaled=False),
-        scaled_condition=condition_number(gram, scaled=True),
-    )
-
-
 def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list[ParameterResult]:
     model, estimate, posterior = cell.model, estimation.result, estimation.posterior
-    pooled = estimate.pooled
-    expressions = [*model.base.expressions(), *model.parameter_names[len(model.base.names) :]]
-    std = estimate.std if len(estimate.repetitions) > 1 else None
-    printed = _table2_ids() if cell.urdf == URDF_PATH.read_text(encoding="utf-8") else {}
+    pooled, many = estimate.pooled, len(estimate.repetitions) > 1
+    # Rows 29 and 31 of the paper's Table 2 have the other sign.
+    printed = {row.pivot or row.parameter: row.id for row in TABLE2}
+    ours = cell.urdf != URDF_PATH.read_text(encoding="utf-8")
+    known = None if isinstance(posterior, str) else posterior
+    rows = _rows(
+        name=model.parameter_names,
+        expression=[*model.base.expressions(), *model.parameter_names[len(model.base.names) :]],
+        unit=model.units,
+        table2_id=None if ours else [printed.get(name) for name in model.parameter_names],
+        estimate=pooled.values,
+        std=pooled.std,
+        repetition_mean=estimate.mean,
+        repetition_std=estimate.std if many else None,
+        truth=truth,
+        undetermined=[name in pooled.undetermined for name in model.parameter_names],
+        of_this_run=model.friction_columns,
+        prior_std=known and known.prior_std,
+        prior_ratio=known and known.ratio,
+        learned=known and known.learned,
+    )
+    return [ParameterResult.of(**row) for row in rows]
+
+
+def _rows(**columns: Any) -> list[dict[str, Any]]:
+    """A record for each entry of columns of equal length, the first of which is there.
+
+    Arrays give Python's own numbers; a column that is None gives None throughout.
+    """
+    lists = {
+        name: values.tolist() if isinstance(values, np.ndarray) else values
+        for name, values in columns.items()
+    }
+    count = len(next(iter(lists.values())))
     return [
-        ParameterResult(
-            name=parameter,
-            expression=expressions[i],
-            unit=model.units[i],
-            table2_id=printed.get(parameter),
-            estimate=float(pooled.values[i]),
-            std=float(pooled.std[i]),
-            repetition_mean=float(estimate.mean[i]),
-            repetition_std=None if std is None else float(std[i]),
-            truth=None if truth is None or np.isnan(truth[i]) else float(truth[i]),
-            undetermined=parameter in pooled.undetermined,
-            of_this_run=bool(model.friction_columns[i]),
-            prior_std=None if isinstance(posterior, str) else float(posterior.prior_std[i]),
-            prior_ratio=None if isinstance(posterior, str) else float(posterior.ratio[i]),
-            learned=None if isinstance(posterior, str) else bool(posterior.learned[i]),
-        )
-        for i, parameter in enumerate(model.parameter_names)
+        {name: None if values is None else values[k] for name, values in lists.items()}
+        for k in range(count)
     ]
-
-
-def _table2_ids() -> dict[str, int]:
-    """Row of the paper's Table 2 by our parameter name (rows 29 and 31 have the other sign)."""
-    return {row.pivot or row.parameter: row.id for row in TABLE2}
 
 
 def _validation(
@@ -514,16 +422,16 @@ def _validation(
     errors = prediction_error(model, values, held_out)
     everywhere = prediction_error(model, values, held_out, all_rows=True)
     return [
-        ValidationResult(
+        ValidationResult.of(
             archive=source.name,
             duration=float(source.recording.time[-1] - source.recording.time[0]),
-            mean_abs_error=error.mean_absolute.tolist(),
-            rms_error=error.rms.tolist(),
-            mean_error=error.mean.tolist(),
-            relative_error=error.relative.tolist(),
+            mean_abs_error=error.mean_absolute,
+            rms_error=error.rms,
+            mean_error=error.mean,
+            relative_error=error.relative,
             overall_relative_error=error.overall,
             all_rows_relative_error=all_rows.overall,
-            all_rows_joint_errors=all_rows.relative.tolist(),
+            all_rows_joint_errors=all_rows.relative,
         )
         for source, error, all_rows in zip(sources.held_out, errors, everywhere, strict=True)
     ]
@@ -537,17 +445,15 @@ def _fitted(model: RobotModel, values: Array, prepared: Prepared) -> FittedResul
 
     moving = error(prepared.training, all_rows=False)
     everywhere = error(prepared.training, all_rows=True)
-    smoothed = (
-        error(prepared.fitted, all_rows=True)
-        if prepared.settings.preprocessing.smooth_torque
-        else None
-    )
-    return FittedResult(
-        relative_error=moving.relative.tolist(),
+    smoothed = None
+    if prepared.settings.preprocessing.smooth_torque:
+        smoothed = error(prepared.fitted, all_rows=True)
+    return FittedResult.of(
+        relative_error=moving.relative,
         overall_relative_error=moving.overall,
         all_rows_relative_error=everywhere.overall,
-        all_rows_joint_errors=everywhere.relative.tolist(),
-        smoothed_relative_error=None if smoothed is None else smoothed.relative.tolist(),
+        all_rows_joint_errors=everywhere.relative,
+        smoothed_relative_error=None if smoothed is None else smoothed.relative,
         smoothed_overall_relative_error=None if smoothed is None else smoothed.overall,
     )
 
@@ -556,12 +462,11 @@ def _delays(prepared: Prepared) -> DelaysResult | None:
     found = prepared.delays
     if found is None:
         return None
-    known = found.determined.tolist()
-    half = (found.interval_factor * found.std).tolist()
-    return DelaysResult(
-        found=[d if k else None for d, k in zip(found.delays.tolist(), known, strict=True)],
-        interval=[h if k else None for h, k in zip(half, known, strict=True)],
-        applied=prepared.assumed_delay.tolist(),
+    half = found.interval_factor * found.std
+    return DelaysResult.of(
+        found=np.where(found.determined, found.delays, np.nan),
+        interval=np.where(found.determined, half, np.nan),
+        applied=prepared.assumed_delay,
     )
 
 
@@ -575,3 +480,126 @@ def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
         within_3=int((distance <= 3.0 * std).sum()),
         total=int(determined.sum()),
     )
+
+
+def _judgement(
+    joint_names: Sequence[str], evidence: Evidence, verdict: Verdict, nominal: str | None
+) -> JudgementResult:
+    """What the verdict rests on."""
+    checks, around, error = evidence.residuals, evidence.surroundings, evidence.held_out
+    if checks is None:
+        raise IdentificationError("the evidence holds no checks of the residuals")
+    colour, drift, inertia = checks.colour, checks.drift, around.controller_inertia
+    step = max(1, -(-len(colour.lag) // _LAGS))
+    rows = _rows(
+        joint=joint_names,
+        unit=["N·m" if evidence.revolute(j) else "N" for j in range(len(joint_names))],
+        rms=error.rms,
+        relative=error.relative,
+        fitted_relative=evidence.training.relative,
+        explained=error.explained,
+        limit=around.torque_limit,
+        share_of_limit=evidence.share_of_limit,
+        nominal_relative=None if evidence.nominal is None else evidence.nominal.relative,
+        controller_relative=None if around.controller is None else around.controller.relative,
+        nominal_scale=None if around.nominal_scale is None else around.nominal_scale.scale,
+        controller_inertia=None if inertia is None else inertia.ratio,
+        controller_inertia_spread=None if inertia is None else inertia.spread,
+    )
+    return JudgementResult.of(
+        in_sample=evidence.in_sample,
+        nominal=None if evidence.nominal is None else nominal,
+        findings=verdict.findings,
+        next_steps=verdict.next_steps,
+        joints=[JointJudgement.of(**row) for row in rows],
+        speed=_profiles(checks.speed),
+        position=_profiles(checks.position),
+        lag=colour.lag[::step],
+        autocorrelation=colour.correlation[::step].T,
+        effective_rows=np.nan_to_num(colour.effective_rows),
+        friction_over_time=None if drift is None else drift.share.T,
+    )
+
+
+def _profiles(profile: Profile) -> list[ProfileResult]:
+    columns = zip(profile.centres, profile.bins.mean, profile.bins.std, strict=True)
+    return [ProfileResult.of(centre=centre, mean=mean, std=std) for centre, mean, std in columns]
+
+
+def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSeries:
+    """The series of a report: the first motion that was fitted, the first that was held out."""
+    sources, fitted, example = prepared.sources, prepared.fitted, prepared.held_out[0]
+    model, values = sources.cell.model, estimate.pooled.values
+    excitation, motion = fitted[0], fitted[0].motion
+    shown, seen = _shown(prepared.training[0]), _shown(example)
+    time = example.motion.time
+    predicted = example.predicted_torque(model, values)
+    parts = torque_parts(model, values, example)
+    both = np.column_stack([example.torque, example.torque - predicted])
+    frequency, density = spectrum(time, both, example.segments)
+    speed, torque = _friction_data(model, values, fitted)
+    curves = [
+        friction_curve(
+            model,
+            values,
+            joint,
+            float(np.nanmin(speed[:, joint], initial=0.0)),
+            float(np.nanmax(speed[:, joint], initial=0.0)),
+        )
+        for joint in range(model.n_joints)
+    ]
+    return ReportSeries(
+        excitation_time=motion.time[shown] - excitation.origin,
+        excitation_position=motion.position[shown],
+        excitation_velocity=motion.velocity[shown],
+        example_archive=sources.held_out[0].name,
+        example_time=time[seen] - example.origin,
+        example_measured=for_figure(time, example.torque)[seen],
+        example_predicted=for_figure(time, predicted)[seen],
+        excitation_fitted=excitation.usable[shown].astype(np.float64),
+        example_used=example.usable[seen].astype(np.float64),
+        example_inertia=for_figure(time, parts.inertia)[seen],
+        example_coriolis=for_figure(time, parts.coriolis)[seen],
+        example_gravity=for_figure(time, parts.gravity)[seen],
+        example_friction=for_figure(time, parts.friction)[seen],
+        friction_speed=speed,
+        friction_torque=torque,
+        law_speed=np.column_stack([curve.speed for curve in curves]),
+        law_torque=np.column_stack([curve.sliding for curve in curves]),
+        reversal_travel=np.column_stack([curve.travel for curve in curves]),
+        reversal_torque=np.column_stack([curve.turning for curve in curves]),
+        spectrum_frequency=frequency,
+        spectrum_torque=density[:, : model.n_joints],
+        spectrum_residual=density[:, model.n_joints :],
+        motion_bandwidth=np.where(
+            np.isfinite(example.position_bandwidth), example.position_bandwidth, np.nan
+        ),
+    )
+
+
+def _shown(samples: Samples) -> slice:
+    """Rows for a figure: the motion, and a little of the rest before and after it."""
+    moving, time = moving_rows(samples), samples.motion.time
+    if moving.start == moving.stop:
+        return moving
+    first = int(np.searchsorted(time, time[moving.start] - _MARGIN))
+    last = int(np.searchsorted(time, time[moving.stop - 1] + _MARGIN, side="right"))
+    return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
+
+
+def _friction_data(
+    model: RobotModel, values: Array, fitted: tuple[Samples, ...]
+) -> tuple[Array, Array]:
+    """Speed and friction torque of fitted rows (FRICTION_POINTS, n), NaN where there are fewer."""
+    some = fitted[:: -(-len(fitted) // _RECORDINGS)]
+    speed = np.concatenate([samples.motion.velocity for samples in some])
+    torque = np.concatenate([friction_torque(model, values, samples) for samples in some])
+    usable = np.concatenate([samples.usable for samples in some])
+    found = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)
+    for joint in range(model.n_joints):
+        rows = np.flatnonzero(usable[:, joint])
+        count = min(len(rows), FRICTION_POINTS)
+        if count:
+            chosen = rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]
+            found[:, :count, joint] = speed[chosen, joint], torque[chosen, joint]
+    return found[0], found[1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,12 +19,7 @@ from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
 from identification.validation.evidence import Surroundings
 from identification.validation.finding import Finding, joined
-from identification.validation.nominal_scale import (
-    InertiaRatio,
-    NominalScale,
-    inertia_ratio,
-    nominal_scale,
-)
+from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
 from identification.validation.position_jumps import position_jumps
 from identification.validation.prediction import PredictionError, over_all
 
@@ -40,12 +34,11 @@ _SAME_TIME = 1e-6  # s
 
 
 def controller_error(
-    paths: Sequence[Path], cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
+    cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
 ) -> PredictionError | None:
     """Error of the controller's model on the rows that a verdict counts.
 
     Args:
-        paths: the archives, by whose names the sources are called.
         cell: whose drive train turns currents into torques.
         sources: what is predicted.
         samples: the same, prepared.
@@ -56,48 +49,30 @@ def controller_error(
     """
     if cell.file.drive_train is None:
         return None
-    by_name = {path.name: path for path in paths}
     errors = []
     for source, prepared in zip(sources, samples, strict=True):
-        if source.name not in by_name:  # a part of an archive
+        current = _column_at(source, "model_current", prepared.motion.time)
+        if current is None:
             return None
-        torque = _model_torque(by_name[source.name], cell, prepared.motion.time)
-        if torque is None:
-            return None
+        torque = cell.drive_train.joint_torque(current)
         errors.append(PredictionError.between(prepared.torque, torque, prepared.usable))
     return over_all(errors) if errors else None
 
 
-def _model_torque(path: Path, cell: Cell, time: Array) -> Array | None:
-    """Joint torques (m, n) of the controller's model at these times of the archive."""
-    current = _column_at(path, "model_current", time)
-    return None if current is None else cell.drive_train.joint_torque(current)
-
-
 def controller_inertia(
-    paths: Sequence[Path], cell: Cell, estimate: Estimate, sources: Sequence[Source]
+    cell: Cell, estimate: Estimate, sources: Sequence[Source]
 ) -> InertiaRatio | None:
     """The controller's diagonal inertia beside the identified one, over the recorded postures.
 
-    Args:
-        paths: the archives, by whose names the sources are called.
-        cell: whose model was identified.
-        estimate: of its parameters.
-        sources: what was recorded.
-
-    Returns:
-        None where the controller sent none (zeros), or the data leave parameters open.
+    None where the controller sent none (zeros), or the data leave parameters open.
     """
-    by_name = {path.name: path for path in paths}
     if cell.file.drive_train is None or estimate.undetermined:
         return None
     positions, theirs = [], []
     for source in sources:
-        if source.name not in by_name:  # a part of an archive
-            continue
         recording = source.recording
         few = slice(None, None, max(1, recording.n_samples // _POSTURES))
-        inertia = _column_at(by_name[source.name], "diagonal_inertia", recording.time[few])
+        inertia = _column_at(source, "diagonal_inertia", recording.time[few])
         if inertia is not None:
             positions.append(recording.position[few])
             theirs.append(inertia)
@@ -108,9 +83,14 @@ def controller_inertia(
     )
 
 
-def _column_at(path: Path, field: str, time: Array) -> Array | None:
-    """A channel (m, n) of the archive at these of its times; None where it says nothing."""
-    archive = open_archive(path, fields=("cycle", field))
+def _column_at(source: Source, field: str, time: Array) -> Array | None:
+    """A channel (m, n) of the source's archive at these of its times; None where it says nothing.
+
+    Nor of a source that is a part of its archive.
+    """
+    if source.name != source.path.name:
+        return None
+    archive = open_archive(source.path, fields=("cycle", field))
     column, cycle = archive.columns.get(field), archive.columns.get("cycle")
     if column is None or cycle is None or archive.period is None:
         return None
@@ -130,26 +110,29 @@ _COARSE: Final = 0.02  # share of the accelerations
 _FAST: Final = 2.0  # bandwidths of the motion: what ends above has no effect on what is fitted
 
 
-def surroundings_of(paths: Sequence[Path], prepared: Prepared, estimate: Estimate) -> Surroundings:
-    """What a verdict needs to know of the cell.
-
-    Args:
-        paths: the archives that were identified from.
-        prepared: what was made of them.
-        estimate: what was estimated from that.
-    """
+def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
+    """What a verdict needs to know of the cell, beside the recordings and an estimate from them."""
     cell, sources = prepared.sources.cell, prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
+    saturated, nominal = prepared.masked.get(SATURATED), nominal_of(cell)
     return Surroundings(
         torque_limit=torque_limits(cell),
-        saturated=_saturated(prepared),
+        saturated=None if saturated is None else saturated / max(prepared.rows, 1),
         motor_from_joint=cell.drive_train.motor_from_joint if driven else None,
-        controller=controller_error(paths, cell, prepared.sources.held_out, prepared.held_out),
-        nominal_scale=_scale(cell, prepared),
+        controller=controller_error(cell, sources.held_out, prepared.held_out),
+        nominal_scale=None
+        if nominal is None
+        else nominal_scale(
+            cell.model,
+            nominal.values,
+            prepared.training,
+            rotors_known=nominal.rotors_known,
+            share=nominal.share,
+        ),
         jumps=tuple(jump for one in recorded for jump in position_jumps(one.recording, one.name)),
         controller_inertia=controller_inertia(
-            paths, cell, estimate, (*sources.training, *sources.held_out)
+            cell, estimate, (*sources.training, *sources.held_out)
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
@@ -271,25 +254,8 @@ def nominal_of(cell: Cell) -> Nominal | None:
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ standard
     values[model.element_part] = model.elements.nominal
-    return Nominal(
-        values,
-        "the URDF's inertias, without friction and rotors",
-        False,
-        NOMINAL_SHARE,
-    )
-
-
-def _scale(cell: Cell, prepared: Prepared) -> NominalScale | None:
-    nominal = nominal_of(cell)
-    if nominal is None:
-        return None
-    return nominal_scale(
-        cell.model,
-        nominal.values,
-        prepared.training,
-        rotors_known=nominal.rotors_known,
-        share=nominal.share,
-    )
+    words = "the URDF's inertias, without friction and rotors"
+    return Nominal(values, words, False, NOMINAL_SHARE)
 
 
 def torque_limits(cell: Cell) -> Array | None:
@@ -302,12 +268,12 @@ def torque_limits(cell: Cell) -> Array | None:
         drives = cell.drive_train
         gear = np.abs(np.diag(drives.motor_from_joint))
         return np.asarray(gear * drives.torque_constant * drives.current_limit)
-    efforts = {}
-    for joint in urdf_tree(cell.urdf).iter("joint"):
-        limit = joint.find("limit")
-        if limit is not None:
-            efforts[joint.get("name")] = _positive(limit.get("effort", ""))
-    limits = np.array([efforts.get(name, np.nan) for name in cell.joint_names])
+    efforts = {
+        joint.get("name"): limit.get("effort", "")
+        for joint in urdf_tree(cell.urdf).iter("joint")
+        for limit in joint.iter("limit")
+    }
+    limits = np.array([_positive(efforts.get(name, "")) for name in cell.joint_names])
     return None if np.isnan(limits).all() else limits
 
 
@@ -317,9 +283,3 @@ def _positive(text: str) -> float:
     except ValueError:
         return np.nan
     return value if 0.0 < value < np.inf else np.nan
-
-
-def _saturated(prepared: Prepared) -> Array | None:
-    """Share of each joint's rows that were left out because something was at its limit (n,)."""
-    rows = prepared.masked.get(SATURATED)
-    return None if rows is None else np.asarray(rows / max(prepared.rows, 1))

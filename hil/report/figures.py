@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
@@ -19,13 +18,9 @@ from hil.report.drawing import (
     FIRST,
     GRID,
     INK,
-    INSIDE,
     MOST_POINTS,
     MUTED,
-    OUTSIDE_2,
-    OUTSIDE_3,
     PANEL_WIDTH,
-    PAPER,
     ROUTES,
     SECOND,
     TICK_SIZE,
@@ -52,7 +47,6 @@ from hil.report.drawing import (
 from hil.report.numbers import fixed, percent, significant
 from hil.report.series import ReportSeries
 from hil.results import (
-    EssentialResult,
     FittedResult,
     JointJudgement,
     JudgementResult,
@@ -559,97 +553,7 @@ def error_boxes(results: Results) -> list[Panel]:
     return panels
 
 
-# Parameters
-
-_ROW: Final = 14.5
-_MOST_ROWS: Final = 20
-_FURTHEST: Final = 6.5
-
-
-def groups(results: Results) -> list[tuple[str, list[int]]]:
-    """Parameters in stretches of at most twenty; base parameters and friction never mixed."""
-    found = []
-    base, more = range(results.n_base), range(results.n_base, len(results.parameters))
-    friction = [i for i in more if results.parameters[i].of_this_run] or [*more]
-    for name, members in (
-        ("Base parameters", [*base]),
-        ("Friction", friction),
-        ("Elements", [i for i in more if i not in friction]),
-    ):
-        count = math.ceil(len(members) / _MOST_ROWS)
-        parts = [part.tolist() for part in np.array_split(members, count)] if count else []
-        for k, part in enumerate(parts):
-            title = name if count == 1 else f"{name}, {k + 1} of {count}"
-            found.append((title, [int(i) for i in part]))
-    return found
-
-
-def deviation_panels(results: Results) -> list[Panel]:
-    """(estimate - truth) / std of every parameter that has a planted truth."""
-    values = [p.deviation for p in results.parameters]
-    furthest = max((abs(z) for z in values if z is not None), default=0.0)
-    reach = min(_FURTHEST, max(4.0, furthest + 0.5))
-    panels = []
-    for k, (title, members) in enumerate(groups(results)):
-        shown = [(row, z) for row, i in enumerate(members) if (z := values[i]) is not None]
-        if not shown:
-            continue
-        outside, far = (sum(abs(z) > limit for _, z in shown) for limit in (2.0, 3.0))
-        alt = (
-            f"{title}: deviation of {len(shown)} estimates from the truth in standard deviations;"
-            f" {outside} outside 2, {far} outside 3."
-        )
-        with drawing():
-            figure, axes = _parameter_rows(results, members)
-            axes.axvspan(-2.0, 2.0, color=BAND, linewidth=0.0)
-            for limit in (-3.0, 3.0):
-                axes.axvline(limit, color=MUTED, linewidth=0.8, linestyle=(0, (3, 3)))
-            axes.axvline(0.0, color=MUTED, linewidth=0.9)
-            for row, z in shown:
-                _deviation(axes, row, z, reach)
-            axes.xaxis.set_major_locator(FixedLocator([-6, -4, -3, -2, 0, 2, 3, 4, 6]))
-            axes.set_xlim(-reach, reach)
-            footed(axes, "(estimate − truth) / std")
-            note = f"{outside} of {len(shown)} outside 2σ"
-            panels.append(to_panel(figure, key=f"d{k}", title=title, note=note, alt=alt))
-    return panels
-
-
-def _deviation(axes: Axes, row: int, z: float, reach: float) -> None:
-    size = abs(z)
-    marker, color, area = ("o", INSIDE, 26.0)
-    if size > 2.0:
-        marker, color, area = ("^", OUTSIDE_2, 38.0)
-    if size > 3.0:
-        marker, color, area = ("s", OUTSIDE_3, 34.0)
-    edge = math.copysign(min(size, reach - 0.25), z)
-    axes.scatter([edge], [row], s=area, marker=marker, color=color, linewidths=0.0, zorder=3)
-    if size > 2.0:
-        axes.annotate(
-            fixed(z, 1, sign=True).replace("-", "−"),
-            (edge, row),
-            xytext=(-7.0 if z > 0.0 else 7.0, 0.0),
-            textcoords="offset points",
-            ha="right" if z > 0.0 else "left",
-            va="center",
-            fontsize=TICK_SIZE,
-            color=INK,
-        )
-
-
-def _parameter_rows(results: Results, members: list[int]) -> tuple[Figure, Axes]:
-    """A figure whose axes have one ruled, labelled row per parameter, the first on top."""
-    height = _ROW * len(members)
-    figure = blank(PANEL_WIDTH, 8.0 + height + 40.0)
-    axes = place(figure, 92.0, 8.0, PANEL_WIDTH - 106.0, height)
-    axes.set_ylim(len(members) - 0.5, -0.5)
-    axes.set_yticks(range(len(members)))
-    axes.set_yticklabels([label(results.parameters[i].label) for i in members])
-    axes.tick_params(axis="y", length=0.0)
-    axes.grid(True, axis="y", color=GRID, linewidth=0.8)
-    axes.spines["left"].set_visible(False)
-    return figure, axes
-
+# Correlation
 
 _LABELS, _SCALE = 84.0, 78.0
 _SIDE: Final = 560.0
@@ -715,59 +619,3 @@ def _bordered(axes: Axes, colour: str) -> None:
     for spine in axes.spines.values():
         spine.set_visible(True)
         spine.set_color(colour)
-
-
-# The last few parameters leave errors of 100 %, beside which nothing else could be distinguished.
-_HIGHEST_ERROR: Final = 4.0  # times the lowest
-
-
-def elimination_panels(essential: EssentialResult) -> list[Panel]:
-    """Torque error over the number of parameters, from all of them on the left to one."""
-    panels: list[Panel] = []
-    steps = essential.steps
-    if len(steps) < 2:
-        return panels
-    left = np.array([step.left for step in steps])
-    held_out, in_sample = (
-        100.0 * np.array([getattr(step, name) for step in steps])
-        for name in ("held_out", "in_sample")
-    )
-    cut, at_cut = steps[essential.cut].left, held_out[essential.cut]
-    by_spread = 100.0 * essential.by_spread_held_out
-    top = _HIGHEST_ERROR * max(float(np.nanmin(held_out)), 1e-9)
-    top = max(top, 1.15 * float(held_out[0]), 1.15 * by_spread)
-    alt = (
-        f"Torque error over the number of parameters: on held-out motion {held_out[0]:.2f} % with"
-        f" all {left[0]}, {at_cut:.2f} % with the {cut} at the cut, {by_spread:.2f} % with the"
-        f" {essential.by_spread_left} that relative standard deviations alone leave."
-    )
-    caption = Caption("el0", "Torque error", f"cut at {cut} of {left[0]}", alt)
-    axis = "torque error [%]", "parameters left"
-    with panel(panels, 250.0, caption, *axis, right=12.0, bottom=42.0) as axes:
-        axes.set_xlim(float(left[0]) + 0.5, 0.0)
-        axes.plot(left, in_sample, color=SECOND, linewidth=1.4, linestyle=(0, (5, 3)))
-        axes.plot(left, held_out, color=FIRST, linewidth=1.8)
-        axes.set_ylim(0.0, top)
-        ruled(axes, "y", x_ticks=6, y_ticks=5)
-        axes.axvline(cut, color=MUTED, linewidth=1.0, linestyle=(0, (3, 3)))
-        axes.scatter([cut], [min(at_cut, top)], s=44.0, color=FIRST, linewidths=0.0, zorder=5)
-        axes.annotate(
-            "cut",
-            (cut, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(4.0, -9.0),
-            textcoords="offset points",
-            fontsize=TICK_SIZE,
-            color=INK,
-        )
-        axes.scatter(
-            [essential.by_spread_left],
-            [by_spread],
-            s=40.0,
-            marker="D",
-            facecolor=PAPER,
-            edgecolor=FIRST,
-            linewidths=1.5,
-            zorder=5,
-        )
-    return panels

@@ -19,7 +19,6 @@ from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
 from hil.results import (
     ChoiceResult,
-    CriteriaResult,
     ParameterResult,
     RecordedResult,
     Results,
@@ -89,7 +88,6 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "excitation_panels": figures.excitation_panels(series, results.joint_names),
         "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
-        "deviation_panels": figures.deviation_panels(results),
         "correlation": figures.correlation_matrix(results),
         "box_panels": figures.error_boxes(results),
         "torque_panels": figures.torque_panels(series, joints),
@@ -151,12 +149,8 @@ def judgement_context(results: Results) -> dict[str, Any]:
 
 def trust_context(results: Results) -> dict[str, Any]:
     """What `trust.html.j2` and `consistency.html.j2` need."""
-    essential = results.essential
-    return {
-        "by_name": {parameter.name: parameter for parameter in results.parameters},
-        "outside_mark": outside_mark,
-        "elimination_panels": [] if essential is None else figures.elimination_panels(essential),
-    }
+    by_name = {parameter.name: parameter for parameter in results.parameters}
+    return {"by_name": by_name, "outside_mark": outside_mark}
 
 
 def conduct_context(results: Results) -> dict[str, Any]:
@@ -370,36 +364,24 @@ def estimation_facts(results: Results) -> list[Fact]:
 def criteria(results: Results) -> list[tuple[str, str, str, str, str]]:
     """Title, meaning, planned, executed and change; the paper's equations by number."""
     planned, executed = results.excitation.planned, results.excitation.executed
-    return [
-        (
-            title,
-            meaning,
-            _criterion(planned, field, decimals),
-            _criterion(executed, field, decimals),
-            _change(planned, executed, field, decimals),
-        )
-        for field, title, meaning, decimals in _CRITERIA
-    ]
+    rows = []
 
+    def shown(value: float | None, decimals: int) -> str:
+        large = value is not None and abs(value) >= 1e7
+        return significant(value) if large else fixed(value, decimals)
 
-def _criterion(criteria: CriteriaResult | None, field: str, decimals: int) -> str:
-    value = None if criteria is None else getattr(criteria, field)
-    if value is None:
-        return MISSING
-    return fixed(value, decimals) if abs(value) < 1e7 else significant(value)
-
-
-def _change(
-    planned: CriteriaResult | None, executed: CriteriaResult, field: str, decimals: int
-) -> str:
-    """Executed minus planned; a log has no meaningful percentage, the others get one."""
-    before = None if planned is None else getattr(planned, field)
-    after = getattr(executed, field)
-    if before is None or after is None or field == "n_samples":
-        return MISSING
-    if field in {"log10_det", "fitness"} or before == 0.0:
-        return fixed(after - before, decimals, sign=True)
-    return fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
+    for name, title, meaning, decimals in _CRITERIA:
+        before = None if planned is None else getattr(planned, name)
+        after = getattr(executed, name)
+        change = MISSING
+        if before is not None and after is not None and name != "n_samples":
+            # A log has no meaningful percentage, the others get one.
+            if name in {"log10_det", "fitness"} or before == 0.0:
+                change = fixed(after - before, decimals, sign=True)
+            else:
+                change = fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
+        rows.append((title, meaning, shown(before, decimals), shown(after, decimals), change))
+    return rows
 
 
 def strongest_pairs(results: Results) -> list[tuple[str, str, float]]:

@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.files import write_together
 from hil.identify.exports import Exports, exports_of
-from hil.identify.summary import consistency_of, essential_of
+from hil.identify.run import consistency_of
 from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
-from identification.selection.essential import EssentialChoice
+from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 
 Array = NDArray[np.float64]
 
+TWO_LINK = (Path(__file__).parents[1] / "identification" / "two_link.urdf").read_text()
 CELL = '[cell]\nname = "arm"\nurdf = "arm.urdf"\n[robot]\n{robot}\n'
 
 
@@ -90,9 +91,8 @@ def identified_arm(
     free = with_block_covariance(estimate(model, training.total, weights), training, weights)
     unseen = sum(held_out, PhaseFactor.zero(model)).total
     consistency = consistency_of(model, training, unseen)
-    essential = essential_of(model, training, held_out)
     assert isinstance(consistency, ConsistencyCheck), consistency
-    assert isinstance(essential, EssentialChoice), essential
+    essential = choose_essential(model, training, held_out)
     return IdentifiedArm(cell, truth, free, consistency, essential)
 
 

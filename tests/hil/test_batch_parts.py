@@ -1,20 +1,31 @@
-"""Parts of the batch by themselves: the cache, sums, keys, workers."""
+"""Parts of a batch by themselves: cache, sums, keys, workers, tables, and remote files."""
 
 from __future__ import annotations
 
+import csv
+import http.server
 import json
+import math
 import os
+import re
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache, partial
 from pathlib import Path
+from typing import Any, ClassVar
 
+import fsspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from isal.isal_zlib import crc32
 
+from hil.batch import remote, table
 from hil.batch.cache import (
     _HEAD,
     _MAGIC,
@@ -28,16 +39,31 @@ from hil.batch.cache import (
     sum_key,
 )
 from hil.batch.factors import BUNDLE, bundles, cached
-from hil.batch.types import ArchiveRef, Broken, CacheError
+from hil.batch.remote import archives_below, is_url, local_file
+from hil.batch.table import TABLES, write_tables
+from hil.batch.types import (
+    ArchiveRef,
+    Arm,
+    BatchResult,
+    Broken,
+    CacheError,
+    LevelEstimate,
+    UnavailableError,
+)
 from hil.batch.workers import ArchiveTask, LocalWorkers, TreeSum
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
+from hil.errors import InputError
 from hil.identify.settings import Settings
+from hil.version import install_command
 from identification.estimators.shrinkage import Shrinkage
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.web_folder import served
+
+from .arm_histories import cell, history, model, steady
 
 KEY = "0123456789abcdef"
 
@@ -249,3 +275,350 @@ def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
     assert "ended its process, twice, with status 3" in broken["dead.mcap"]
     assert "took longer than 4 s" in broken["slow.mcap"]
     assert "ValueError" in broken["wrong.mcap"]
+
+
+# Tables, as other programs read them
+
+DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
+ODD_NAME = 'line "3", spring/\udcff.mcap'
+
+
+@cache
+def result() -> BatchResult:
+    one, other = history(steady, 2, seed=2)
+    undetermined = one.std.copy()
+    undetermined[3] = np.inf
+    repetition = replace(
+        one,
+        level="repetition",
+        archive=ODD_NAME,
+        sha256="ab" * 32,
+        covariance=None,
+        std=undetermined,
+        undetermined=(one.names[3],),
+        when="",
+        warnings=("stood still at first", "two gaps"),
+    )
+    pooled = replace(one, level="pooled", campaign="", unseen_rms=0.1 * one.torque_rms)
+    return BatchResult(
+        estimator="wls",
+        arms={"digest": Arm("digest", cell())},
+        repetitions=(repetition,),
+        campaigns=(one, other),
+        pooled=(replace(pooled, unseen_torque_rms=one.torque_rms),),
+        broken=(Broken("a/torn.mcap", "its footer is missing"),),
+        skipped=(Broken("a/slow.mcap", "holds a validation run"),),
+        read=1,
+        cached=0,
+        code="c0de",
+    )
+
+
+def levels() -> list[LevelEstimate]:
+    found = result()
+    return [*found.repetitions, *found.campaigns, *found.pooled]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tables")
+    write_tables(path, result())
+    return path
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_each_estimate_has_a_row_per_parameter_with_its_numbers_to_the_bit(folder: Path) -> None:
+    rows = rows_of(folder / "parameters.csv")
+    expected = [
+        (level.level, level.campaign, name, value, std)
+        for level in levels()
+        for name, value, std in zip(level.names, level.values, level.std, strict=True)
+    ]
+    found = [
+        (row["level"], row["campaign"], row["parameter"], float(row["value"]), float(row["std"]))
+        for row in rows
+    ]
+    assert found == expected
+
+
+def test_a_row_says_how_sure_it_is_and_where_it_comes_from(folder: Path) -> None:
+    rows = rows_of(folder / "parameters.csv")
+    row, undetermined = rows[0], rows[3]
+    half = levels()[0].interval_factor * float(row["std"])
+    assert float(row["low"]) == pytest.approx(float(row["value"]) - half)
+    assert float(row["high"]) == pytest.approx(float(row["value"]) + half)
+    found = (undetermined["determined"], undetermined["std"], undetermined["high"])
+    assert found == ("false", "inf", "inf")
+    assert row["archive"] == 'line "3", spring/?.mcap'
+    assert row["archive_sha256"] == "ab" * 32
+    assert (row["settings"], row["code"], row["estimator"]) == ("settings", "c0de", "wls")
+    assert re.search(r"\bhil \d", row["software"])
+    assert row["warnings"] == "stood still at first; two gaps"
+    assert row["arm"] == "NS 16-digest" or row["arm"].endswith("-digest")
+
+
+def test_friction_is_of_an_axis_and_inertia_of_none(folder: Path) -> None:
+    rows = {row["parameter"]: row for row in rows_of(folder / "parameters.csv")}
+    assert (rows["f1_3"]["kind"], rows["f1_3"]["axis"]) == ("friction", "joint_3")
+    assert (rows["mc2x"]["kind"], rows["mc2x"]["axis"]) == ("inertial", "")
+
+
+def test_the_relative_error_is_over_all_joints(folder: Path) -> None:
+    rows = rows_of(folder / "parameters.csv")
+    one = result().campaigns[0]
+    weight = one.samples.astype(float)
+    expected = math.sqrt((weight @ one.noise_std**2) / (weight @ one.torque_rms**2))
+    campaign = next(row for row in rows if row["level"] == "campaign")
+    assert float(campaign["relative_error"]) == pytest.approx(expected)
+    assert math.isnan(float(campaign["unseen_relative_error"]))
+    assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
+
+
+def test_each_estimate_has_a_row_per_axis(folder: Path) -> None:
+    rows = rows_of(folder / "axes.csv")
+    assert len(rows) == len(levels()) * model().n_joints
+    assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
+    assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
+
+
+def test_what_was_not_used_is_listed_with_the_reason(folder: Path) -> None:
+    assert rows_of(folder / "not_used.csv") == [
+        {"path": "a/torn.mcap", "kind": "broken", "reason": "its footer is missing"},
+        {"path": "a/slow.mcap", "kind": "skipped", "reason": "holds a validation run"},
+    ]
+
+
+def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    for one in TABLES:
+        read: Any = parquet.read_table(folder / f"{one.name}.parquet")
+        assert read.column_names == list(one.kinds)
+        plain = rows_of(folder / f"{one.name}.csv")
+        typed = read.to_pylist()
+        assert len(plain) == len(typed)
+        for text, row in zip(plain, typed, strict=True):
+            assert all(same(text[name], row[name]) for name in one.csv_columns), text
+
+
+def same(text: str, value: object) -> bool:
+    match value:
+        case None:
+            return text == ""
+        case bool():
+            return text == str(value).lower()
+        case float():
+            return float(text) == value or (math.isnan(float(text)) and math.isnan(value))
+        case datetime():
+            return datetime.fromisoformat(text) == value
+        case _:
+            return text == str(value)
+
+
+def test_parquet_carries_covariances_and_times(folder: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    read: Any = parquet.read_table(folder / "parameters.parquet")
+    rows = [row for row in read.to_pylist() if row["level"] == "campaign"][: model().n_parameters]
+    np.testing.assert_array_equal(
+        [row["covariance"] for row in rows], result().campaigns[0].covariance
+    )
+    assert rows[0]["when"] == datetime(2026, 1, 1, 8, tzinfo=UTC)
+    assert read.column("covariance").to_pylist()[0] is None
+    facts = json.loads(read.schema.metadata[b"hil"])
+    assert facts["schema_version"] == table.SCHEMA_VERSION
+    assert facts["code"] == "c0de"
+
+
+def test_rows_are_written_in_portions(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    monkeypatch.setattr(table, "_PORTION", 7)
+    write_tables(tmp_path, result())
+    path = "parameters.parquet"
+    assert parquet.ParquetFile(tmp_path / path).num_row_groups > 1
+    portions, whole = (parquet.read_table(at / path).to_pylist() for at in (tmp_path, folder))
+    assert repr(portions) == repr(whole)
+
+
+def test_without_pyarrow_there_is_csv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table, "has_parquet", lambda: False)
+    written = write_tables(tmp_path, result())
+    assert [path.name for path in written] == [f"{one.name}.csv" for one in TABLES]
+
+
+def test_a_table_that_cannot_be_finished_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_tables(tmp_path, result())
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    bad = replace(result(), arms={})
+    with pytest.raises(KeyError):
+        write_tables(tmp_path, bad)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_every_column_is_documented_and_no_other() -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    for one in TABLES:
+        part = text.split(f"### `{one.name}`")[1].split("###")[0]
+        rows = re.findall(r"^\| (`.+?`(?:, `.+?`)*) \|", part, flags=re.MULTILINE)
+        assert re.findall(r"`(\w+)`", " ".join(rows)) == list(one.kinds)
+
+
+# Archives behind an address
+
+CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
+ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
+
+
+@pytest.fixture(autouse=True)
+def _patient_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "_PAUSES", (0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def store_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("store")
+    for name, content in CONTENT.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(content)
+    return root
+
+
+@pytest.fixture(scope="module")
+def web(store_folder: Path) -> Iterator[str]:
+    with served(store_folder) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def memory() -> str:
+    store = fsspec.filesystem("memory")
+    for name, content in CONTENT.items():
+        store.pipe(f"/store/{name}", content)
+    return "memory://store"
+
+
+@pytest.fixture(params=["web", "memory", "file"])
+def root(request: pytest.FixtureRequest, store_folder: Path) -> str:
+    """The same files in three kinds of store."""
+    if request.param == "file":
+        return store_folder.as_uri()
+    return str(request.getfixturevalue(request.param))
+
+
+def test_every_archive_below_an_address_is_found_in_order(root: str) -> None:
+    found = [url for url, _ in archives_below(root)]
+    assert len(found) == len(ARCHIVES)
+    for url, name in zip(found, ARCHIVES, strict=True):
+        assert is_url(url)
+        assert url.endswith(f"/{name}")
+
+
+def test_an_archive_is_found_by_its_own_address(root: str) -> None:
+    ((url, _),) = archives_below(f"{root}/{ARCHIVES[0]}")
+    assert url.endswith(ARCHIVES[0])
+
+
+def test_what_is_found_is_fetched_to_the_byte_and_removed(root: str) -> None:
+    for (url, _), name in zip(archives_below(root), ARCHIVES, strict=True):
+        with local_file(url) as path:
+            assert path.name == Path(name).name
+            assert path.read_bytes() == CONTENT[name]
+        assert not path.parent.exists()
+
+
+def test_a_version_is_that_of_the_content_or_none(
+    memory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = f"{memory}/{ARCHIVES[0]}"
+    assert archives_below(address)[0][1] == ""
+    store = fsspec.get_filesystem_class("memory")
+    plain = store.info
+    monkeypatch.setattr(store, "info", lambda *path: plain(*path) | {"ETag": '"5f3"'})
+    assert archives_below(address)[0][1] == '"5f3"'
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("memory://store/absent.mcap", "is not there"),
+        ("http://127.0.0.1:9/x.mcap", "(Cannot connect|its server does not answer)"),
+        ("nosuch://store/x.mcap", "Protocol not known: nosuch"),
+    ],
+)
+def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"{address}.*{message}"):
+        archives_below(address)
+    with pytest.raises(InputError, match=f"{address}.*{message}"), local_file(address):
+        pass
+
+
+class _Busy(http.server.SimpleHTTPRequestHandler):
+    """Refuses the first so many requests for a file."""
+
+    refusals: ClassVar[list[int]] = []
+    asked: ClassVar[list[str]] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        if self.refusals:
+            self.send_error(self.refusals.pop())
+        else:
+            super().do_GET()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def busy(store_folder: Path) -> Iterator[str]:
+    _Busy.asked.clear()
+    handler = partial(_Busy, directory=str(store_folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_server_that_is_busy_is_asked_again(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [503, 429])
+    with local_file(f"{busy}/{ARCHIVES[0]}") as path:
+        assert path.read_bytes() == CONTENT[ARCHIVES[0]]
+    assert len(_Busy.asked) == 3
+
+
+def test_a_server_that_stays_busy_is_given_up(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [503] * 10)
+    with pytest.raises(UnavailableError, match="503"), local_file(f"{busy}/{ARCHIVES[0]}"):
+        pass
+    assert len(_Busy.asked) == 3
+
+
+def test_what_a_server_does_not_give_is_asked_for_once(
+    busy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Busy, "refusals", [403])
+    with pytest.raises(UnavailableError, match="403"), local_file(f"{busy}/{ARCHIVES[0]}"):
+        pass
+    with pytest.raises(UnavailableError, match="not there"), local_file(f"{busy}/absent.mcap"):
+        pass
+    assert len(_Busy.asked) == 2
+
+
+def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
+        archives_below("memory://store")
+
+
+def test_a_path_is_no_address() -> None:
+    assert is_url("s3://bucket/campaign")
+    assert not is_url("/data/campaign")
+    assert not is_url("C:/data")

@@ -5,13 +5,17 @@ from __future__ import annotations
 import base64
 import csv
 import hashlib
+import html as html_module
 import io
 import json
 import math
 import re
+import shutil
+import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -22,22 +26,36 @@ from hypothesis import strategies as st
 from matplotlib.image import imread
 from pydantic import ValidationError
 
+from hil.identify.summary import consistency_result, essential_result
 from hil.report import (
     ReportSeries,
     SeriesError,
     csv_tables,
+    figures,
     numbers,
+    page,
     render_report,
     report_bytes,
 )
-from hil.report.drawing import thinned
-from hil.report.figures import correlation_matrix
-from hil.report.page import joint_errors
-from hil.results import Results
+from hil.report.drawing import FIRST, MOST_POINTS, Plot, Trace, thinned, traces_text
+from hil.report.rendering import environment
+from hil.results import BlindResult, ChoiceResult, ParameterResult, Results
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
+from .identified_arm import TWO_LINK, IdentifiedArm, identified_arm
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 JOINTS = [f"joint_{j}" for j in range(1, 7)]
 TORQUE = np.array([496.0, 643.0, 158.0, 17.0, 23.0, 20.0])  # RMS of a fast motion, N·m
+
+N = len(JOINTS)
+FITTED = {
+    "relative_error": [0.02] * N,
+    "overall_relative_error": 0.021,
+    "all_rows_relative_error": 0.043,
+    "all_rows_joint_errors": [0.05] * N,
+}
+HOSTILE = '$\\frac$\x07"><script>alert(1)</script><img src=x onerror=alert(2)>--></svg>{{7*7}}'
 
 
 # fmt: off
@@ -225,267 +243,518 @@ def assert_inert(page: Page) -> None:
     assert not [name for _, a in page.tags for name in a if name.startswith("on")]
 
 
-@pytest.fixture(scope="module")
-def html() -> str:
-    return render_report(make_results(), make_series())
+def full_series() -> ReportSeries:
+    """A series with everything that figures need."""
+    bare = make_series(samples=2000)
+    k = bare.example_time.size
+    rng = np.random.default_rng(5)
+    fitted = np.ones((2000, N))
+    fitted[:500] = 0.0
+    fitted[1000:1100, 0] = 0.0
+    counted = np.ones((k, N))
+    counted[-100:] = 0.0
+    split = {
+        f"example_{part}": share * bare.example_predicted
+        for part, share in (("gravity", 0.6), ("inertia", 0.2), ("coriolis", 0.05))
+    }
+    speed = rng.uniform(-1.0, 1.0, (300, N))
+    law_speed = np.repeat(np.linspace(-1.0, 1.0, 40)[:, None], N, axis=1)
+    travel = np.repeat(np.linspace(0.0, 6e-4, 30)[:, None], N, axis=1)
+    travel[:, 1] = np.nan
+    frequency = np.geomspace(0.25, 100.0, 80)
+    density = TORQUE / (1.0 + frequency[:, None])
+    return replace(
+        bare,
+        excitation_fitted=fitted,
+        example_used=counted,
+        example_friction=0.15 * bare.example_predicted,
+        **split,
+        friction_speed=speed,
+        friction_torque=0.1 * TORQUE * (np.sign(speed) + speed),
+        law_speed=law_speed,
+        law_torque=0.1 * TORQUE * (np.sign(law_speed) + law_speed),
+        reversal_travel=travel,
+        reversal_torque=0.1 * TORQUE * (1.0 - 2.0 * np.exp(-travel / 1e-4)),
+        spectrum_frequency=frequency,
+        spectrum_torque=density,
+        spectrum_residual=0.1 * density,
+        motion_bandwidth=np.full(N, 10.0),
+    )
+
+
+def many_choices() -> list[dict[str, object]]:
+    errors = [0.5, *(0.2 + 0.01 * k for k in range(9)), None]
+    return [
+        {"name": "bandwidth of the motion", "candidates": ["10 Hz", "5 Hz"],
+         "errors": [0.0612, 0.0655], "chosen": 0},
+        {"name": "estimator",
+         "candidates": ["least squares", *(f"ridge {k}" for k in range(9)), "failed"],
+         "errors": errors, "chosen": 1},
+    ]  # fmt: skip
+
+
+def conduct(**changes: Any) -> dict[str, Any]:
+    """A campaign of two repetitions, one of them run twice, after a warm-up of three motions."""
+    archive = {
+        "kind": "excitation", "when": "2026-03-01T08:00:00+00:00", "seconds": 9.7, "cycles": 4870,
+        "missed": 0, "late": 0, "not_accepted": 0, "lost": 0, "outcome": "completed", "why": "",
+    }  # fmt: skip
+    return {
+        "steps": [
+            {"step": "rehearsal", "done": True, "words": "6 of 6 criteria passed", "details": []},
+            {"step": "dry run", "done": True, "words": "accepted by ada", "details": ["2 late"]},
+        ],
+        "warm_up": {
+            "verdict": "warm",
+            "threshold": 0.002,
+            "friction": [[60.0 - k - j if j else None for j in range(6)] for k in range(3)],
+            "change": [None, 0.02, 0.0015],
+        },
+        "recorded": [
+            archive | {"archive": "excitation_000_a1.mcap", "missed": 3},
+            archive
+            | {"archive": "excitation_001_a1.mcap", "outcome": "rejected", "why": "it was held"},
+            archive | {"archive": "excitation_001_a2.mcap"},
+        ],
+    } | changes
+
+
+def traces_in(html: str) -> list[dict[str, Any]]:
+    return [json.loads(html_module.unescape(t)) for t in re.findall(r'data-traces="([^"]*)"', html)]
+
+
+def shaded_in(svg: str) -> list[list[list[float]]]:
+    return [plot["shaded"] for plot in traces_in(svg)[0]["plots"]]
+
+
+def decoded(line: dict[str, Any]) -> np.ndarray:
+    counts = np.frombuffer(base64.b64decode(line["data"]), "<u2")
+    return np.asarray(line["low"] + line["step"] * counts)
 
 
 @pytest.fixture(scope="module")
-def page(html: str) -> Page:
+def results() -> Results:
+    """Of a campaign, with everything that a page can show."""
+    runs = [run.model_dump() for run in make_results().validation]
+    runs = [run | {"all_rows_joint_errors": [0.06] * N} for run in runs]
+    return make_results(choices=many_choices(), fitted=FITTED, validation=runs, conduct=conduct())
+
+
+@pytest.fixture(scope="module")
+def html(results: Results) -> str:
+    return render_report(results, full_series())
+
+
+@pytest.fixture(scope="module")
+def whole(html: str) -> Page:
     return Page(html)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("noise_std", [1.0]),
-        ("correlation", [[1.0]]),
-        ("repetition_values", [[1.0]]),
-        ("joint_names", ["one"]),
-    ],
-)
-def test_lists_that_do_not_fit_are_no_results(field: str, value: object) -> None:
-    with pytest.raises(ValidationError, match=r"has \d+ entries and not \d+"):
-        make_results(**{field: value})
+@pytest.fixture(scope="module")
+def recording() -> Page:
+    return Page(render_report(real_recording(), make_series()))
 
 
-def test_the_verdict_comes_before_everything_else(html: str) -> None:
-    line = html.index("predicts unseen motion to 1.5 % of the torque")
-    assert line < html.index("SIMULATED") < html.index("What was run") < html.index("Figure 1")
+def rendered(results: Results) -> Page:
+    return Page(render_report(results, make_series(samples=200)))
 
 
-@pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
-def test_the_verdict_is_a_word_and_a_symbol_not_only_a_colour(good: bool, word: str) -> None:
-    verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
-    text = render_report(make_results(verdict=verdict), make_series())
-    card = text[text.index('<section class="verdict') :].split("</section>")[0]
-    assert Page(card).text == f"{word} So it is. because"
-    assert 'class="badge"' in card
+class TestPage:
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("noise_std", [1.0]),
+            ("correlation", [[1.0]]),
+            ("repetition_values", [[1.0]]),
+            ("joint_names", ["one"]),
+        ],
+    )
+    def test_needs_lists_that_fit(self, field: str, value: object) -> None:
+        with pytest.raises(ValidationError, match=r"has \d+ entries and not \d+"):
+            make_results(**{field: value})
+
+    def test_has_the_verdict_first_and_details_folded(self, html: str) -> None:
+        order = ["predicts unseen motion to 1.5 % of the torque", "SIMULATED",
+                 "Torque error over all joints", 'id="friction"', 'id="parameters"', 'id="trust"',
+                 '<details id="appendix">', 'id="run"', 'id="excitation"', 'id="estimation"',
+                 'id="uncertainty"', 'id="correlation"', 'id="validation"']  # fmt: skip
+        places = [html.index(mark) for mark in order]
+        assert places == sorted(places)
+        assert places[0] < html.index("Figure 1")
+        assert html.rindex("</details>") > places[-1]
+
+    @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
+    def test_has_a_word_and_a_symbol_for_the_verdict(self, good: bool, word: str) -> None:
+        verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
+        text = render_report(make_results(verdict=verdict), make_series(samples=200))
+        card = text[text.index('<section class="verdict') :].split("</section>")[0]
+        assert Page(card).text == f"{word} So it is. because"
+        assert 'class="badge"' in card
+
+    def test_says_what_was_simulated(self, whole: Page, recording: Page) -> None:
+        assert "SIMULATED. No robot moved" in whole.text
+        assert all(effect in whole.text for effect in make_results().effects)
+        assert "best case" not in whole.text
+        assert "best case" in rendered(make_results(effects=[])).text
+        assert not {"simulated", "truth:", "planned"} & set(recording.text.lower().split())
+        assert not any("Truth" in rows[0] for rows in recording.tables)
+        assert len(recording.table("Estimate")) == 58
+
+    def test_stands_alone(self, html: str) -> None:
+        assert_stands_alone(html)
+        assert len(set(re.findall(r'(?:href="|url\()#([^")]*)', html))) > 50
+        assert len(html.encode()) < 2_000_000
+
+    def test_has_the_same_bytes_whoever_draws(self) -> None:
+        settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
+        series = make_series(samples=200)
+        with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
+            pages = list(pool.map(lambda _: report_bytes(make_results(), series), range(2)))
+            assert {key: mpl.rcParams[key] for key in settings} == settings
+        assert set(pages) == {report_bytes(make_results(), series)}
+
+    def test_stays_small(self) -> None:
+        runs = [make_results().validation[0].model_dump() for _ in range(30)]
+        text = render_report(make_results(validation=runs), make_series(samples=40_000))
+        assert len(text.encode()) < 1_500_000
+
+    def test_starts_nothing_that_an_archive_is_called(self, results: Results) -> None:
+        def spoil(value: Any) -> Any:
+            if isinstance(value, list):
+                return [spoil(v) for v in value]
+            if isinstance(value, dict):
+                end = HOSTILE if "hil" in value else ""  # the keys of `software` are names too
+                return {k + end: spoil(v) for k, v in value.items()}
+            # The route is one of four words: nothing else gets past the schema.
+            hostile = isinstance(value, str) and value != "phase_clustered"
+            return value + HOSTILE if hostile else value
+
+        spoilt = Results.model_validate(spoil(results.model_dump()))
+        found = Page(render_report(spoilt, make_series(samples=200, name="v" + HOSTILE)))
+        assert_inert(found)
+        assert "{{7*7}}" in found.text
+        assert "<script>alert(1)</script>" in found.text
+
+    def test_describes_and_numbers_each_figure(self, whole: Page, html: str) -> None:
+        drawn = [a for tag, a in whole.tags if tag == "svg" and a.get("role") == "img"]
+        assert all(len(a["aria-label"] or "") > 30 for a in drawn)
+        assert sum(tag == "h1" for tag, _ in whole.tags) == 1
+        assert sum(tag == "caption" for tag, _ in whole.tags) == len(whole.tables)
+        for kind, count in (("Figure", 8), ("Table", len(whole.tables))):
+            found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
+            assert found == [str(k) for k in range(1, count + 1)]
+
+    def test_has_every_colour_from_the_style_sheet(self, html: str) -> None:
+        assert not re.findall(r"(?:fill|stroke): *#[0-9a-f]{3,6}", html[html.index("<main>") :])
+        declared = set(re.findall(r"(--[a-z0-9-]+):", html))
+        assert set(re.findall(r"var\((--[a-z0-9-]+)\)", html)) <= declared
+
+    def test_of_one_joint_without_friction_or_validation_is_made_too(self) -> None:
+        whole, empty = real_recording(), np.empty((0, 1))
+        executed = _criteria(1.0, 1.0) | {"condition": math.inf}
+        # fmt: off
+        alone = whole.model_dump() | {
+            "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
+            "correlation": [[1.0]], "noise_std": [0.1], "validation": [], "fitted": None,
+            "repetition_values": [[1.0] for _ in whole.repetitions],
+            "uncertainty": whole.uncertainty.model_dump() | {"least_squares": [math.nan]},
+            "excitation": whole.excitation.model_dump() | {"executed": executed},
+        }
+        # fmt: on
+        none = {"example_time": empty[:, 0], "example_measured": empty, "example_predicted": empty}
+        series = replace(make_series(joints=1), **none)
+        found = Page(render_report(Results.model_validate(alone), series))
+        assert "Nothing was held out" in found.text
+
+    def test_turns_no_other_text_round_by_a_name(self) -> None:
+        text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
+        name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
+        shown = text.render(name=name, same=same, number=3)
+        assert shown == r"a\u202eb\x1b[31m\u2066c\x7f" + f"|{same}|3"
 
 
-def test_a_simulation_says_so_and_what_the_plant_did_besides(page: Page) -> None:
-    assert "SIMULATED. No robot moved" in page.text
-    assert all(effect in page.text for effect in make_results().effects)
-    assert "best case" not in page.text
-    ideal = Page(render_report(make_results(effects=[]), make_series()))
-    assert "best case" in ideal.text
+class TestEstimation:
+    """How the estimate was made."""
+
+    def test_is_described_with_what_stands_behind_it(self, whole: Page, results: Results) -> None:
+        assert results.endogeneity is not None
+        for words in (
+            results.estimator.words,
+            results.estimator.grouping,
+            results.notes[0],
+            results.endogeneity.sentence,
+            "58 of 58 parameters were learned from the data",
+        ):
+            assert words in whole.text
+
+    def test_names_what_was_not_tested_or_believed(self) -> None:
+        whole, recording = make_results(), real_recording()
+        estimator = whole.estimator.model_copy(update={"prior": "the URDF gives no inertia"})
+        parameters = [p.model_copy(update={"learned": None}) for p in recording.parameters]
+        update = {"estimator": estimator, "parameters": parameters}
+        text = rendered(recording.model_copy(update=update)).text
+        assert "The recordings hold no commanded positions." in text
+        assert "Nothing: the URDF gives no inertia." in text
+
+    def test_shows_the_chosen_candidate_and_the_best(self, results: Results, whole: Page) -> None:
+        estimator = results.choices[1]
+        words = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
+        assert words == ["least squares", *(f"ridge {k}" for k in range(5))]
+        worst = ChoiceResult(
+            name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7
+        )
+        assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
+        assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
+        assert "✓ ridge 0 20.00" in whole.text and "least squares 50.00" in whole.text
+        assert whole.text.count("Inner prediction:") == 1
+        assert "Inner prediction" not in rendered(make_results()).text
 
 
-def test_a_real_recording_is_not_called_simulated_and_has_no_truth() -> None:
-    page = Page(render_report(real_recording(), make_series()))
-    assert not {"simulated", "truth:", "planned"} & set(page.text.lower().split())
-    assert not any("Truth" in rows[0] for rows in page.tables)
-    assert len(page.table("Estimate")) == 58
+class TestParameters:
+    def test_stand_in_a_table(self, whole: Page, results: Results) -> None:
+        rows, parameters = whole.table("Estimate"), results.parameters
+        assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
+        for row, p in zip(rows, parameters, strict=True):
+            half = 0.06 * p.std  # numbers are rounded at the second digit of std
+            assert float(row["Estimate"]) == pytest.approx(p.estimate, abs=half)
+            assert float(row["Truth"]) == pytest.approx(p.truth, abs=half)
+            assert float(row["± std"]) == pytest.approx(p.std, rel=0.06)
+            assert float(row["95 % from"]) == pytest.approx(p.estimate - 2.05 * p.std, abs=half)
+            assert float(row["95 % to"]) == pytest.approx(p.estimate + 2.05 * p.std, abs=half)
+            z = (p.estimate - p.truth) / p.std
+            assert float(row["(est. − truth) / std"]) == pytest.approx(z, abs=0.0051)
+            assert float(row["Std over rep."]) == pytest.approx(p.repetition_std, rel=0.06)
+
+    def test_that_are_off_or_not_significant_are_marked(self) -> None:
+        cases = [
+            (10.0, 8.1, ""), (10.0, 7.9, "▲ outside 2σ"), (10.0, 13.1, "■ outside 3σ"),
+            (1.9, 1.0, "○ not significant"), (1.9, 5.0, "■ outside 3σ, ○ not significant"),
+        ]  # fmt: skip
+        parameters = [p.model_dump() for p in make_results().parameters]
+        for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
+            parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
+        found = rendered(make_results(parameters=parameters))
+        remarks = [row["Remark"].replace("\xa0", " ") for row in found.table("Estimate")]
+        assert remarks[: len(cases)] == [remark for *_, remark in cases]
+
+    def test_have_routes_to_their_deviation(self, whole: Page, results: Results) -> None:
+        rows = {row["Route"]: row for row in whole.table("Route")}
+        assert [name.endswith("(reported)") for name in rows] == [False, False, True, False]
+        pairs = zip(results.parameters, results.uncertainty.least_squares, strict=True)
+        inside = sum(abs(p.estimate - p.truth) <= 2.0 * std for p, std in pairs)
+        assert rows["Least squares"]["Truth within 2σ"] == f"{inside} of 58"
+        uncertainty = results.uncertainty.model_dump()
+        uncertainty |= {"posterior": uncertainty["phase_clustered"], "phase_clustered": None}
+        posterior = rendered(make_results(uncertainty=uncertainty | {"reported": "posterior"}))
+        assert "Posterior (reported)" in posterior.text
+        assert "Phase-clustered" not in posterior.text
+
+    def test_have_a_matrix_of_correlation_from_white_to_black(self, results: Results) -> None:
+        svg = figures.correlation_matrix(results).svg
+        image = re.findall(r"data:image/png;base64,([^\"]*)", svg)[0]
+        pixels = imread(io.BytesIO(base64.b64decode(image)))[..., :3]
+        assert pixels.shape == (40, 40, 3)
+        expected = np.abs(np.array(results.correlation)[:40, :40])
+        np.testing.assert_allclose(1.0 - pixels.mean(axis=2), expected, atol=0.02)
 
 
-def test_the_report_stands_alone(html: str) -> None:
-    assert_stands_alone(html)
-    assert len(set(re.findall(r'(?:href="|url\()#([^")]*)', html))) > 50
+class TestErrors:
+    """Of the torque: of every run, over all runs, and over every row beside that of the verdict."""
+
+    def test_over_runs_are_those_of_all_their_samples(self) -> None:
+        rng = np.random.default_rng(1)
+        errors = [s * rng.standard_normal((size, 6)) for s, size in ((1.0, 400), (3.0, 100))]
+        keys = ("duration", "rms_error", "mean_error")
+        found = [(0.01 * len(e), (e**2).mean(axis=0) ** 0.5, e.mean(axis=0)) for e in errors]
+        runs = [_validation(rng, 1) | dict(zip(keys, values, strict=True)) for values in found]
+        every = np.concatenate(errors)
+        for j, row in enumerate(page.joint_errors(make_results(validation=runs))):
+            assert row["rms"] == pytest.approx(math.sqrt((every[:, j] ** 2).mean()))
+            assert row["mean"] == pytest.approx(every[:, j].mean())
+
+    def test_stand_for_every_run_and_joint(self, whole: Page, results: Results) -> None:
+        tables = [rows for rows in whole.tables if rows[0][0] == "Archive"]
+        assert len(tables) == 5
+        for rows in tables:
+            assert [row[0] for row in rows[1:]] == [run.archive for run in results.validation]
+        third, fifth = results.validation[2], results.validation[4]
+        assert float(tables[2][3][2 + 4]) == pytest.approx(third.mean_error[4], abs=6e-4)
+        overall = 100.0 * fifth.overall_relative_error
+        assert float(tables[3][5][-1]) == pytest.approx(overall, rel=0.006)
+
+    def test_are_of_unseen_and_fitted_motion(self, results: Results, html: str) -> None:
+        median, worst, fitted = page.error_rows(results)
+        assert fitted == ("fitted", 0.021, 0.043)
+        assert median[2] == pytest.approx(0.05) == worst[2]
+        assert worst[1] is not None and median[1] is not None
+        assert worst[1] >= median[1] > 0.0
+        assert "median of 12 runs" in median[0]
+        head = Page(html[: html.index("<main>")])
+        assert [row["Motion"] for row in head.table("Every row [%]")][-1] == "fitted"
+        assert Page(html).text.count("standstill and reversals included") == 1
+
+    def test_over_every_row_stand_beside_each_joint(self, results: Results) -> None:
+        assert page.every_row_errors(results) == [0.06] * N
+        assert page.every_row_errors(make_results()) == []
+        assert all("every row 6.00 %" in one.error for one in figures.joints_of(results))
+
+    def test_are_those_of_the_fit_where_nothing_was_held_out(self) -> None:
+        alone = make_results(fitted=FITTED, validation=[], repetitions=["log.mcap"])
+        (row,) = page.error_rows(alone)
+        assert "in-sample" in row[0]
+        assert figures.joints_of(alone)[0].error == "error 2.00 %, every row 5.00 %"
 
 
-def test_the_same_input_gives_the_same_bytes_whoever_draws(html: str) -> None:
-    settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
-    with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
-        pages = list(pool.map(lambda _: report_bytes(make_results(), make_series()), range(2)))
-        assert {key: mpl.rcParams[key] for key in settings} == settings
-    assert set(pages) == {html.encode()}
+class TestFigures:
+    """Friction, split and spectra of each joint; rows that do not count are shaded."""
+
+    def test_shade_rows_to_midway_to_the_next(self, results: Results) -> None:
+        series, joints = full_series(), figures.joints_of(results)
+        first, second = (shaded_in(p.svg)[0] for p in figures.excitation_panels(series, JOINTS)[:2])
+        assert first == [[0.0, pytest.approx(0.999)], [pytest.approx(1.999), pytest.approx(2.199)]]
+        assert second == [[0.0, pytest.approx(0.999)]]
+        end = float(series.example_time[-1] - series.example_time[0])
+        for panels, plots in (
+            (figures.torque_panels(series, joints), 2),
+            (figures.split_panels(series, joints), 1),
+        ):
+            assert shaded_in(panels[0].svg) == [[[pytest.approx(end - 0.199), end]]] * plots
+        assert shaded_in(figures.excitation_panels(make_series(), JOINTS)[0].svg) == [[], []]
+
+    def test_show_every_joint_whose_series_are_there(self, results: Results) -> None:
+        series, joints = full_series(), figures.joints_of(results)
+        series.law_speed[:, 2] = 0.0  # it never moved
+        for made, expected in (
+            (figures.friction_curve_panels, [*JOINTS[:2], *JOINTS[3:]]),
+            (figures.split_panels, JOINTS),
+            (figures.spectrum_panels, JOINTS),
+        ):
+            assert [one.title for one in made(series, joints)] == expected
+            assert not made(make_series(), joints)
+
+    def test_show_friction_at_a_reversal_and_row_by_row(self, results: Results) -> None:
+        panels = figures.friction_curve_panels(full_series(), figures.joints_of(results))
+        assert "at reversal" in panels[0].svg and "travel [mrad]" in panels[0].svg
+        assert "at reversal" not in panels[1].svg
+        longest = max(re.findall(r' d="([^"]*)"', panels[1].svg), key=len)
+        assert longest.count("M") == 300
+
+    def test_name_the_largest_part_and_the_power_above(self, results: Results) -> None:
+        series, joints = full_series(), figures.joints_of(results)
+        assert figures.split_panels(series, joints)[0].note.startswith("largest: gravity")
+        assert "power above 10 Hz" in figures.spectrum_panels(series, joints)[0].note
+
+    @pytest.mark.parametrize(
+        ("field", "values"),
+        [
+            ("excitation_velocity", np.zeros((3, 6))),
+            ("excitation_fitted", np.ones((3, 6))),
+            ("friction_torque", np.ones((7, 6))),
+            ("spectrum_residual", np.ones((80, 2))),
+            ("motion_bandwidth", np.full(6, np.inf)),
+        ],
+    )
+    def test_refuse_series_that_do_not_fit_by_name(self, field: str, values: np.ndarray) -> None:
+        with pytest.raises(SeriesError, match=field):
+            replace(full_series(), **{field: values})
+        with pytest.raises(SeriesError):
+            render_report(make_results(), make_series(joints=5))
 
 
-def test_a_full_campaign_stays_small() -> None:
-    runs = [make_results().validation[0].model_dump() for _ in range(30)]
-    text = render_report(make_results(validation=runs), make_series(samples=40_000))
-    assert len(text.encode()) < 1_500_000
+class TestZoom:
+    """Samples of plots over time, for the page's script."""
+
+    def test_is_of_the_series(self) -> None:
+        series = make_series(samples=2000)
+        panels = figures.torque_panels(series, figures.joints_of(make_results()))
+        assert all(one.svg.count("<path") > 4 for one in panels)  # to be seen without it
+        for j, content in enumerate(traces_in("".join(one.svg for one in panels))):
+            time = series.example_time - series.example_time[0]
+            assert content["end"] == pytest.approx(time[-1])
+            upper, lower = content["plots"]
+            measured, predicted = (decoded(line) for line in upper["lines"])
+            grid = np.linspace(0.0, content["end"], len(measured))
+            for found, wanted in (
+                (measured, series.example_measured[:, j]),
+                (predicted, series.example_predicted[:, j]),
+            ):
+                step = np.ptp(wanted) / 65534.0
+                np.testing.assert_allclose(found, np.interp(grid, time, wanted), atol=step)
+            (error,) = (decoded(line) for line in lower["lines"])
+            np.testing.assert_allclose(error, measured - predicted, atol=np.ptp(measured) / 2e4)
+
+    @pytest.mark.parametrize("samples", [2, 100, 50_000])
+    def test_has_no_more_points_than_a_reader_can_use(self, samples: int) -> None:
+        values = np.sin(np.arange(float(samples)))
+        plot = Plot((0.0, 0.0, 1.0, 1.0), "x", [Trace(values, FIRST, 1.0, "x")])
+        (content,) = json.loads(traces_text(np.arange(float(samples)), [plot]))["plots"]
+        assert len(decoded(content["lines"][0])) == min(samples, MOST_POINTS)
+        assert traces_text(np.zeros(1), []) == "" == traces_text(np.zeros(0), [])
+
+    @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
+    def test_thinning_leaves_order_ends_and_every_peak(
+        self, values: list[float], bins: int
+    ) -> None:
+        time, signal = np.arange(float(len(values))), np.array(values)
+        thin_time, thin = thinned(time, signal, bins)
+        assert thin.size <= 2 * bins + 2
+        assert np.all(np.diff(thin_time) > 0)
+        assert (thin_time[0], thin_time[-1]) == (time[0], time[-1])
+        assert (thin.min(), thin.max()) == (signal.min(), signal.max())
 
 
-HOSTILE = '$\\frac$\x07"><script>alert(1)</script><img src=x onerror=alert(2)>--></svg>{{7*7}}'
+class TestConduct:
+    """How the campaign was run."""
+
+    def test_is_shown_with_what_was_run_again_and_why(self, whole: Page) -> None:
+        text = whole.text
+        assert "How it was run" in text
+        assert "6 of 6 criteria passed" in text and "Accepted by ada" in text and "2 late" in text
+        assert "Repetition 2 ( excitation_001_a1.mcap ) rejected: it was held" in text
+        assert "3 packets missed (205 in a million)" in text
+        rows = whole.table("Recorded as")
+        assert [row["Outcome"] for row in rows] == ["completed", "▲ rejected", "completed"]
+        assert [row["Missed"] for row in rows] == ["3", "0", "0"]
+        assert "0.15 %, at most 0.2 % wanted" in text
+        assert "not warm" not in text
+
+    def test_may_be_missing_or_empty(self) -> None:
+        assert "How it was run" not in rendered(make_results()).text
+        text = rendered(make_results(conduct=conduct(warm_up=None, recorded=[]))).text
+        assert "No archive could be read" in text and "Warm-up" not in text
+
+    def test_says_that_an_arm_did_not_get_warm(self) -> None:
+        cold = conduct()
+        cold["warm_up"] |= {"verdict": "not warm"}
+        words = {"done": False, "words": "not warm after 3 motions", "details": ["still 1.3%"]}
+        cold["steps"] = [{"step": "warm-up", **words}]
+        text = rendered(make_results(conduct=cold)).text
+        assert "▲ Not warm after 3 motions" in text and "still 1.3%" in text
+        assert "the arm was not warm when the repetitions began" in text
+
+    def test_survives_results_json(self, results: Results, tmp_path: Path) -> None:
+        results.save(tmp_path / "results.json")
+        assert Results.load(tmp_path / "results.json") == results
 
 
-def test_names_from_archives_are_inert() -> None:
-    def spoil(value: Any) -> Any:
-        if isinstance(value, list):
-            return [spoil(v) for v in value]
-        if isinstance(value, dict):
-            end = HOSTILE if "hil" in value else ""  # the keys of `software` are names too
-            return {k + end: spoil(v) for k, v in value.items()}
-        # The route is one of four words: nothing else gets past the schema.
-        hostile = isinstance(value, str) and value != "phase_clustered"
-        return value + HOSTILE if hostile else value
+class TestNumbers:
+    @given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e9))
+    def test_read_back_as_what_they_were(self, value: float, std: float) -> None:
+        assert float(numbers.significant(value)) == pytest.approx(value, rel=0.0051)
+        assert abs(float(numbers.beside(value, std)) - value) <= 0.06 * std + 1e-9 * abs(value)
 
-    spoilt = Results.model_validate(spoil(make_results().model_dump()))
-    page = Page(render_report(spoilt, make_series(name="v" + HOSTILE)))
-    assert_inert(page)
-    assert "{{7*7}}" in page.text
-    assert "<script>alert(1)</script>" in page.text
-
-
-def test_the_parameter_table_holds_the_numbers(page: Page) -> None:
-    rows = page.table("Estimate")
-    parameters = make_results().parameters
-    assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
-    for row, p in zip(rows, parameters, strict=True):
-        half = 0.06 * p.std  # numbers are rounded at the second digit of std
-        assert float(row["Estimate"]) == pytest.approx(p.estimate, abs=half)
-        assert float(row["Truth"]) == pytest.approx(p.truth, abs=half)
-        assert float(row["± std"]) == pytest.approx(p.std, rel=0.06)
-        assert float(row["95 % from"]) == pytest.approx(p.estimate - 2.05 * p.std, abs=half)
-        assert float(row["95 % to"]) == pytest.approx(p.estimate + 2.05 * p.std, abs=half)
-        z = (p.estimate - p.truth) / p.std
-        assert float(row["(est. − truth) / std"]) == pytest.approx(z, abs=0.0051)
-        assert float(row["Std over rep."]) == pytest.approx(p.repetition_std, rel=0.06)
-
-
-def test_estimates_that_are_off_or_not_significant_are_marked() -> None:
-    cases = [
-        (10.0, 8.1, ""), (10.0, 7.9, "▲ outside 2σ"), (10.0, 13.1, "■ outside 3σ"),
-        (1.9, 1.0, "○ not significant"), (1.9, 5.0, "■ outside 3σ, ○ not significant"),
-    ]  # fmt: skip
-    parameters = [p.model_dump() for p in make_results().parameters]
-    for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
-        parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
-    page = Page(render_report(make_results(parameters=parameters), make_series()))
-    remarks = [row["Remark"].replace("\xa0", " ") for row in page.table("Estimate")]
-    assert remarks[: len(cases)] == [remark for *_, remark in cases]
-
-
-def test_the_page_says_which_route_is_reported_and_what_each_would_have_covered(page: Page) -> None:
-    rows, results = {row["Route"]: row for row in page.table("Route")}, make_results()
-    assert [name.endswith("(reported)") for name in rows] == [False, False, True, False]
-    pairs = zip(results.parameters, results.uncertainty.least_squares, strict=True)
-    inside = sum(abs(p.estimate - p.truth) <= 2.0 * std for p, std in pairs)
-    assert rows["Least squares"]["Truth within 2σ"] == f"{inside} of 58"
-
-
-def test_the_correlation_matrix_is_shaded_from_white_to_black_without_friction() -> None:
-    results = make_results()
-    image = re.findall(r"data:image/png;base64,([^\"]*)", correlation_matrix(results).svg)[0]
-    pixels = imread(io.BytesIO(base64.b64decode(image)))[..., :3]
-    assert pixels.shape == (40, 40, 3)
-    expected = np.abs(np.array(results.correlation)[:40, :40])
-    np.testing.assert_allclose(1.0 - pixels.mean(axis=2), expected, atol=0.02)
-
-
-def test_errors_over_runs_are_those_of_all_their_samples() -> None:
-    rng = np.random.default_rng(1)
-    errors = [scale * rng.standard_normal((size, 6)) for scale, size in ((1.0, 400), (3.0, 100))]
-    keys = ("duration", "rms_error", "mean_error")
-    found = [(0.01 * len(e), (e**2).mean(axis=0) ** 0.5, e.mean(axis=0)) for e in errors]
-    runs = [_validation(rng, 1) | dict(zip(keys, values, strict=True)) for values in found]
-    every = np.concatenate(errors)
-    for j, row in enumerate(joint_errors(make_results(validation=runs))):
-        assert row["rms"] == pytest.approx(math.sqrt((every[:, j] ** 2).mean()))
-        assert row["mean"] == pytest.approx(every[:, j].mean())
-
-
-def test_every_run_and_joint_stands_in_the_tables_with_names_whole(page: Page) -> None:
-    results = make_results()
-    tables = [rows for rows in page.tables if rows[0][0] == "Archive"]
-    assert len(tables) == 4
-    for rows in tables:
-        assert [row[0] for row in rows[1:]] == [run.archive for run in results.validation]
-    third, fifth = results.validation[2], results.validation[4]
-    assert float(tables[2][3][2 + 4]) == pytest.approx(third.mean_error[4], abs=6e-4)
-    assert float(tables[3][5][-1]) == pytest.approx(100.0 * fifth.overall_relative_error, rel=0.006)
-
-
-def test_a_reader_who_cannot_see_is_told_what_each_figure_shows(page: Page, html: str) -> None:
-    figures = [a for tag, a in page.tags if tag == "svg" and a.get("role") == "img"]
-    assert len(figures) == 6 + 3 + 1 + 6 + 6
-    assert all(len(a["aria-label"] or "") > 30 for a in figures)
-    assert sum(tag == "h1" for tag, _ in page.tags) == 1
-    assert sum(tag == "caption" for tag, _ in page.tags) == len(page.tables)
-    for kind, count in (("Figure", 5), ("Table", 10)):
-        found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
-        assert found == [str(k) for k in range(1, count + 1)]
-
-
-def test_figures_take_every_colour_from_the_style_sheet(html: str) -> None:
-    drawn = html[html.index("<main>") :]
-    assert not re.findall(r"(?:fill|stroke): *#[0-9a-f]{3,6}", drawn)
-    declared = set(re.findall(r"(--[a-z0-9-]+):", html))
-    assert set(re.findall(r"var\((--[a-z0-9-]+)\)", html)) <= declared
-
-
-def test_an_arm_of_one_joint_without_friction_or_validation_has_a_report_too() -> None:
-    whole, series, empty = real_recording(), make_series(joints=1), np.empty((0, 1))
-    executed = _criteria(1.0, 1.0) | {"condition": math.inf}
-    # fmt: off
-    alone = whole.model_dump() | {
-        "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
-        "correlation": [[1.0]], "noise_std": [0.1], "validation": [], "fitted": None,
-        "repetition_values": [[1.0] for _ in whole.repetitions],
-        "uncertainty": whole.uncertainty.model_dump() | {"least_squares": [math.nan]},
-        "excitation": whole.excitation.model_dump() | {"executed": executed},
-    }
-    # fmt: on
-    none = {"example_time": empty[:, 0], "example_measured": empty, "example_predicted": empty}
-    page = Page(render_report(Results.model_validate(alone), replace(series, **none)))
-    assert "Nothing was held out" in page.text
-
-
-def test_it_says_how_the_estimate_was_made_and_what_stands_behind_it(page: Page) -> None:
-    results = make_results()
-    assert results.estimator.words in page.text
-    assert results.estimator.grouping in page.text
-    assert results.notes[0] in page.text
-    assert results.endogeneity is not None
-    assert results.endogeneity.sentence in page.text
-    size = len(results.parameters)
-    assert f"{size} of {size} parameters were learned from the data" in page.text
-
-
-def test_what_was_not_tested_or_believed_is_said_too() -> None:
-    estimator = make_results().estimator.model_dump() | {"prior": "the URDF gives no inertia"}
-    parameters = [p.model_dump() | {"learned": None} for p in real_recording().parameters]
-    recording = real_recording().model_copy(
-        update={"estimator": make_results(estimator=estimator).estimator,
-                "parameters": make_results(parameters=parameters).parameters}
-    )  # fmt: skip
-    text = Page(render_report(recording, make_series())).text
-    assert "The recordings hold no commanded positions." in text
-    assert "Nothing: the URDF gives no inertia." in text
-
-
-def test_the_posterior_takes_the_place_of_the_phase_clustered_route() -> None:
-    uncertainty = make_results().uncertainty.model_dump()
-    std = uncertainty["phase_clustered"]
-    changed = uncertainty | {"phase_clustered": None, "posterior": std, "reported": "posterior"}
-    page = Page(render_report(make_results(uncertainty=changed), make_series()))
-    assert "Posterior (reported)" in page.text
-    assert "Phase-clustered" not in page.text
-
-
-def test_series_that_do_not_belong_together_are_refused_by_name() -> None:
-    good = make_series()
-    with pytest.raises(SeriesError, match="excitation_velocity") as caught:
-        replace(good, excitation_velocity=good.excitation_velocity[:-1])
-    assert caught.value.expected == (7425, 6)
-    with pytest.raises(SeriesError):
-        render_report(make_results(), make_series(joints=5))
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
-def test_thinning_keeps_order_ends_and_every_peak(values: list[float], bins: int) -> None:
-    time, signal = np.arange(float(len(values))), np.array(values)
-    kept_time, kept = thinned(time, signal, bins)
-    assert kept.size <= 2 * bins + 2
-    assert np.all(np.diff(kept_time) > 0)
-    assert (kept_time[0], kept_time[-1]) == (time[0], time[-1])
-    assert (kept.min(), kept.max()) == (signal.min(), signal.max())
-
-
-@given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e9))
-def test_numbers_read_back_as_what_they_were(value: float, std: float) -> None:
-    assert float(numbers.significant(value)) == pytest.approx(value, rel=0.0051)
-    assert abs(float(numbers.beside(value, std)) - value) <= 0.06 * std + 1e-9 * abs(value)
-
-
-def test_a_number_is_rounded_where_its_uncertainty_begins() -> None:
-    assert numbers.beside(71.6987, 0.4512) == "71.70"
-    assert numbers.beside(71.6987, 31.0) == "72"
-    assert numbers.beside(9.996, 0.0996) == "10.00"
-    assert numbers.beside(-0.00004, 0.02) == "0.000"
-    assert numbers.beside(1.23456e-9, 2.2e-11) == "1.235e-9"
-    assert numbers.beside(5.0, math.nan) == "5.000"
+    @pytest.mark.parametrize(
+        ("value", "std", "text"),
+        [
+            *[(71.6987, 0.4512, "71.70"), (71.6987, 31.0, "72"), (9.996, 0.0996, "10.00")],
+            *[(-0.00004, 0.02, "0.000"), (1.23456e-9, 2.2e-11, "1.235e-9")],
+            (5.0, math.nan, "5.000"),
+        ],
+    )
+    def test_are_rounded_where_uncertainty_begins(
+        self, value: float, std: float, text: str
+    ) -> None:
+        assert numbers.beside(value, std) == text
 
 
 class TestTables:
@@ -494,17 +763,219 @@ class TestTables:
     def rows(self, name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(io.StringIO(csv_tables(make_results())[name])))
 
-    def test_a_record_is_a_row_in_full_precision(self) -> None:
+    def test_have_a_row_for_a_record_in_full_precision(self) -> None:
         found, results = self.rows("parameters.csv"), make_results()
         assert [row["name"] for row in found] == [p.name for p in results.parameters]
         assert [float(row["estimate"]) for row in found] == [p.estimate for p in results.parameters]
 
-    def test_numbers_of_joints_have_a_column_each(self) -> None:
+    def test_have_a_column_for_each_joint(self) -> None:
         run, row = make_results().validation[0], self.rows("validation.csv")[0]
         assert [float(row[f"rms_error.{joint}"]) for joint in JOINTS] == list(run.rms_error)
 
-    def test_a_matrix_has_a_column_per_parameter(self) -> None:
+    def test_have_a_column_per_parameter_of_a_matrix(self) -> None:
         results = make_results()
         found = self.rows("repetition_values.csv")
         assert list(found[0]) == [p.name for p in results.parameters]
         assert [float(x) for x in found[-1].values()] == list(results.repetition_values[-1])
+
+
+# Which parameters can be trusted, and the nearest machine
+
+
+@pytest.fixture(scope="module")
+def arm() -> IdentifiedArm:
+    return identified_arm(TWO_LINK)
+
+
+class Sections:
+    """What the sections on trust and consistency read of `hil.results.Results`."""
+
+    def __init__(self, arm: IdentifiedArm, **changes: Any) -> None:
+        estimate = arm.estimate
+        columns = (estimate.names, estimate.units, estimate.values.tolist(), estimate.std.tolist())
+        unknown = dict.fromkeys(("table2_id", "repetition_std", "truth"))
+        self.parameters = [
+            ParameterResult(
+                name=name, expression=name, unit=unit, estimate=value, std=std,
+                repetition_mean=value, undetermined=name in estimate.undetermined, **unknown,
+            )
+            for name, unit, value, std in zip(*columns, strict=True)
+        ]  # fmt: skip
+        self.n_base = arm.cell.model.base.rank
+        self.joint_names = list(arm.cell.model.joint_names)
+        self.essential: Any = essential_result(arm.essential)
+        self.consistency: Any = consistency_result(arm.cell.model, arm.consistency)
+        for name, value in changes.items():
+            own = getattr(self, name)
+            both = value is not None and isinstance(value, dict)
+            setattr(self, name, own.model_copy(update=value) if both else value)
+
+    @property
+    def html(self) -> str:
+        source = (
+            '{% from "macros.html.j2" import panels, swatch, dot, table_open %}'
+            '{% include "trust.html.j2" %}{% include "consistency.html.j2" %}'
+        )
+        has_truth = any(one.truth is not None for one in self.parameters)
+        context = page.trust_context(self)  # type: ignore[arg-type]
+        template = environment().from_string(source)
+        return template.render(**context, results=self, has_truth=has_truth)
+
+
+class TestTrust:
+    def test_essential_estimates_far_from_the_truth_are_marked(self, arm: IdentifiedArm) -> None:
+        """In standard deviations, and with the marks of the table of all parameters."""
+        sections = Sections(arm)
+        one, other = sections.essential.parameters[:2]
+        truths = {
+            one.name: one.estimate - 4.0 * one.std,
+            other.name: other.estimate + 2.5 * other.std,
+        }
+        sections.parameters = [
+            parameter.model_copy(update={"truth": truths.get(parameter.name)})
+            for parameter in sections.parameters
+        ]
+        marks = re.findall(
+            r'<tr( class="\w+")?><th scope="row">.*?<td class="z">([^<]*)<', sections.html
+        )
+        assert marks[:2] == [(' class="out3"', "+4.00"), (' class="out2"', "-2.50")]
+        assert {mark for mark, _ in marks[2:]} == {""}
+
+    def test_a_grade_is_by_relative_standard_deviation(self, arm: IdentifiedArm) -> None:
+        graded = {one.name: one.grade for one in Sections(arm).parameters}
+        relative = arm.estimate.std / np.abs(arm.estimate.values)
+        for name, std in zip(arm.estimate.names, relative, strict=True):
+            grade = "well" if std <= 0.1 else "roughly" if std <= 0.5 else "hardly"
+            assert graded[name] == grade
+
+    def test_what_the_data_do_not_determine_is_named(self) -> None:
+        html = Sections(identified_arm(TWO_LINK, still=(1,))).html
+        named = html.split("Not determined by these data")[1].split("</p>")[0]
+        assert "f0_2" in named and "I2m" in named
+
+    def test_says_what_was_learned_from_the_data(self, arm: IdentifiedArm) -> None:
+        sections = Sections(arm)
+        assert "Learned from data" not in sections.html
+        sections.parameters = [
+            one.model_copy(update={"learned": one.name != "mc2z"}) for one in sections.parameters
+        ]
+        assert 'of <strong>1</strong>: <span class="muted">mc2z</span>' in sections.html
+        rows = re.findall(
+            r'<th scope="row">(\w+)</th>.*?<td class="text">(yes|no)</td>', sections.html
+        )
+        names = arm.essential.elimination.estimate.names
+        assert dict(rows) == {name: "no" if name == "mc2z" else "yes" for name in names}
+
+    def test_says_why_parameters_are_essential(self, arm: IdentifiedArm) -> None:
+        sections = Sections(arm)
+        html, part = sections.html, sections.essential
+        text = re.sub(r"<[^>]*>", "", html)
+        assert part.reason in text
+        assert f"{part.by_spread_held_out:.2%}" in text
+        assert f"{part.blind.essential:.2%}" in text
+        for parameter in part.parameters:
+            assert f'<th scope="row">{parameter.name}</th>' in html
+
+    def test_gives_the_blind_figure_or_says_that_there_is_none(self, arm: IdentifiedArm) -> None:
+        assert "too short to tell" in Sections(arm, essential={"blind": None}).html
+        blind = BlindResult(left=7, essential=0.0612, full=0.0534)
+        words = "7 parameters predict the held-out motion with an error of 6.12%, against 5.34%"
+        assert words in Sections(arm, essential={"blind": blind}).html
+
+    def test_has_only_grades_without_the_rest(self, arm: IdentifiedArm) -> None:
+        html = Sections(arm, essential=None, consistency=None).html
+        assert 'id="trust"' in html
+        assert "Essential parameters" not in html
+        assert 'id="consistency"' not in html
+
+
+class TestConsistency:
+    def test_names_links_bounds_and_what_it_moves(self, arm: IdentifiedArm) -> None:
+        bound = "rotor inertia of elbow would be negative (-0.3)"
+        html = Sections(arm, consistency={"bounds": [bound], "moved": ["mc2x", "f0_1"]}).html
+        assert bound in html
+        assert "moved by more than three standard deviations: mc2x, f0_1." in html
+        for joint in ("shoulder", "elbow"):
+            assert f'<th scope="row">{joint}</th>' in html
+        mass = arm.consistency.consistent.standard[arm.cell.model.layout.links[1, 9]]
+        assert f"<td>{mass:.2f}</td>" in html
+        assert "At odds" not in Sections(arm, consistency={"moved": []}).html
+
+    def test_shows_names_of_joints_as_text(self, arm: IdentifiedArm) -> None:
+        link = Sections(arm).consistency.links[0].model_copy(update={"joint": "<script>alert(1)"})
+        assert "<script>" not in Sections(arm, consistency={"links": [link]}).html
+
+
+# In a browser
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_the_page_is_at_most_9000_pixels_high(tmp_path: Path) -> None:
+    assert CHROMIUM is not None
+    html = render_report(make_results(conduct=conduct()), make_series())
+    told = "<script>document.title = document.documentElement.scrollHeight</script></body>"
+    text = re.sub(r"<meta http-equiv=[^>]*>", "", html).replace("</body>", told)
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    shown = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--window-size=1300,900", "--dump-dom",
+         (tmp_path / "page.html").as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    ).stdout  # fmt: skip
+    (height,) = re.findall(r"<title>(\d+)</title>", shown)
+    assert 1000 < int(height) <= 9000
+
+
+DRIVER = """
+const $ = (selector) => Array.from(document.querySelectorAll(selector));
+addEventListener("load", () => {
+  const said = {};
+  said.copies = $("button.copy").length;
+  said.captions = $("caption").length;
+  document.execCommand = () => { said.copied = document.activeElement.value; return true; };
+  Object.defineProperty(window, "isSecureContext", { value: false });
+  $("button.copy")[0].click();
+  const svg = $("svg[data-traces]")[6], box = svg.getBoundingClientRect();
+  svg.setPointerCapture = () => {};
+  const pointer = (kind, share) => svg.dispatchEvent(new PointerEvent(kind, { pointerId: 1,
+    pointerType: "mouse", button: 0, bubbles: true, clientX: box.left + share * box.width }));
+  pointer("pointerdown", 0.4); pointer("pointermove", 0.5); pointer("pointerup", 0.5);
+  const figure = svg.closest("figure"), panels = svg.closest(".panels");
+  const key = (name) => panels.dispatchEvent(new KeyboardEvent("keydown", { key: name }));
+  setTimeout(() => {
+    said.zoomed = figure.querySelectorAll("svg.zoomed").length;
+    said.lines = figure.querySelectorAll("svg.zoomed .zoom-line").length;
+    said.range = figure.querySelector(".zoom-bar span").textContent;
+    key("0");
+    setTimeout(() => {
+      said.whole = figure.querySelectorAll("svg.zoomed").length;
+      document.title = JSON.stringify(said);
+    }, 200);
+  }, 200);
+});
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: chromium")
+def test_in_a_browser_tables_are_copied_and_plots_zoomed(tmp_path: Path) -> None:
+    html = render_report(make_results(conduct=conduct()), make_series())
+    digest = base64.b64encode(hashlib.sha256(DRIVER.encode()).digest()).decode()
+    driven = html.replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
+    path = tmp_path / "page.html"
+    path.write_text(driven.replace("<script>", f"<script>{DRIVER}</script><script>", 1), "utf-8")
+    assert CHROMIUM is not None
+    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000"]
+    done = subprocess.run(
+        [*command, path.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    )
+    title = re.search(r"<title>(.*?)</title>", done.stdout, re.S)
+    assert title is not None
+    said = json.loads(html_module.unescape(title[1]))
+    found = Page(html)
+    assert said["copies"] == said["captions"] == len(found.tables)
+    rows = [row.split("\t") for row in said["copied"].rstrip("\n").split("\n")]
+    assert rows == [[" ".join(cell.split()) for cell in row] for row in found.tables[0]]
+    assert said["zoomed"] == 6 and said["lines"] == 18 and said["whole"] == 0
+    begin, end = (float(text) for text in re.findall(r"[\d.]+", said["range"]))
+    assert 0.0 < begin < end < traces_in(html)[6]["end"] / 2.0 + 1.0

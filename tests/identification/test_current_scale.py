@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil.identify.currents import _warnings
+from hil.identify.prepared import current_warnings
 from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from tests.identification.two_link import MODEL, a_motion, coloured
 
@@ -24,7 +24,7 @@ def test_a_current_of_the_wrong_sign_is_named(signs: tuple[float, float]) -> Non
     found = scale(signs)
     np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
     np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
-    negative = [text for text in _warnings(MODEL.joint_names, found) if "negative" in text]
+    negative = [text for text in current_warnings(MODEL.joint_names, found) if "negative" in text]
     assert len(negative) == any(found.turned)
     for name, turned in zip(MODEL.joint_names, found.turned, strict=True):
         assert any(name in text for text in negative) == turned
