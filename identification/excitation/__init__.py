@@ -36,24 +36,25 @@ from identification.excitation.errors import (
     WorkspaceError,
 )
 from identification.excitation.excitation import DrawnMotion, Excitation
-from identification.excitation.genome import Genome
+from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
 from identification.excitation.objective import Measures, Objective
-from identification.excitation.searches.front import Front
 from identification.excitation.searches.journal import Journal
-from identification.excitation.searches.ledger import Progress
 from identification.excitation.searches.polish import PolishResult, dominating, polish
-from identification.excitation.searches.population import Population
-from identification.excitation.searches.problem import Method, Problem, Scores, SearchSettings
+from identification.excitation.searches.population import (
+    Method,
+    Population,
+    Problem,
+    SearchSettings,
+)
 from identification.excitation.searches.run import (
     RESCORE_PERIOD,
     Design,
+    Progress,
     most_evaluations,
     search,
 )
-from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
-from identification.excitation.sines import SineGenome
+from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
-from identification.excitation.via_points import ViaPointGenome
 
 __all__ = [
     # criteria

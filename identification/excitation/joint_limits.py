@@ -9,21 +9,12 @@ looked at exactly. Either answer is rigorous.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.violation import Violation
 from identification.model.motion import Motion
-from planner import (
-    FourierSeries,
-    JointLimits,
-    NotSmooth,
-    PiecewiseCubic,
-    check_rest,
-)
+from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic, check_rest
 from planner.limits import position_rounding
 from planner.piecewise_cubic import Extrema
 
@@ -32,23 +23,6 @@ Array = NDArray[np.float64]
 # Samples within a ramp that is shorter than the motion's own.
 _IN_RAMP = 17
 _RATES = ("velocity", "acceleration", "jerk")
-
-
-class RateBounds(NamedTuple):
-    """Bounds of the magnitudes of each joint's rates in g parts of a motion, (n, g) each."""
-
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-
-class _Swing(NamedTuple):
-    """By how much a series may exceed what its samples show, (n,) each."""
-
-    position: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
 
 
 def limit_violations(
@@ -61,14 +35,12 @@ def limit_violations(
         limits: what it must keep.
         motion: samples of it, both ends included; they say when the excess is.
     """
-    if isinstance(trajectory, PiecewiseCubic):
-        return _beyond(trajectory.extrema(), limits, motion)
-    attained = _attained(motion)
-    found = _beyond(attained, limits, motion)
-    for ramp in _short_ramps(trajectory, motion):
-        found = found or _beyond(_attained(ramp), limits, ramp)
-    if found or _within(attained, _swing(trajectory, motion), limits):
-        return found
+    if isinstance(trajectory, FourierSeries):
+        for samples in (motion, *_short_ramps(trajectory, motion)):
+            if found := _beyond(_attained(samples), limits, samples):
+                return found
+        if _certain(trajectory, limits, motion):
+            return []
     return _beyond(trajectory.extrema(), limits, motion)
 
 
@@ -99,70 +71,45 @@ def rest_violations(
 
 
 def _beyond(extrema: Extrema, limits: JointLimits, motion: Motion) -> list[Violation]:
-    slack = position_rounding(limits)
-    room = limits.upper - limits.lower
-    found = [
-        *_low(extrema.lower, limits.lower - slack, limits.lower, room, motion),
-        *_high("position", extrema.upper, limits.upper + slack, limits.upper, room, motion),
+    slack, room = position_rounding(limits), limits.upper - limits.lower
+    # Of each quantity: what it reaches, its bound, the sign of an excess, rounding, and its scale.
+    rows = [
+        ("position", extrema.lower, limits.lower, -1.0, slack, room),
+        ("position", extrema.upper, limits.upper, 1.0, slack, room),
     ]
-    for quantity in _RATES:
-        bound = getattr(limits, quantity)
-        found += _high(quantity, getattr(extrema, quantity), bound, bound, bound, motion)
+    for name in _RATES:
+        bound = getattr(limits, name)
+        rows.append((name, getattr(extrema, name), bound, 1.0, 0.0 * bound, bound))
+    found = []
+    for quantity, value, bound, sign, rounding, scale in rows:
+        broken = np.flatnonzero(~(sign * value <= sign * bound + rounding)).tolist()  # NaN as well
+        for joint in broken:
+            place = quantity == "position"
+            size = sign * motion.position if place else _rates(motion)[_RATES.index(quantity)]
+            k = int(np.argmax(size[:, joint]))
+            found.append(
+                Violation(
+                    "joint limit",
+                    f"{quantity} of joint {joint}",
+                    float(value[joint]),
+                    float(bound[joint]),
+                    float(motion.time[k]),
+                    tuple(motion.position[k].tolist()),
+                    scale=float(scale[joint]),
+                )
+            )
     return found
 
 
-def _low(
-    value: Array, least: Array, bound: Array, scale: Array, motion: Motion
-) -> Iterable[Violation]:
-    for joint in np.flatnonzero(~(value >= least)).tolist():  # NaN is beyond every bound
-        k = int(np.argmin(motion.position[:, joint]))
-        yield _violation("position", joint, value, bound, scale, motion, k)
-
-
-def _high(
-    quantity: str, value: Array, most: Array, bound: Array, scale: Array, motion: Motion
-) -> Iterable[Violation]:
-    for joint in np.flatnonzero(~(value <= most)).tolist():
-        size = motion.position if quantity == "position" else np.abs(_sampled(quantity, motion))
-        k = int(np.argmax(size[:, joint]))
-        yield _violation(quantity, joint, value, bound, scale, motion, k)
-
-
-def _violation(
-    quantity: str, joint: int, value: Array, bound: Array, scale: Array, motion: Motion, k: int
-) -> Violation:
-    return Violation(
-        "joint limit",
-        f"{quantity} of joint {joint}",
-        float(value[joint]),
-        float(bound[joint]),
-        float(motion.time[k]),
-        tuple(motion.position[k].tolist()),
-        scale=float(scale[joint]),
-    )
-
-
-def _sampled(quantity: str, motion: Motion) -> Array:
-    if quantity == "velocity":
-        return motion.velocity
-    if quantity == "acceleration":
-        return motion.acceleration
-    return _jerk(motion)
-
-
-def _jerk(motion: Motion) -> Array:
-    """Return the mean jerk between samples (m - 1, n), which the true one attains there."""
-    steps = np.diff(motion.time)
-    change: Array = np.diff(motion.acceleration, axis=0) / steps[:, None]
-    return change
+def _rates(motion: Motion) -> tuple[Array, Array, Array]:
+    """Return |qd|, |qdd| at the samples and the mean |jerk| between them, which is attained."""
+    jerk = np.diff(motion.acceleration, axis=0) / np.diff(motion.time)[:, None]
+    return np.abs(motion.velocity), np.abs(motion.acceleration), np.abs(jerk)
 
 
 def _attained(motion: Motion) -> Extrema:
-    return Extrema(
-        motion.position.min(axis=0),
-        motion.position.max(axis=0),
-        *(np.abs(_sampled(quantity, motion)).max(axis=0) for quantity in _RATES),
-    )
+    ends = motion.position.min(axis=0), motion.position.max(axis=0)
+    return Extrema(*ends, *(rate.max(axis=0) for rate in _rates(motion)))
 
 
 def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
@@ -180,32 +127,34 @@ def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
     ]
 
 
-def _within(attained: Extrema, swing: _Swing, limits: JointLimits) -> bool:
-    return bool(
-        np.all(attained.lower - swing.position >= limits.lower)
-        and np.all(attained.upper + swing.position <= limits.upper)
-        and np.all(attained.velocity + swing.velocity <= limits.velocity)
-        and np.all(attained.acceleration + swing.acceleration <= limits.acceleration)
-        and np.all(attained.jerk + swing.jerk <= limits.jerk)
-    )
-
-
-def _swing(series: FourierSeries, motion: Motion) -> _Swing:
+def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool:
+    """Whether the samples are farther from all limits than the series swings between them."""
     step = float(np.max(np.diff(motion.time)))
     second, third, fourth = (series.derivative_bound(order) for order in (2, 3, 4))
     # Where sines stop growing or begin to fade the jerk jumps. A neighbouring pair of samples on
     # the same side of that knows it to two steps' time, if each part lasts three.
     parts = [series.ramp, series.length - 2.0 * series.ramp]
     long_enough = all(part == 0.0 or part >= 3.0 * step for part in parts)
-    jerk = 2.0 * step * fourth if long_enough else np.full_like(fourth, np.inf)
+    reached = _attained(motion)
+    position = second * step**2 / 8.0
+    velocity = third * step**2 / 8.0
     acceleration = fourth * step**2 / 8.0 if series.ramp == 0.0 else third * step / 2.0
-    return _Swing(second * step**2 / 8.0, third * step**2 / 8.0, acceleration, jerk)
+    jerk = 2.0 * step * fourth if long_enough else np.full_like(fourth, np.inf)
+    return bool(
+        np.all(reached.lower - position >= limits.lower)
+        and np.all(reached.upper + position <= limits.upper)
+        and np.all(reached.velocity + velocity <= limits.velocity)
+        and np.all(reached.acceleration + acceleration <= limits.acceleration)
+        and np.all(reached.jerk + jerk <= limits.jerk)
+    )
 
 
 def rate_bounds(
     trajectory: PiecewiseCubic | FourierSeries, start: Array, stop: Array
-) -> RateBounds:
-    """Return bounds of the rates in parts of a motion, sound and quick rather than tight.
+) -> tuple[Array, Array, Array]:
+    """Return bounds of velocity, acceleration and jerk in parts of a motion, (n, g) each.
+
+    They are sound and quick rather than tight.
 
     Args:
         trajectory: a table, or a series: short ramps count only in the parts they reach into.
@@ -215,21 +164,15 @@ def rate_bounds(
     if isinstance(trajectory, FourierSeries):
         ramp, length = trajectory.ramp, trajectory.length
         between = (start >= ramp) & (stop <= length - ramp)
-        return RateBounds(
-            *(
-                np.where(
-                    between,
-                    trajectory.derivative_bound(order, ramps=False)[:, None],
-                    trajectory.derivative_bound(order)[:, None],
-                )
-                for order in (1, 2, 3)
-            )
-        )
-    extrema = trajectory.extrema()
-    everywhere = np.ones(len(start))
-    return RateBounds(
-        *(
-            rate[:, None] * everywhere
-            for rate in (extrema.velocity, extrema.acceleration, extrema.jerk)
-        )
+
+        def bound(order: int) -> Array:
+            calm = trajectory.derivative_bound(order, ramps=False)[:, None]
+            return np.where(between, calm, trajectory.derivative_bound(order)[:, None])
+
+        return bound(1), bound(2), bound(3)
+    extrema, everywhere = trajectory.extrema(), np.ones(len(start))
+    return (
+        extrema.velocity[:, None] * everywhere,
+        extrema.acceleration[:, None] * everywhere,
+        extrema.jerk[:, None] * everywhere,
     )

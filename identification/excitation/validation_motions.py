@@ -23,7 +23,7 @@ from identification.excitation.constraints import (
 )
 from identification.excitation.errors import NoFeasibleMotionError
 from identification.excitation.excitation import DrawnMotion
-from identification.excitation.via_points import straight_way
+from identification.excitation.genomes import straight_way
 from planner import (
     JointLimits,
     PlannerCrashed,

@@ -6,9 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from identification.excitation.constraints import KINDS
-from identification.excitation.searches.front import Front
-from identification.excitation.searches.problem import Scores
-from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Front, Scale, Scores
 
 RANDOM_MOTIONS = Scale(20.0, 10.0, 150.0, 30.0)
 

@@ -18,8 +18,7 @@ from identification.excitation import (
     check_motion,
 )
 from identification.excitation.criteria import Criteria
-from identification.excitation.sines import SineGenome
-from identification.excitation.via_points import ViaPointGenome
+from identification.excitation.genomes import SineGenome, ViaPointGenome
 from planner import (
     FourierSeries,
     JointLimits,
@@ -193,7 +192,7 @@ def test_a_motion_that_cannot_be_planned_is_told_in_its_place(monkeypatch):
 def test_the_record_of_via_points_plans_to_its_motion_bit_for_bit(genome):
     genes = some_genes(genome, 1)
     (motion,) = genome.motions(genes)
-    record = Excitation(criteria=CRITERIA, **RECORD, **genome.recorded(genes[0], motion))
+    record = Excitation(criteria=CRITERIA, **RECORD, trajectory=motion, **genome.recorded(genes[0]))
     again = plan_moves(record.via_points[0], record.moves, LIMITS)
     assert again.trajectory.to_dict() == record.trajectory.to_dict()
     times = np.arange(0.0, motion.duration, 0.001)
@@ -323,10 +322,8 @@ def test_genes_of_one_half_are_a_standstill():
     assert not np.any(motion.amplitude)
 
 
-def test_the_record_of_sines_is_the_series_itself():
-    genes = some_genes(RAMPED, 1)
-    (motion,) = RAMPED.motions(genes)
-    assert RAMPED.recorded(genes[0], motion) == {"trajectory": motion}
+def test_sines_were_planned_from_nothing_else():
+    assert RAMPED.recorded(some_genes(RAMPED, 1)[0]) == {}
 
 
 @pytest.mark.parametrize(

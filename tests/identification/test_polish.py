@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from identification.excitation.constraints import KINDS
 from identification.excitation.searches.polish import dominating, generation_size, polish
-from identification.excitation.searches.problem import Scores, unplanned
-from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Scale, Scores, unplanned
 
 N = 12
 TARGET = np.linspace(0.2, 0.8, N)
@@ -289,12 +288,12 @@ def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index,
 ON_ITS_OWN = """
 import numpy as np
 from identification.excitation.searches.polish import polish
-from identification.excitation.searches.problem import Scores, unplanned
+from identification.excitation.searches.scores import Scores, unplanned
 
 class Bowl:
     def score(self, genes):
         size = 100.0 - np.sum(np.arange(1, 91) * (genes - 0.4) ** 2 * (2 + np.roll(genes, 1, 1)), 1)
-        return Scores.feasible_ones(size, np.full(len(size), 80.0), np.full(len(size), 5.0))
+        return Scores(size, np.full(len(size), 80.0), np.full(len(size), 5.0), np.zeros((len(size), 6)))
 
 start = np.full(90, 0.5)
 known = Bowl().score(start[None])

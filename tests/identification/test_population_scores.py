@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from identification.excitation import DesignError, Population, Scores, midpoints
-from identification.excitation.searches.problem import ROW, unplanned
+from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import KINDS
 from planner import PiecewiseCubic, check_limits
 from planner.errors import LimitExceeded

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from identification.excitation import CurrentModel, Scores, SearchSettings, check_motion, midpoints
-from identification.excitation.searches.problem import ROW, unplanned
 from identification.excitation.searches.run import Evolution
+from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import excess_by_kind
 from tests.identification.searching import LIMITS, problem
 

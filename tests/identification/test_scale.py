@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from identification.excitation.constraints import KINDS
 from identification.excitation.errors import DesignError
-from identification.excitation.searches.problem import Scores
-from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Scale, Scores
 
 HALF = (0.5, 0.5)
 

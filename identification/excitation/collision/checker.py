@@ -243,9 +243,9 @@ def _rebuilt(
 def _looked_at(scene: Scene, trajectory: PiecewiseCubic | FourierSeries, motion: Motion) -> Indices:
     """Return which samples of a motion are looked at, both ends among them."""
     last = motion.n_samples - 1
-    rates = rate_bounds(trajectory, motion.time[:1], motion.time[-1:])
+    velocity, acceleration, _ = rate_bounds(trajectory, motion.time[:1], motion.time[-1:])
     step = float(np.max(np.diff(motion.time), initial=0.0))
-    bulges = scene.from_base.bulge(rates.velocity, rates.acceleration, motion.position, step)
+    bulges = scene.from_base.bulge(velocity, acceleration, motion.position, step)
     share = np.sqrt(_BULGE / np.max(bulges, initial=1e-9))
     stride = 1 if np.isnan(share) else int(np.clip(share, 1, _LONGEST_STRIDE))
     return np.append(np.arange(0, max(last, 1), stride), last)

@@ -68,16 +68,16 @@ def bulges_of(scene: Scene, trajectory: PiecewiseCubic | FourierSeries, motion: 
     starts = _starts(motion.n_samples)
     step = float(np.max(np.diff(motion.time), initial=0.0))
     ends = np.append(starts[1:], motion.n_samples - 1)
-    bounds = rate_bounds(trajectory, motion.time[starts], motion.time[ends])
+    _, change, jerk = rate_bounds(trajectory, motion.time[starts], motion.time[ends])
 
-    def largest(rate: Array, change: Array) -> Array:
+    def largest(rate: Array, slope: Array) -> Array:
         size = np.abs(rate.T)
         seen = np.maximum(np.maximum.reduceat(size, starts, axis=1), size[:, ends])
-        found: Array = seen + change * (step / 2.0)
+        found: Array = seen + slope * (step / 2.0)
         return found
 
-    velocity = largest(motion.velocity, bounds.acceleration)
-    acceleration = largest(motion.acceleration, bounds.jerk)
+    velocity = largest(motion.velocity, change)
+    acceleration = largest(motion.acceleration, jerk)
     return np.array(
         [
             curvature.bulge(velocity, acceleration, motion.position, step)

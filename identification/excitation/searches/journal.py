@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.errors import ForeignJournalError, JournalError
-from identification.excitation.searches.problem import ROW, Problem, Scores, SearchSettings
+from identification.excitation.searches.population import Problem, SearchSettings
+from identification.excitation.searches.scores import ROW, Scores
 from identification.model.robot import RobotModel
 
 # Another release of any of these may draw or compute something else.
@@ -109,12 +110,6 @@ Array = NDArray[np.float64]
 _FIRST_LINE: Final = b"hil search journal 1\n"
 _NAMELESS: Final = "this journal does not say which search it belongs to"
 _FRAME: Final = struct.Struct("<QI")
-# What the content of a generation's frame begins with, by which frames are found behind damage.
-_ARRAY: Final = b"\x93NUMPY"
-# How many times the length of the file is summed up in vain, at most, to find records behind
-# damage. Damaged records together cost it once; a forged file could ask for the sum of its rest at
-# every place.
-_PATIENCE: Final = 4
 # s; what the operating system has is safe from a crash of ours, what is synced from one of its own.
 _SYNCED_EVERY: Final = 5.0
 
@@ -122,9 +117,9 @@ _SYNCED_EVERY: Final = 5.0
 class Journal:
     """Scores of a search in a file that only ever grows.
 
-    Scores are found by their genes, so a damaged record costs its own generation and no other,
-    and a last record that was cut off while it was written is dropped. Where the disk takes no
-    more, records wait in memory and are tried again with the next one: the search goes on.
+    Scores are found by their genes. Records from the first damaged one on are scored anew, as is a
+    last one that was cut off while it was written. Where the disk takes no more, records wait in
+    memory and are tried again with the next one: the search goes on.
 
     Args:
         file: binary, readable, writable and seekable, best without a buffer of its own; empty or
@@ -135,7 +130,7 @@ class Journal:
 
     Attributes:
         recalled: how many motions were read from the file so far.
-        damaged: how many bytes before the last whole record cannot be read.
+        damaged: how many bytes behind the last record that can be read are dropped.
         trouble: why records wait in memory, None while none do.
 
     Raises:
@@ -180,21 +175,20 @@ class Journal:
         for array in (genes, scores.rows):
             np.save(content, np.asarray(array, dtype="<f8"), allow_pickle=False)
         self._waiting += _framed(content.getvalue())
-        try:
-            self._append(self._waiting)
-            self._waiting = b""
-            if monotonic() - self._synced >= _SYNCED_EVERY:
-                self._sync()
-            self.trouble = None
-        except OSError as error:
-            self.trouble = error
+        self._write(sync=monotonic() - self._synced >= _SYNCED_EVERY)
 
     def close(self) -> None:
         """Bring all that waits onto the disk, as far as it can be; the file stays open."""
+        self._write(sync=True)
+
+    def _write(self, *, sync: bool) -> None:
         try:
             self._append(self._waiting)
             self._waiting = b""
-            self._sync()
+            if sync:
+                with suppress(io.UnsupportedOperation):  # a file in memory
+                    os.fsync(self._file.fileno())
+                self._synced = monotonic()
             self.trouble = None
         except OSError as error:
             self.trouble = error
@@ -209,46 +203,23 @@ class Journal:
         self._file.flush()
         self._next += len(content)
 
-    def _sync(self) -> None:
-        with suppress(io.UnsupportedOperation):  # a file in memory
-            os.fsync(self._file.fileno())
-        self._synced = monotonic()
-
     def _read(self, there: bytes) -> None:
-        """Take in every whole record; the next one belongs behind the last of them."""
-        begin, patience = self._next, _PATIENCE * len(there)
-        while begin < len(there):
-            content = _content(there, begin)
-            if content is None:
-                patience -= _length(there, begin) or 0
-                if patience < 0:
-                    return
-                # Only the next record's own beginning tells where it is.
-                array = there.find(_ARRAY, begin + _FRAME.size + 1)
-                begin = len(there) if array < 0 else array - _FRAME.size
-                continue
-            self.damaged += begin - self._next
-            begin = self._next = begin + _FRAME.size + len(content)
+        """Take in every record up to the first damaged one, in whose place the next one belongs."""
+        while (content := _content(there, self._next)) is not None:
             generation = _generation(content)
             if generation is not None:
                 self._known[_key(generation[0])] = generation[1]
+            self._next += _FRAME.size + len(content)
+        self.damaged = len(there) - self._next
 
 
 def _content(there: bytes, begin: int) -> bytes | None:
     """Return the content of the frame that begins here, None where there is no whole one."""
-    length = _length(there, begin)
-    if length is None:
-        return None
-    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
-    return content if zlib.crc32(content) == _FRAME.unpack_from(there, begin)[1] else None
-
-
-def _length(there: bytes, begin: int) -> int | None:
-    """Return how long the content of the frame here says it is, None where it would not fit."""
     if begin + _FRAME.size > len(there):
         return None
-    length: int = _FRAME.unpack_from(there, begin)[0]
-    return length if begin + _FRAME.size + length <= len(there) else None
+    length, checksum = _FRAME.unpack_from(there, begin)
+    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
+    return content if len(content) == length and zlib.crc32(content) == checksum else None
 
 
 def _key(genes: Array) -> bytes:
@@ -290,10 +261,8 @@ def _identity(content: bytes | None) -> dict[str, Any]:
     return found
 
 
-def _generation(content: bytes | None) -> tuple[Array, Array] | None:
+def _generation(content: bytes) -> tuple[Array, Array] | None:
     """Return genes and rows of scores, None where a frame holds something else."""
-    if content is None:
-        return None
     stream = io.BytesIO(content)
     try:
         genes, rows = (np.lib.format.read_array(stream, allow_pickle=False) for _ in range(2))

@@ -13,20 +13,17 @@ eigenvectors differ in their last bits with the threads that linear algebra is g
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from identification.excitation.searches.population import CHUNK
-
-if TYPE_CHECKING:
-    from identification.excitation.searches.problem import Scores
-    from identification.excitation.searches.scale import Scale
+from identification.excitation.searches.scores import Scale, Scores
 
 Array = NDArray[np.float64]
-Fitness = Callable[["Scores"], Array]
+Fitness = Callable[[Scores], Array]
 
 # First steps, as a share of each gene's range: the search has left the motion near something good.
 _STEP: Final = 0.03
@@ -75,21 +72,25 @@ def polish(
         seed: of the random numbers.
         stop: asked before each generation; true ends the polish with the best so far.
     """
-    start = genes.copy()
-    best = _Best(start, scores, fitness)
-    size = generation_size(len(start))
-    strategy = _strategy(start, size, seed)
+    best = PolishResult(genes.copy(), scores)
+    least, most = (float(each[0]) for each in _merits(scores, fitness))
+    size = generation_size(len(genes))
+    strategy = _strategy(best.genes, size, seed)
     evaluated = 0
     while evaluated + size <= evaluations and not stop():
         asked = np.array(strategy.ask())
         found = score(asked.copy())
-        merits = _merits(found, fitness)
-        strategy.tell(list(asked), _ranks(merits).tolist())
-        best.take(asked, found, merits)
+        excess, values = _merits(found, fitness)
+        strategy.tell(list(asked), _ranks(excess, values).tolist())
+        # The first of those that are alike.
+        index = int(np.lexsort((-values, excess))[0])
+        if (excess[index], -values[index]) < (least, -most):
+            least, most = float(excess[index]), float(values[index])
+            best = PolishResult(asked[index].copy(), found.take(index))
         evaluated += size
         if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
             break
-    return PolishResult(best.genes, best.scores)
+    return best
 
 
 def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
@@ -127,47 +128,23 @@ def generation_size(n_genes: int) -> int:
     return CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / CHUNK))
 
 
-class _Merits(NamedTuple):
-    """What motions are ranked by: `excess` (m,), the less the better, then `fitness` (m,)."""
-
-    excess: Array
-    fitness: Array
-
-
-def _merits(scores: Scores, fitness: Fitness) -> _Merits:
+def _merits(scores: Scores, fitness: Fitness) -> tuple[Array, Array]:
+    """Return what motions are ranked by: excess (m,), the less the better, then fitness (m,)."""
     excess = np.where(scores.feasible, 0.0, np.sum(scores.excess, axis=1))
     values = np.asarray(fitness(scores), dtype=np.float64)
     # A motion that cannot be judged is the worst of its kind.
-    return _Merits(np.nan_to_num(excess, nan=np.inf), np.nan_to_num(values, nan=-np.inf))
+    return np.nan_to_num(excess, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
 
 
-def _ranks(merits: _Merits) -> Array:
+def _ranks(excess: Array, fitness: Array) -> Array:
     """Return ranks from 1 for the best (m,), alike for motions that are alike."""
-    pairs = np.stack((-merits.fitness, merits.excess))
+    pairs = np.stack((-fitness, excess))
     order = np.lexsort(pairs)
     steps = np.any(np.diff(pairs[:, order], axis=1) != 0.0, axis=0)
     place = np.empty(len(order))
     place[order] = np.concatenate(([0.0], np.cumsum(steps)))
     ranks: Array = scipy.stats.rankdata(place, method="average")
     return ranks
-
-
-class _Best:
-    """The best motion so far; only a better one takes its place."""
-
-    def __init__(self, genes: Array, scores: Scores, fitness: Fitness) -> None:
-        self.genes, self.scores = genes, scores
-        merits = _merits(scores, fitness)
-        self._excess, self._fitness = float(merits.excess[0]), float(merits.fitness[0])
-
-    def take(self, genes: Array, scores: Scores, merits: _Merits) -> None:
-        """Take the best of a generation if it is better; the first of those that are alike."""
-        index = int(np.lexsort((-merits.fitness, merits.excess))[0])
-        excess, fitness = float(merits.excess[index]), float(merits.fitness[index])
-        if (excess, -fitness) < (self._excess, -self._fitness):
-            self._excess, self._fitness = excess, fitness
-            self.genes = genes[index].copy()
-            self.scores = scores.take(index)
 
 
 def _strategy(start: Array, size: int, seed: int) -> Any:

@@ -1,22 +1,122 @@
-"""Scoring populations in processes of their own, where a motion's crash costs that motion."""
+"""What is searched for, and its motions scored in processes of their own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.errors import DesignError
-from identification.excitation.searches.problem import Problem, Scores, unplannable, unplanned
-from identification.excitation.violation import Violation
-from planner import FourierSeries, PiecewiseCubic, PlannerCrashed, PlanningTimedOut
+from identification.excitation.genomes import Genome, Motion
+from identification.excitation.objective import Objective
+from identification.excitation.searches.scores import Scores, unplanned
+from identification.excitation.violation import Violation, excess_by_kind
+from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
 
 Array = NDArray[np.float64]
+
+Method = Literal["a", "b", "balanced", "front"]
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What is sought, and with how much effort.
+
+    Attributes:
+        method: "a": the largest log10 det (D-optimal, eq. 9); "b": the largest fitness by eq. 7
+            as printed; "balanced": both measures in units of their spread over random motions;
+            "front": all compromises between the two at once (NSGA-II), the knee is chosen.
+        population: individuals in a generation.
+        generations: how many generations are scored, the first, random one among them:
+            150 x 120 are 18 000 individuals.
+        crossover: probability that a pair of parents is crossed (Table 1: "cross-over rate").
+        mutation: probability that a gene of a child is changed (Table 1: "mutation").
+        weights: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced").
+        seed: the same seed gives the same design, to the last bit.
+        polish: evaluations of a local search from the winner; 0 for none.
+        crossover_eta: how close children stay to their parents (SBX), the larger the closer.
+        mutation_eta: how close a changed gene stays to what it was, the larger the closer.
+    """
+
+    method: Method = "front"
+    population: int = 150
+    generations: int = 120
+    crossover: float = 0.9
+    mutation: float = 0.01
+    weights: tuple[float, float] = (0.7, 0.3)
+    seed: int = 0
+    polish: int = 0
+    crossover_eta: float = 15.0
+    mutation_eta: float = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Finds the scores of motions given by genes.
+
+    Attributes:
+        genome: what genes mean.
+        objective: how good a motion is.
+        constraints: what it must keep.
+        period: motions are sampled this often [s] while searching: in the middle of such steps
+            for the objective, at their ends for the constraints.
+    """
+
+    genome: Genome
+    objective: Objective
+    constraints: Constraints
+    period: float = SAMPLE_PERIOD
+
+    def score(self, genes: Array) -> Scores:
+        """Score rows of genes (m, n_genes) in this process, which a solver's crash would end.
+
+        The scores of a motion do not depend on its company, to the last bit.
+        """
+        rows = [self._row(trajectory) for trajectory in self.genome.motions(genes)]
+        return Scores.of_rows(np.array(rows))
+
+    def violations(self, genes: Array) -> tuple[Violation, ...]:
+        """Return what the motion of genes (n_genes,) breaks, with place and amount."""
+        (trajectory,) = self.genome.motions(genes[None])
+        if isinstance(trajectory, PlannerError):
+            return (unplannable(trajectory),)
+        return self._assessed(trajectory)[2]
+
+    def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
+        """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
+
+        Raises:
+            PlannerError: there is no motion.
+        """
+        (trajectory,) = self.genome.motions(genes[None])
+        if isinstance(trajectory, PlannerError):
+            raise trajectory
+        return trajectory, self.objective.criteria(trajectory, period)
+
+    def _row(self, trajectory: Motion | PlannerError) -> Array:
+        if isinstance(trajectory, PlannerError):
+            return unplanned()
+        log10_det, coupling_index, violations = self._assessed(trajectory)
+        excess = excess_by_kind(violations)
+        return np.array((log10_det, coupling_index, trajectory.duration, *excess))
+
+    def _assessed(self, trajectory: Motion) -> tuple[float, float, tuple[Violation, ...]]:
+        # Constraints are looked at where the last check before a motion is sent looks.
+        measures = self.objective.measures(midpoints(trajectory, self.period))
+        return *measures, self.constraints.violations(trajectory, sampled(trajectory, self.period))
+
+
+def unplannable(error: PlannerError) -> Violation:
+    """Return how it is reported that there is no motion."""
+    return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)
+
 
 CHUNK: Final = 8
 """Motions per call to a process, the same for any number of processes.
@@ -87,15 +187,13 @@ class Population:
             return (unplannable(error),)
         return found
 
-    def judged(
-        self, genes: Array, period: float
-    ) -> tuple[PiecewiseCubic | FourierSeries, Criteria]:
+    def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
         """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
 
         Raises:
             PlannerError: there is no motion, or its planning ended the process.
         """
-        found: tuple[PiecewiseCubic | FourierSeries, Criteria] = self._alone(_judged, genes, period)
+        found: tuple[Motion, Criteria] = self._alone(_judged, genes, period)
         return found
 
     def _alone(self, function: Callable[..., list[Any]], *arguments: object) -> Any:
@@ -116,9 +214,7 @@ def _violations(packed: bytes, genes: Array) -> list[tuple[Violation, ...]]:
     return [_problem(packed).violations(genes)]
 
 
-def _judged(
-    packed: bytes, genes: Array, period: float
-) -> list[tuple[PiecewiseCubic | FourierSeries, Criteria]]:
+def _judged(packed: bytes, genes: Array, period: float) -> list[tuple[Motion, Criteria]]:
     return [_problem(packed).judged(genes, period)]
 
 

@@ -8,27 +8,58 @@ interrupted and resumed.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
+from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
+from pymoo.config import Config
+from pymoo.core.problem import Problem
+from pymoo.core.termination import NoTermination
+from pymoo.operators.crossover.sbx import SBX
+from pymoo.operators.mutation.pm import PM
+from pymoo.operators.selection.tournament import TournamentSelection
+from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
 from identification.excitation.criteria import Criteria, fitness_of
-from identification.excitation.errors import DesignError
+from identification.excitation.errors import DesignError, NoFeasibleMotionError
 from identification.excitation.excitation import Excitation
-from identification.excitation.searches.front import Front
 from identification.excitation.searches.journal import Journal
-from identification.excitation.searches.ledger import Ledger, Phase, Progress
 from identification.excitation.searches.polish import dominating, polish
-from identification.excitation.searches.population import Population
-from identification.excitation.searches.problem import Scores, SearchSettings
-from identification.excitation.searches.scale import SAMPLE_COUNT, Scale
-from identification.excitation.violation import KINDS
-from planner import FourierSeries, PiecewiseCubic
+from identification.excitation.searches.population import Population, SearchSettings
+from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
+from identification.excitation.violation import KINDS, Violation
 
 Array = NDArray[np.float64]
+Phase = Literal["sample", "search", "polish"]
+
+
+class Progress(NamedTuple):
+    """How far a search is.
+
+    Attributes:
+        phase: "sample" of random motions that give the scale, "search", "polish".
+        generation: generations scored so far, of `generations`.
+        generations: of the search.
+        evaluated: motions scored so far in all phases, of `total`.
+        total: how many there are going to be at most.
+        feasible: how many of them keep every constraint.
+        log10_det: of the best motion so far; nan before there is one.
+        coupling_index: of the same motion. With the method "front" it is the knee so far.
+    """
+
+    phase: Phase
+    generation: int
+    generations: int
+    evaluated: int
+    total: int
+    feasible: int
+    log10_det: float
+    coupling_index: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +103,15 @@ class Design:
     scale: Scale | None
 
 
-# Random numbers that are no other part's, whatever the seeds.
+RESCORE_PERIOD: Final = 0.001
+"""s; the chosen motion is judged once more at the rate of a servo loop."""
+
+# Random numbers that are no other part's, whatever the seeds: of the evolution, of its first
+# generation, and of the motions that give the scale, which are the same for all seeds, so that a
+# balanced fitness is.
 _STREAM: Final = 6
+_FIRST: Final = 4
+_SCALE: Final = (5, 0)
 # Added to the excess of a motion that cannot be judged: it ranks behind all that can, however much
 # they exceed, and before those that cannot even be planned, whose excess is infinite.
 _UNEXCITING: Final = 1e6
@@ -93,13 +131,20 @@ class Evolution:
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
-        # Here and below, because pymoo takes longer to load than many a command to run.
-        from pymoo.config import Config
-        from pymoo.core.problem import Problem
-        from pymoo.core.termination import NoTermination
-
         Config.warnings["not_compiled"] = False  # it would be printed
-        self._algorithm = _algorithm(settings, first, n_objectives)
+        kind, compare, survival = (
+            (GA, comp_by_cv_and_fitness, FitnessSurvival())
+            if n_objectives == 1
+            else (NSGA2, binary_tournament, RankAndCrowding())
+        )
+        self._algorithm: Any = kind(
+            pop_size=settings.population,
+            sampling=first,
+            selection=TournamentSelection(func_comp=compare),
+            crossover=SBX(prob=settings.crossover, eta=settings.crossover_eta),
+            mutation=PM(prob=1.0, prob_var=settings.mutation, eta=settings.mutation_eta),
+            survival=survival,
+        )
         self._algorithm.setup(
             Problem(
                 n_var=first.shape[1],
@@ -126,41 +171,12 @@ class Evolution:
 
     def tell(self, scores: Scores, objectives: Array) -> None:
         """Take the scores of what was asked for, and its objectives (m, n_objectives)."""
-        judged = scores.usable
-        exciting = np.isfinite(scores.log10_det) & np.isfinite(scores.coupling_index)
-        unexciting = np.where(exciting, 0.0, _UNEXCITING)
+        unexciting = np.where(scores.exciting, 0.0, _UNEXCITING)
         excess = np.column_stack((scores.excess, unexciting))
         # Objectives decide among feasible motions only, and must be finite for their distances.
-        finite = np.nan_to_num(np.where(judged[:, None], objectives, 0.0))
+        finite = np.nan_to_num(np.where(scores.usable[:, None], objectives, 0.0))
         self._asked.set("F", finite, "G", excess)
         self._algorithm.advance(infills=self._asked)
-
-
-def _algorithm(settings: SearchSettings, first: Array, n_objectives: int) -> Any:
-    from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
-    from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
-    from pymoo.operators.crossover.sbx import SBX
-    from pymoo.operators.mutation.pm import PM
-    from pymoo.operators.selection.tournament import TournamentSelection
-    from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
-
-    common = {
-        "pop_size": settings.population,
-        "sampling": first,
-        "crossover": SBX(prob=settings.crossover, eta=settings.crossover_eta),
-        "mutation": PM(prob=1.0, prob_var=settings.mutation, eta=settings.mutation_eta),
-    }
-    if n_objectives == 1:
-        return GA(
-            selection=TournamentSelection(func_comp=comp_by_cv_and_fitness),
-            survival=FitnessSurvival(),
-            **common,
-        )
-    return NSGA2(
-        selection=TournamentSelection(func_comp=binary_tournament),
-        survival=RankAndCrowding(),
-        **common,
-    )
 
 
 @dataclass(frozen=True)
@@ -239,15 +255,6 @@ class Goal:
         return dominating(start, self.scale)
 
 
-RESCORE_PERIOD: Final = 0.001
-"""s; the chosen motion is judged once more at the rate of a servo loop."""
-
-# Random numbers of the first generation, by seed, and of the motions that give the scale. The
-# latter are the same for all seeds, so that a balanced fitness is.
-_FIRST: Final = 4
-_SCALE: Final = (5, 0)
-
-
 def search(
     population: Population,
     settings: SearchSettings,
@@ -285,7 +292,7 @@ def most_evaluations(settings: SearchSettings) -> int:
 
 
 class _Search:
-    """One search under way."""
+    """One search under way, and what it has seen so far."""
 
     def __init__(
         self,
@@ -296,25 +303,28 @@ class _Search:
         scored: Callable[[int], None] | None,
         stop: Callable[[], bool],
     ) -> None:
-        self._population, self._settings = population, settings
+        self._population, self._settings, self._journal = population, settings, journal
         self._genome = population.problem.genome
-        self._progress, self._stop = progress, stop
+        self._progress, self._scored, self._stop = progress, scored, stop
         self._stopped = self._exhausted = False
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
         self._history: list[tuple[float, float, float]] = []
-        self._ledger = Ledger(population, journal, self._entered, scored)
+        self._front = Front.empty(self._genome.n_genes)
+        self._evaluated = self._feasible = 0
+        self._infeasible: Counter[str] = Counter()
+        # The smallest excess but zero of each kind, and of all together, and whose it is.
+        self._mildest: dict[str, tuple[float, Array]] = {}
 
     def run(self) -> Design:
         goal = self._goal = self._chosen_goal()
         self._evolve(goal)
-        front = self._ledger.front
+        front = self._front
         if len(front) == 0:
-            raise self._ledger.failure(stopped=self._stopped)
+            raise self._failure()
         winner = goal.choice(front)
-        start = front.genes[winner]
+        genes = start = front.genes[winner]
         origin = trajectory, criteria = self._population.judged(start, RESCORE_PERIOD)
-        genes = start
         if self._settings.polish > 0 and not self._halted():
             genes = self._polished(goal, front, winner)
         if genes.tobytes() != start.tobytes():
@@ -325,14 +335,22 @@ class _Search:
         return Design(
             settings=self._settings,
             genes=genes.copy(),
-            excitation=self._excitation(genes, trajectory, criteria),
+            excitation=Excitation(
+                trajectory=trajectory,
+                criteria=criteria,
+                method=self._settings.method,
+                seed=self._settings.seed,
+                tried=self._evaluated,
+                rejected=dict(self._infeasible),
+                **self._genome.recorded(genes),
+            ),
             front=front,
             chosen=winner if genes is start else None,
             origin=winner,
             origin_criteria=origin[1],
             history=np.array(self._history).reshape(-1, 3),
-            evaluated=self._ledger.evaluated,
-            infeasible=dict(self._ledger.infeasible),
+            evaluated=self._evaluated,
+            infeasible=dict(self._infeasible),
             complete=not self._stopped,
             exhausted=self._exhausted,
             scale=goal.scale,
@@ -343,15 +361,14 @@ class _Search:
         p = self._population.problem.objective.n_parameters
         if not _needs_scale(self._settings):
             return Goal(self._settings, p, None)
-        scale_genes = self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT)
-        scores = self._ledger.score(scale_genes)
+        scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
         try:
             return Goal(self._settings, p, Scale.of(scores))
         except DesignError:
             # Random motions excite hardly anything. A front does without a scale.
             if self._settings.method == "front":
                 return Goal(self._settings, p, None)
-            raise self._ledger.failure(stopped=False) from None
+            raise self._failure() from None
 
     def _evolve(self, goal: Goal) -> None:
         self._phase = "search"
@@ -363,57 +380,86 @@ class _Search:
             if genes is None:
                 self._exhausted = True
                 return
-            scores = self._ledger.score(genes)
+            scores = self._score(genes)
             evolution.tell(scores, goal.objectives(scores))
 
     def _polished(self, goal: Goal, front: Front, winner: int) -> Array:
         """Return the genes of the best motion near the winner, or its own."""
         self._phase = "polish"
-        start = _scores_on(front, winner)
-        result = polish(
-            self._ledger.score,
+        start = front.scores(winner)
+        return polish(
+            self._score,
             front.genes[winner],
             start,
             goal.polished_by(start),
             evaluations=self._settings.polish,
             seed=self._settings.seed,
             stop=self._halted,
-        )
-        return result.genes
+        ).genes
 
-    def _excitation(
-        self, genes: Array, trajectory: PiecewiseCubic | FourierSeries, criteria: Criteria
-    ) -> Excitation:
-        return Excitation(
-            criteria=criteria,
-            method=self._settings.method,
-            seed=self._settings.seed,
-            tried=self._ledger.evaluated,
-            rejected=dict(self._ledger.infeasible),
-            **self._genome.recorded(genes, trajectory),
-        )
+    def _score(self, genes: Array) -> Scores:
+        """Return the scores of genes (m, n_genes), from the journal where it has them."""
+        scores = None if self._journal is None else self._journal.recall(genes)
+        if scores is None:
+            scores = self._population.score(genes, self._scored)
+            if self._journal is not None:
+                self._journal.record(genes, scores)
+        self._evaluated += len(genes)
+        self._feasible += int(np.count_nonzero(scores.feasible))
+        excess = dict(zip(KINDS, scores.excess.T, strict=True))
+        for kind, each in excess.items():
+            if count := int(np.count_nonzero(each)):
+                self._infeasible[kind] += count
+        for kind, each in {**excess, "all": scores.excess.sum(axis=1)}.items():
+            broken = np.flatnonzero(each)
+            if len(broken) > 0:
+                index = int(broken[np.argmin(each[broken])])
+                if kind not in self._mildest or each[index] < self._mildest[kind][0]:
+                    self._mildest[kind] = float(each[index]), genes[index].copy()
+        self._front = self._front.merge(Front.of(genes, scores))
+        self._report()
+        return scores
 
-    def _entered(self) -> None:
-        """Keep the history and tell how far the search is."""
-        ledger, settings = self._ledger, self._settings
-        if self._phase == "search" and self._goal is not None:
-            self._history.append(self._goal.best(ledger.front))
+    def _report(self) -> None:
+        """Extend the history and report how far the search is."""
+        goal, front, best = self._goal, self._front, (np.nan, np.nan)
+        if self._phase == "search" and goal is not None:
+            self._history.append(goal.best(front))
         if self._progress is None:
             return
-        best = (np.nan, np.nan)
-        if self._goal is not None and len(ledger.front) > 0:
-            k = self._goal.choice(ledger.front)
-            best = float(ledger.front.log10_det[k]), float(ledger.front.coupling_index[k])
+        if goal is not None and len(front) > 0:
+            k = goal.choice(front)
+            best = float(front.log10_det[k]), float(front.coupling_index[k])
         self._progress(
             Progress(
                 self._phase,
                 len(self._history),
-                settings.generations,
-                ledger.evaluated,
-                most_evaluations(settings),
-                ledger.feasible,
+                self._settings.generations,
+                self._evaluated,
+                most_evaluations(self._settings),
+                self._feasible,
                 *best,
             )
+        )
+
+    def _failure(self) -> NoFeasibleMotionError:
+        """Return the error that says what forbids every motion, where, and by how much."""
+        mildest, violations = self._mildest, self._population.violations
+        closest = violations(mildest["all"][1]) if "all" in mildest else ()
+
+        def worst(kind: str) -> Violation:
+            found = violations(mildest[kind][1])
+            # Only a process that ended for other reasons breaks something else the second time.
+            alike = [violation for violation in found if violation.kind == kind]
+            return max(alike or found, key=lambda violation: violation.excess)
+
+        return NoFeasibleMotionError(
+            self._infeasible,
+            {kind: worst(kind) for kind in sorted(self._infeasible)},
+            closest=closest,
+            tried=self._evaluated,
+            unexciting=self._feasible,
+            stopped=self._stopped,
         )
 
     def _halted(self) -> bool:
@@ -423,11 +469,3 @@ class _Search:
 
 def _needs_scale(settings: SearchSettings) -> bool:
     return settings.method in ("balanced", "front")
-
-
-def _scores_on(front: Front, index: int) -> Scores:
-    """Return the scores (m = 1) of a motion of a front, which keeps every constraint."""
-    one = slice(index, index + 1)
-    return Scores.feasible_ones(
-        front.log10_det[one], front.coupling_index[one], front.duration[one]
-    )
