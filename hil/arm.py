@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from identification.excitation.collision.bodies import described_shapes
-from identification.excitation.collision.poses import joint_poses
+from identification.excitation.collision.hulls import joint_poses
 from identification.model.kinematics import FARTHEST, Chain, chain_from_urdf
 
 Array = NDArray[np.float64]

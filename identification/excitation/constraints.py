@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.checker import CollisionChecker, PathContact
+from identification.excitation.collision.checker import CollisionChecker, Contact
 from identification.excitation.joint_limits import limit_violations, rest_violations
 from identification.excitation.violation import KINDS, Kind, Violation, excess_by_kind
 from identification.model.motion import Motion
@@ -227,22 +227,11 @@ def check_motion(
 
 def clearance(checker: CollisionChecker, q: Array, time: Array | None = None) -> Violation | None:
     """Return the deepest contact in postures (m, n), reached at times (m,), if there is one."""
-    contact = checker.deepest_contact(q)
-    if contact is None:
-        return None
-    return _collision(
-        checker,
-        PathContact(
-            contact.first,
-            contact.second,
-            None if time is None else float(time[contact.sample]),
-            tuple(q[contact.sample].tolist()),
-            contact.distance,
-        ),
-    )
+    contact = checker.deepest_contact(q, time)
+    return None if contact is None else _collision(checker, contact)
 
 
-def _collision(checker: CollisionChecker, contact: PathContact) -> Violation:
+def _collision(checker: CollisionChecker, contact: Contact) -> Violation:
     return Violation(
         "collision",
         f"{contact.first} and {contact.second}",

@@ -24,7 +24,7 @@ from identification.excitation import (
 )
 from identification.excitation.collision import checker as checker_module
 from identification.excitation.collision.bodies import link_bodies
-from identification.excitation.collision.checker import joint_poses
+from identification.excitation.collision.hulls import joint_poses
 from identification.excitation.constraints import sampled
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan

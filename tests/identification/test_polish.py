@@ -293,7 +293,8 @@ from identification.excitation.searches.scores import Scores, unplanned
 class Bowl:
     def score(self, genes):
         size = 100.0 - np.sum(np.arange(1, 91) * (genes - 0.4) ** 2 * (2 + np.roll(genes, 1, 1)), 1)
-        return Scores(size, np.full(len(size), 80.0), np.full(len(size), 5.0), np.zeros((len(size), 6)))
+        ones = np.ones(len(size))
+        return Scores(size, 80.0 * ones, 5.0 * ones, np.zeros((len(size), 6)))
 
 start = np.full(90, 0.5)
 known = Bowl().score(start[None])

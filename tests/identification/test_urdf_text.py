@@ -261,23 +261,19 @@ PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collisio
 @pytest.mark.parametrize(
     ("shapes", "why"),
     [
-        (SHAPE + PIPE.format("capsule"), "2 .* 0 .*: <capsule> is no known shape .known: box, cyl"),
-        (PIPE.format("Box"), "1 .* 0 .*: <Box> is no known shape"),
-        (SHAPE + "<collision/>", "2 .* 0 .*: it has a <collision> without a shape"),
-        ("<collision><geometry/></collision>", "1 .* 0 .*: it has a <collision> without a shape"),
-        (SHAPE + PIPE.format("cylinder").replace("0.1", "0,1"), "correct its <collision> elements"),
-        (SHAPE + PIPE.format("capsule").replace("collision", "visual"), "<capsule> is no known"),
-        (SHAPE + "<visual/>", "it has a <visual> without a shape"),
-        (
-            SHAPE.replace("</geo", '<sphere radius="2"/></geo'),
-            "of the 2 .* 1 could be read: give each shape a <collision> of its own",
-        ),
+        (SHAPE + PIPE.format("capsule"), "2 .* 0 could be read.* stand <box>, <capsule>"),
+        (PIPE.format("Box"), "1 .* 0 could be read.* stand <Box>"),
+        (SHAPE + "<collision/>", "2 .* 0 could be read.* stand <box>"),
+        ("<collision><geometry/></collision>", "1 .* 0 could be read.* stand none"),
+        (SHAPE + PIPE.format("cylinder").replace("0.1", "0,1"), "2 .* 0 .* sizes and places"),
+        (SHAPE + PIPE.format("capsule").replace("collision", "visual"), "stand <box>, <capsule>"),
+        (SHAPE + "<visual/>", "1 .* 0 could be read"),
+        (SHAPE.replace("</geo", '<sphere radius="2"/></geo'), "2 .* 1 .* needs one shape"),
     ],
 )
 def test_what_is_wrong_with_a_shape_is_told(shapes: str, why: str) -> None:
-    with pytest.raises(CollisionModelError, match=why) as caught:
+    with pytest.raises(CollisionModelError, match=why):
         checker(arm(SHAPE, shapes))
-    assert ("all of its link are left out" in str(caught.value)) == ("of its own" not in why)
 
 
 @pytest.mark.parametrize("corner", [math.nan, math.inf, 0.0])

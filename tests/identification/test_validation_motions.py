@@ -16,7 +16,7 @@ from identification.excitation import (
     check_motion,
     random_validation_motions,
 )
-from identification.excitation.collision.checker import joint_poses
+from identification.excitation.collision.hulls import joint_poses
 from planner import JointLimits, PlannerCrashed, plan, plan_moves
 from sim_fixtures.ns16 import load_truth, urdf_text
 

@@ -82,11 +82,8 @@ class Workspace:
             raise WorkspaceError(f"margin of {self.margin} m: it must be finite, 0 or more")
 
 
-_SHAPES: Final = ("box", "cylinder", "sphere", "mesh")
-
-
 def lost_shapes(urdf: str, links: Iterable[str]) -> str | None:
-    """Return in words the first link of which shapes were left out, and why; None if of none.
+    """Return in words the first link of which shapes were left out; None if of none.
 
     Args:
         urdf: text of the description.
@@ -98,35 +95,19 @@ def lost_shapes(urdf: str, links: Iterable[str]) -> str | None:
     read = Counter(links)
     for link in urdf_tree(urdf).findall("link"):
         name = link.get("name", "")
-        collisions = link.findall("collision")
-        written = sum(max(1, len(list(_shapes(shape)))) for shape in collisions)
-        if read[name] == written:
-            continue
-        found = f"of the {written} collision shapes of link {name!r} {read[name]} could be read"
-        return f"{found}: {_cause(link)}"
+        collisions = [list(_shapes(element)) for element in link.findall("collision")]
+        written = sum(max(1, len(shapes)) for shapes in collisions)
+        if read[name] != written:
+            visuals = [list(_shapes(element)) for element in link.findall("visual")]
+            shapes = [f"<{shape.tag}>" for each in (*collisions, *visuals) for shape in each]
+            return (
+                f"of the {written} collision shapes of link {name!r} {read[name]} could be read; "
+                f"in its <collision> and <visual> elements stand {', '.join(shapes) or 'none'}. "
+                "Each element needs one shape of its own, a box, cylinder, sphere or mesh; sizes "
+                "and places are numbers with single spaces between, a mesh has a filename, a "
+                "material a name. Where one cannot be read, all of its link are left out"
+            )
     return None
-
-
-def _cause(link: Element) -> str:
-    elements = [*link.findall("collision"), *link.findall("visual")]
-    for element in elements:
-        tags = [shape.tag for shape in _shapes(element)]
-        if not tags:
-            return _of_all(f"it has a <{element.tag}> without a shape in its <geometry>")
-        if tags[0] not in _SHAPES:
-            known = ", ".join(_SHAPES)
-            return _of_all(f"<{tags[0]}> is no known shape (known: {known})")
-        if len(tags) > 1 and element.tag == "collision":
-            return "give each shape a <collision> of its own"
-    kinds = sorted({f"<{element.tag}>" for element in elements})
-    return _of_all(
-        f"correct its {' and '.join(kinds)} elements (sizes and places are numbers with single "
-        "spaces between, a mesh has a filename, a material a name)"
-    )
-
-
-def _of_all(cause: str) -> str:
-    return f"{cause}; one that cannot be read, and all of its link are left out"
 
 
 def _shapes(element: Element) -> Iterator[Element]:
@@ -213,33 +194,20 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     names = [model.frames[item.parentFrame].name for item in shapes.geometryObjects]
     if (lost := lost_shapes(urdf, names)) is not None:
         raise CollisionModelError(lost)
-    _require_near(shapes)
     bodies = []
-    for item in shapes.geometryObjects:
-        shape = _body(item.geometry, model.frames[item.parentFrame].name)
+    for item, link in zip(shapes.geometryObjects, names, strict=True):
         rotation, translation = item.placement.rotation, item.placement.translation
-        bodies.append(
-            Body(
-                model.frames[item.parentFrame].name,
-                item.name,
-                item.parentJoint - 1,
-                shape,
-                coal.Transform3s(rotation, translation),
-                _hull(shape, rotation, translation),
-            )
-        )
-    if not any(body.joint >= 0 for body in bodies):
-        raise CollisionModelError("no moving link of the robot description has a collision shape")
-    return sorted(bodies, key=lambda body: body.joint)
-
-
-def _require_near(shapes: pin.GeometryModel) -> None:
-    for item in shapes.geometryObjects:
-        if not np.abs(item.placement.translation).max() <= FARTHEST:
+        if not np.abs(translation).max() <= FARTHEST:
             raise CollisionModelError(
                 f"collision shape {item.name!r} of the robot description is more than "
                 f"{FARTHEST:g} m away from what carries it"
             )
+        shape, joint = _body(item.geometry, link), item.parentJoint - 1
+        pose, hull = coal.Transform3s(rotation, translation), _hull(shape, rotation, translation)
+        bodies.append(Body(link, item.name, joint, shape, pose, hull))
+    if not any(body.joint >= 0 for body in bodies):
+        raise CollisionModelError("no moving link of the robot description has a collision shape")
+    return sorted(bodies, key=lambda body: body.joint)
 
 
 def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:

@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from identification.errors import ShapeError
 from identification.excitation.collision.bodies import Workspace, link_bodies, obstacles, withdrawn
-from identification.excitation.collision.curvature import Curvature, carrier
-from identification.excitation.collision.poses import (
+from identification.excitation.collision.hulls import (
     Bodies,
+    Curvature,
     Frames,
+    Indices,
+    Separation,
+    carrier,
     frames,
     placed,
     travel,
     turning,
 )
-from identification.excitation.collision.separation import Indices, Separation
 from identification.excitation.errors import PostureError
 from identification.model.kinematics import Chain, chain_from_urdf
 from planner import JointLimits
@@ -140,8 +142,8 @@ class Scene:
             if a < len(links) and self.joints_apart(a, b) > (0 if b >= len(links) else 1)
         ]
         self.separation = Separation(self._bodies, pairs)
-        self._tried = random_postures(model, limits)
-        self.built_in, self.narrowed = self._leave_out(self._tried)
+        self._tried = self.path(random_postures(model, limits))
+        self.built_in, self.narrowed = self._leave_out()
         first, second = self.separation.first, self.separation.second
         joints = [body.joint for body in self._bodies]
         self.carrier: Indices = np.array(
@@ -208,29 +210,40 @@ class Scene:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _leave_out(self, postures: Array) -> tuple[tuple[BuiltIn, ...], tuple[BuiltIn, ...]]:
-        """Leave out the pairs that are built in, as these postures (k, n) show.
+    def _leave_out(self) -> tuple[tuple[BuiltIn, ...], tuple[BuiltIn, ...]]:
+        """Leave out the pairs that are built in, as random postures show.
 
         A plane stands back for a link that can never keep the margin of it.
+
+        Two links are built in that are two joints apart at most, and too close in every posture.
+        So are an obstacle and a shape of the first link, which can but turn in it, if they are too
+        close at the same distance in every posture; one that comes nearer and goes farther is
+        checked along the motion. A link never keeps a plane's margin that is one of the two next
+        to the mounting, such as an upper arm whose shoulder turns close above the floor; in some
+        postures it does not touch.
 
         Returns:
             What is left out, and those links.
         """
-        tried = _Tried(self, self.path(postures))
+        near = min(self.margin, NEAR)
         checked: list[tuple[int, int]] = []
         left_out, narrowed = list[BuiltIn](), list[BuiltIn]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
+            obstacle, plane = b >= self._n_links, self._bodies[b].normal is not None
+            joints = self.joints_apart(a, b)
+            least, most = (-np.inf, np.inf)
+            if joints <= 2 and self._may_be_near(pair, near):
+                distances = self._distances(pair)
+                least, most = float(distances.min()), float(distances.max())
             names = self._bodies[a].shape_name, self._bodies[b].shape_name
-            plane = self._bodies[b].normal is not None
-            if (always := tried.always_close(pair)) is not None:
-                left_out.append(BuiltIn(*names, *always))
+            fixed = joints <= 1 and most - least <= STILL if obstacle else True
+            if most < near and fixed:
+                left_out.append(BuiltIn(*names, least, most))
                 continue
-            if plane and (range_ := tried.never_clear(pair)) is not None:
-                narrowed.append(BuiltIn(*names, *range_))
-                self._bodies.append(
-                    withdrawn(self._bodies[b], self.margin - narrowed[-1].farthest + SLACK)
-                )
+            if plane and SLACK < most < near:
+                narrowed.append(BuiltIn(*names, least, most))
+                self._bodies.append(withdrawn(self._bodies[b], self.margin - most + SLACK))
                 b = len(self._bodies) - 1
             checked.append((a, b))
         self.separation = Separation(self._bodies, checked)
@@ -243,13 +256,9 @@ class Scene:
             ValueError: they are no pair.
         """
         pairs = [k for k in range(len(self.separation.first)) if self.names(k) == (first, second)]
-        tried = _Tried(self, self.path(self._tried))
-        distances = np.min([tried.distances(pair) for pair in pairs], axis=0)
+        self._tried = self.path(self._tried.q)  # planes may have been added since
+        distances = np.min([self._distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
-
-    def with_obstacle(self, pair: int) -> bool:
-        """Whether the second body of a pair is an obstacle."""
-        return bool(self.separation.second[pair] >= self._n_links)
 
     def joints_apart(self, a: int, b: int) -> int:
         """Count the joints between two bodies."""
@@ -259,54 +268,15 @@ class Scene:
         ]
         return len(trunks[0] ^ trunks[1])
 
-
-class _Tried:
-    """Pairs of a scene in the postures of a path."""
-
-    def __init__(self, scene: Scene, path: Path) -> None:
-        self._scene, self._path = scene, path
-        self._samples = np.arange(len(path.q))
-        self._near = min(scene.margin, NEAR)
-
-    def distances(self, pair: int) -> Array:
+    def _distances(self, pair: int) -> Array:
         """Return the distances of a pair in the postures tried (k,) [m]."""
-        samples = self._samples.tolist()
-        return np.array([self._scene.distance(pair, self._path, k) for k in samples])
+        return np.array([self.distance(pair, self._tried, k) for k in range(_N_POSTURES)])
 
-    def always_close(self, pair: int) -> tuple[float, float] | None:
-        """Return nearest and farthest distance [m] of a pair that is built in, else None.
-
-        Two links: two joints apart at most, and too close in every posture. An obstacle and a
-        shape of the first link, which can but turn in it: too close at the same distance in every
-        posture; one that comes nearer and goes farther is checked along the motion.
-        """
-        obstacle = self._scene.with_obstacle(pair)
-        found = self._near_always(pair, 1 if obstacle else 2)
-        if found is None or not found[1] < self._near:
-            return None
-        return None if obstacle and not found[1] - found[0] <= STILL else found
-
-    def never_clear(self, pair: int) -> tuple[float, float] | None:
-        """Return nearest and farthest distance [m] of a link that never keeps a plane's margin.
-
-        It is one of the two links next to the mounting, such as an upper arm whose shoulder turns
-        close above the floor; in some postures it does not touch.
-        """
-        found = self._near_always(pair, 2)
-        return found if found is not None and SLACK < found[1] < self._near else None
-
-    def _near_always(self, pair: int, most_joints: int) -> tuple[float, float] | None:
-        """Return the range of the distance [m] of a pair that may be near in every posture."""
-        scene = self._scene
-        if scene.joints_apart(*scene.indices(pair)) > most_joints:
-            return None
-        pairs = np.full(len(self._samples), pair)
-        if not np.all(
-            scene.separation.bound(self._path.bodies, pairs, self._samples)[0] < self._near
-        ):
-            return None
-        distances = self.distances(pair)
-        return float(distances.min()), float(distances.max())
+    def _may_be_near(self, pair: int, near: float) -> bool:
+        """Whether a pair may be closer than so much [m] in every posture tried."""
+        samples = np.arange(_N_POSTURES)
+        pairs = np.full(_N_POSTURES, pair)
+        return bool(np.all(self.separation.bound(self._tried.bodies, pairs, samples)[0] < near))
 
 
 def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
