@@ -42,7 +42,7 @@ from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 from planner.plan_file import PlanFile, to_csv
 from planner.player import TrajectoryPlayer
 from planner.verify import check_limits, check_rest
-from planner.worker import WorkerProcess, in_child, map_in_children, plan_in_child
+from planner.worker import WorkerProcess, in_child, plan_in_child
 
 __all__ = [
     "plan",
@@ -58,7 +58,6 @@ __all__ = [
     "plan_in_child",
     "in_child",
     "WorkerProcess",
-    "map_in_children",
     "check_limits",
     "check_rest",
     "JointLimits",

@@ -10,7 +10,6 @@ from identification.excitation.constraints import (
     MotionCheck,
     Violation,
     check_motion,
-    excess_by_kind,
     midpoints,
     sampled,
 )
@@ -21,7 +20,6 @@ from identification.excitation.criteria import (
     coupling_index,
     coupling_index_max,
     fitness_eq7,
-    fitness_of,
     information,
     log10_det,
 )
@@ -39,7 +37,6 @@ from identification.excitation.excitation import DrawnMotion, Excitation
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
 from identification.excitation.objective import Measures, Objective
 from identification.excitation.searches.journal import Journal
-from identification.excitation.searches.polish import PolishResult, dominating, polish
 from identification.excitation.searches.population import (
     Method,
     Population,
@@ -53,7 +50,7 @@ from identification.excitation.searches.run import (
     most_evaluations,
     search,
 )
-from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
+from identification.excitation.searches.scores import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
 
 __all__ = [
@@ -64,7 +61,6 @@ __all__ = [
     "coupling_index",
     "coupling_index_max",
     "fitness_eq7",
-    "fitness_of",
     "information",
     "log10_det",
     "Measures",
@@ -84,7 +80,6 @@ __all__ = [
     "MotionCheck",
     "Violation",
     "check_motion",
-    "excess_by_kind",
     # motions
     "Genome",
     "SineGenome",
@@ -97,19 +92,15 @@ __all__ = [
     "Front",
     "Journal",
     "Method",
-    "PolishResult",
     "Population",
     "PostureError",
     "Problem",
     "Progress",
     "RESCORE_PERIOD",
-    "SAMPLE_COUNT",
     "Scale",
     "Scores",
     "SearchSettings",
-    "dominating",
     "most_evaluations",
-    "polish",
     "search",
     # errors
     "CollisionModelError",

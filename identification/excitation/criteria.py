@@ -89,14 +89,12 @@ def log10_det(gram: Array, n_samples: int) -> float:
         n_samples: N, the number of time samples as in the paper's Table 1 (not of rows, of which
             there are one per joint and sample).
     """
-    scale, lower = _factorise(gram)
-    return -np.inf if lower is None else _log10_det(scale, lower, n_samples)
+    return log10_det_and_coupling(gram, n_samples)[0]
 
 
 def coupling_index(gram: Array) -> float:
     """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
-    _, lower = _factorise(gram)
-    return np.inf if lower is None else _coupling_index(lower)
+    return log10_det_and_coupling(gram, 1)[1]
 
 
 def log10_det_and_coupling(gram: Array, n_samples: int) -> tuple[float, float]:
@@ -104,7 +102,9 @@ def log10_det_and_coupling(gram: Array, n_samples: int) -> tuple[float, float]:
     scale, lower = _factorise(gram)
     if lower is None:
         return -np.inf, np.inf
-    return _log10_det(scale, lower, n_samples), _coupling_index(lower)
+    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
+    coupling = np.abs(np.tril(_lower_correlation(lower), -1)).sum()
+    return float(2.0 * logs.sum()), float(coupling)
 
 
 def correlation(gram: Array) -> Array:
@@ -174,15 +174,6 @@ def _factorise(gram: Array) -> tuple[Array, Array | None]:
     if info != 0 or np.min(np.diag(lower)) ** 2 <= _smallest_pivot(len(matrix)):
         return scale, None
     return scale, lower
-
-
-def _log10_det(scale: Array, lower: Array, n_samples: int) -> float:
-    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
-    return float(2.0 * logs.sum())
-
-
-def _coupling_index(lower: Array) -> float:
-    return float(np.abs(np.tril(_lower_correlation(lower), -1)).sum())
 
 
 def _lower_correlation(lower: Array) -> Array:

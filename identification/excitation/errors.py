@@ -41,17 +41,7 @@ class MissingMeshError(CollisionModelError):
 
 
 class PostureError(IdentificationError, ValueError):
-    """A posture with a position that is no finite number.
-
-    Attributes:
-        sample: which posture, from 0.
-        joint: which joint, from 0.
-    """
-
-    def __init__(self, sample: int, joint: int, value: float) -> None:
-        super().__init__(f"joint {joint} is at {value} rad in posture {sample}; it must be finite")
-        self.sample = sample
-        self.joint = joint
+    """A posture with a position that is no finite number."""
 
 
 class WorkspaceError(IdentificationError, ValueError):
@@ -132,19 +122,13 @@ class ForeignJournalError(JournalError):
     Attributes:
         part: "problem", "settings" or "versions".
         name: what differs: a setting, a part of the problem, or a package.
-        recorded: its value in the journal (of a part of the problem: its fingerprint).
-        value: its value here.
     """
 
     def __init__(self, part: str, name: str, recorded: object, value: object) -> None:
-        self.part = part
-        self.name = name
-        self.recorded = recorded
-        self.value = value
-        if part == "problem":
-            reason = f"its {name} is not this one's"
-        elif part == "settings":
-            reason = f"its {name} is {recorded}, here it is {value}"
-        else:
-            reason = f"it was written with {name} {recorded}, installed is {value}"
+        self.part, self.name = part, name
+        reason = {
+            "problem": f"its {name} is not this one's",
+            "settings": f"its {name} is {recorded}, here it is {value}",
+            "versions": f"it was written with {name} {recorded}, installed is {value}",
+        }[part]
         super().__init__(f"the journal belongs to another search: {reason}")

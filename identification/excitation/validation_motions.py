@@ -78,108 +78,79 @@ def random_validation_motions(
     Raises:
         NoFeasibleMotionError: a hundred tries in a row did not give one feasible motion.
     """
-    draw = _Draw(limits, home, n_via, fly, checker, currents)
-    motions = []
-    for k in range(count):
-        for attempt in range(_TRIES_PER_MOTION):
-            candidate = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
-            if candidate is not None:
-                motions.append(candidate)
-                break
-        else:
-            raise draw.failure()
-    return tuple(motions)
 
+    def contact(q: Array) -> Violation | None:
+        return None if checker is None else clearance(checker, q)
 
-class _Draw:
-    """Draws motions one by one and keeps count of what stands in their way."""
+    rejected = _Rejected()
+    if (found := contact(home[None])) is not None:
+        rejected.add([replace(found, subject=f"{found.subject} at home")])
+        raise NoFeasibleMotionError(rejected.counts, rejected.nearest)
+    half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
+    middle = (limits.upper + limits.lower) / 2.0
 
-    def __init__(
-        self,
-        limits: JointLimits,
-        home: Array,
-        n_via: int,
-        fly: float,
-        checker: CollisionChecker | None,
-        currents: CurrentModel | None,
-    ) -> None:
-        self._limits, self._home = limits, home
-        self._n_via, self._fly = n_via, fly
-        self._checker, self._currents = checker, currents
-        self.rejected: Counter[str] = Counter()
-        self._nearest: dict[str, Violation] = {}
-        if (contact := self._contact(self._home[None])) is not None:
-            self._reject([replace(contact, subject=f"{contact.subject} at home")])
-            raise self.failure()
-
-    def __call__(self, random: np.random.Generator) -> DrawnMotion | None:
-        """Return a feasible motion, or None and count why there is none."""
-        speed = random.uniform(*_SPEED, self._limits.n_joints)
-        via_points = self._via_points(random)
-        if via_points is None:
-            return None
-        try:
-            # The solver can take its process with it; that individual is infeasible, no more.
-            trajectory = plan_in_child(via_points, self._limits, speed=speed, fly=self._fly)
-        except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
-            self._reject([Violation("planning", f"the motion ({error})", 1.0, 0.0, None)])
-            return None
-        found: Sequence[Violation] = [
-            Violation("duration", "the motion", trajectory.duration, _LONGEST, None)
-        ]
-        if trajectory.duration <= _LONGEST:
-            check = check_motion(
-                trajectory, self._limits, checker=self._checker, currents=self._currents
-            )
-            found = check.violations
-        if found:
-            self._reject(found)
-            return None
-        return DrawnMotion(via_points, speed, self._fly, trajectory)
-
-    def failure(self) -> NoFeasibleMotionError:
-        """Return the error that tells what forbids every motion."""
-        return NoFeasibleMotionError(self.rejected, self._nearest)
-
-    def _via_points(self, random: np.random.Generator) -> Array | None:
-        """Draw points one after the other, each within free straight reach of the one before.
-
-        The last one must see home. Corners are rounded later: the whole motion is checked then.
-        """
-        points = [self._home]
-        while len(points) <= self._n_via:
-            found = self._next_point(random, points[-1], last=len(points) == self._n_via)
-            if isinstance(found, Violation):
-                self._reject([found])
-                return None
-            points.append(found)
-        return np.array([*points, self._home])
-
-    def _next_point(
-        self, random: np.random.Generator, before: Array, *, last: bool
-    ) -> Array | Violation:
+    def next_point(random: np.random.Generator, before: Array, *, last: bool) -> Array | Violation:
         """Draw until the way is free; return what was in the way when patience ends."""
-        middle = (self._limits.upper + self._limits.lower) / 2.0
-        half = (self._limits.upper - self._limits.lower) / 2.0 * _RANGE_SHARE
         draws = 0
         while True:
             point = random.uniform(middle - half, middle + half)
             way = straight_way(before, point)
             if last:
-                way = np.concatenate((way, straight_way(point, self._home)))
-            if self._checker is None or self._checker.clear(way).all():
+                way = np.concatenate((way, straight_way(point, home)))
+            if checker is None or checker.clear(way).all():
                 return point
             draws += 1
-            if draws >= _DRAWS_PER_POINT and (blocked := self._contact(way)) is not None:
+            if draws >= _DRAWS_PER_POINT and (blocked := contact(way)) is not None:
                 return blocked
 
-    def _contact(self, q: Array) -> Violation | None:
-        return None if self._checker is None else clearance(self._checker, q)
+    def drawn(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
+        """Return a feasible motion, or why there is none.
 
-    def _reject(self, violations: Sequence[Violation]) -> None:
-        """Count a motion once per kind of constraint it breaks; keep the mildest case of each."""
+        Points are drawn one after the other, each within free straight reach of the one before;
+        the last one must see home. Corners are rounded later: the whole motion is checked then.
+        """
+        speed = random.uniform(*_SPEED, limits.n_joints)
+        points = [home]
+        while len(points) <= n_via:
+            point = next_point(random, points[-1], last=len(points) == n_via)
+            if isinstance(point, Violation):
+                return [point]
+            points.append(point)
+        via_points = np.array([*points, home])
+        try:
+            # The solver can take its process with it; that individual is infeasible, no more.
+            trajectory = plan_in_child(via_points, limits, speed=speed, fly=fly)
+        except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
+            return [Violation("planning", f"the motion ({error})", 1.0, 0.0, None)]
+        if trajectory.duration > _LONGEST:
+            return [Violation("duration", "the motion", trajectory.duration, _LONGEST, None)]
+        check = check_motion(trajectory, limits, checker=checker, currents=currents)
+        return check.violations or DrawnMotion(via_points, speed, fly, trajectory)
+
+    motions = []
+    for k in range(count):
+        for attempt in range(_TRIES_PER_MOTION):
+            motion = drawn(np.random.default_rng([_VALIDATION, seed, k, attempt]))
+            if isinstance(motion, DrawnMotion):
+                motions.append(motion)
+                break
+            rejected.add(motion)
+        else:
+            raise NoFeasibleMotionError(rejected.counts, rejected.nearest)
+    return tuple(motions)
+
+
+class _Rejected:
+    """How many motions each kind of constraint forbids, and the mildest case of each."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.nearest: dict[str, Violation] = {}
+
+    def add(self, violations: Sequence[Violation]) -> None:
+        """Count a motion once per kind of constraint it breaks."""
         for kind in dict.fromkeys(violation.kind for violation in violations):
-            self.rejected[kind] += 1
+            self.counts[kind] += 1
             worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
-            if kind not in self._nearest or worst.excess < self._nearest[kind].excess:
-                self._nearest[kind] = worst
+            if kind not in self.nearest or worst.excess < self.nearest[kind].excess:
+                self.nearest[kind] = worst

@@ -170,7 +170,10 @@ class Scene:
             raise ShapeError("q", q.shape, f"(m, {self._chain.n_joints})")
         if not np.all(np.isfinite(q)):
             sample, joint = np.argwhere(~np.isfinite(q))[0].tolist()
-            raise PostureError(sample, joint, float(q[sample, joint]))
+            value = float(q[sample, joint])
+            raise PostureError(
+                f"joint {joint} is at {value} rad in posture {sample}; it must be finite"
+            )
         at = frames(self._chain, q)
         bodies = placed(self._bodies, at)
         return Path(q, at, bodies, travel(self._bodies, bodies, turning(self._chain, q)))
