@@ -157,7 +157,7 @@ class ViaPointGenome:
             if draw > 0:
                 coordinates[blocked] = random.random((len(blocked), self.limits.n_joints))
             points = self._points(coordinates[blocked])
-            ways = [
+            segments = [
                 np.concatenate(
                     (
                         point[None] if before is None else straight_way(before[index], point),
@@ -166,8 +166,8 @@ class ViaPointGenome:
                 )
                 for index, point in zip(blocked.tolist(), points, strict=True)
             ]
-            starts = np.cumsum([0, *(len(way) for way in ways[:-1])])
-            free = np.logical_and.reduceat(checker.clear(np.concatenate(ways)), starts)
+            starts = np.cumsum([0, *(len(way) for way in segments[:-1])])
+            free = np.logical_and.reduceat(checker.clear(np.concatenate(segments)), starts)
             blocked = blocked[~free]
             if len(blocked) == 0:
                 break

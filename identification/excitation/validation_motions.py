@@ -103,7 +103,7 @@ def random_validation_motions(
             if draws >= _DRAWS_PER_POINT and (blocked := contact(way)) is not None:
                 return blocked
 
-    def drawn(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
+    def draw(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
         """Return a feasible motion, or why there is none.
 
         Points are drawn one after the other, each within free straight reach of the one before;
@@ -130,7 +130,7 @@ def random_validation_motions(
     motions = []
     for k in range(count):
         for attempt in range(_TRIES_PER_MOTION):
-            motion = drawn(np.random.default_rng([_VALIDATION, seed, k, attempt]))
+            motion = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
             if isinstance(motion, DrawnMotion):
                 motions.append(motion)
                 break
