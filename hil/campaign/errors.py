@@ -100,12 +100,7 @@ class AgainstGravityError(DryRunError):
 
 
 class RepetitionsRejectedError(HilError):
-    """A motion failed its quality check as often as it may be repeated.
-
-    Attributes:
-        motion: which one.
-        reasons: of each attempt.
-    """
+    """A motion failed its quality check as often as it may be repeated, for these reasons."""
 
     exit_code: ClassVar[int] = 5
 
@@ -135,8 +130,7 @@ class ArmChangedError(RepetitionsRejectedError):
             self,
             f"{motion}: the last {len(later)} attempts ({', '.join(later)}) agree with each other, "
             f"and not with the {len(reference)} repetitions that count ({', '.join(reference)}): "
-            f"{differs}. Something drags on the arm, slipped or was changed, or the first ones "
-            "were disturbed. Look at the arm: payload, tool, cables, belts, brakes, what stands "
-            "near it. If it can be put back as it was, do so and run the campaign again; if the "
-            "later ones are right, begin a new campaign.",
+            f"{differs}. Look at the arm: payload, tool, cables, belts, brakes, what stands near "
+            "it. If it can be put back as it was, do so and run the campaign again; if the later "
+            "ones are right, begin a new campaign.",
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -35,18 +35,25 @@ class Step:
     """One step of a campaign.
 
     Attributes:
-        name: "design", "rehearse", "dry run", "warm-up", "repetitions", "validation", "identify"
-            or "report".
         state: whether it is done, is to be done next, or waits for one before it.
         sentence: what is known of it.
         command: what to type for it; "" for what is done, and where no command helps (the
             sentence then says what does).
+        details: more sentences, for the report.
+        name: "design", "rehearse", "dry run", "warm-up", "repetitions", "validation", "identify"
+            or "report".
     """
 
-    name: str
     state: State
     sentence: str
     command: str = ""
+    details: tuple[str, ...] = ()
+    name: str = ""
+
+    @property
+    def done(self) -> bool:
+        """Whether it is."""
+        return self.state == "done"
 
 
 @dataclass(frozen=True)
@@ -68,7 +75,7 @@ class CampaignStatus:
     @property
     def complete(self) -> bool:
         """Whether every step is done."""
-        return all(step.state == "done" for step in self.steps)
+        return all(step.done for step in self.steps)
 
     @property
     def next_command(self) -> str:
@@ -78,23 +85,6 @@ class CampaignStatus:
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it."""
         return asdict(self) | {"complete": self.complete, "next_command": self.next_command}
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What is known of a step by itself.
-
-    Attributes:
-        done: whether it is.
-        words: on it.
-        command: how to do it, behind "hil".
-        details: for the report.
-    """
-
-    done: bool
-    words: str
-    command: str = ""
-    details: list[str] = field(default_factory=list)
 
 
 def status_of(campaign: Campaign) -> CampaignStatus:
@@ -107,7 +97,7 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     at = shlex.quote(str(folder.root))
     # With what makes the file of a step anew, should it be damaged: nothing makes up for the cell
     # or the plan of recordings, nor for what a person saw.
-    looks: list[tuple[str, Callable[[], _Found], str]] = [
+    looks: list[tuple[str, Callable[[], Step], str]] = [
         ("design", lambda: _design(campaign), ""),
         ("rehearse", lambda: _gate(campaign, _rehearsal(folder), folder.rehearsal), again),
         ("dry run", lambda: _gate(campaign, _dry_run(campaign), folder.dry_run), ""),
@@ -120,51 +110,52 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     steps: list[Step] = []
     first = ""
     for name, look, mend in looks:
-        found = _looked(look, mend)
-        state: State = "done" if found.done else "blocked" if first else "next"
-        words = f"{found.words}; waits for: {first}" if state == "blocked" else found.words
-        first = first or ("" if found.done else name)
-        known = found.command and not found.done
-        command = f"hil {found.command}".replace("{}", at) if known else ""
-        steps.append(Step(name, state, words, command))
+        step = replace(_looked(look, mend), name=name)
+        if step.done:
+            step = replace(step, command="")
+        elif first:
+            step = replace(step, state="blocked", sentence=f"{step.sentence}; waits for: {first}")
+        first = first or ("" if step.done else name)
+        command = f"hil {step.command.replace('{}', at)}" if step.command else ""
+        steps.append(replace(step, command=command))
     return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps), _notes(folder))
 
 
-def _looked(look: Callable[[], _Found], mend: str = "") -> _Found:
+def _looked(look: Callable[[], Step], mend: str = "") -> Step:
     try:
         return look()
     except HilError as error:  # a file of one step says nothing of the others
-        return _Found(False, str(error).rstrip("."), mend)
+        return Step("next", str(error).rstrip("."), mend)
 
 
-def _design(campaign: Campaign) -> _Found:
+def _design(campaign: Campaign) -> Step:
     excitation, folder = campaign.plan.excitation, campaign.folder
     if folder.manifest():  # until something is recorded, a rehearsal takes changes in
         folder.require_unchanged()
     motions = plural(len(campaign.plan.validation), "validation motion")
-    return _Found(True, f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}")
+    return Step("done", f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}")
 
 
-def _rehearsal(folder: CampaignFolder) -> _Found:
+def _rehearsal(folder: CampaignFolder) -> Step:
     found = Rehearsal.load(folder)
     if found is None:
-        return _Found(False, "not rehearsed on the simulated arm", "rehearse {}")
+        return Step("next", "not rehearsed on the simulated arm", "rehearse {}")
     if not found.covers(folder, folder.plan_hash):
         words = "rehearsed with another cell, URDF or plan than it has now"
-        return _Found(False, words, "rehearse {}")
+        return Step("next", words, "rehearse {}")
     but = "" if found.warning is None else f"; {found.warning}"
-    return _Found(
-        found.passed,
+    return Step(
+        "done" if found.passed else "next",
         f"passed all {len(found.criteria)} criteria{but}" if found.passed else found.line,
         "rehearse {}",
-        [
+        (
             *(one.sentence for one in found.criteria),
             *(f"not seen by it: {sentence}" for sentence in found.not_seen),
-        ],
+        ),
     )
 
 
-def _dry_run(campaign: Campaign) -> _Found:
+def _dry_run(campaign: Campaign) -> Step:
     folder = campaign.folder
     found = DryRun.that_counts(
         folder,
@@ -174,54 +165,55 @@ def _dry_run(campaign: Campaign) -> _Found:
     )
     if found is None and folder.dry_run.exists():
         was = "of another plan, of another kind of arm, or its archives are gone"
-        return _Found(False, f"the one on record does not count: it is {was}", "run {} --dry-run")
+        return Step("next", f"the one on record does not count: it is {was}", "run {} --dry-run")
     return _accepted(found)
 
 
-def _accepted(found: DryRun | None) -> _Found:
+def _accepted(found: DryRun | None) -> Step:
     if found is None:
-        return _Found(False, "not done: every motion at a fifth of its speed", "run {} --dry-run")
+        return Step("next", "not done: every motion at a fifth of its speed", "run {} --dry-run")
     if found.accepted is None:
         names = "".join(f" --accept-torque {joint}" for joint in found.against_gravity)
         but = "".join(f"; {warning}" for warning in found.warnings)
         words = f"done ({found.duration:.0f} s), but not accepted{but}"
-        return _Found(False, words, f"run {{}} --accept-dry-run{names}")
+        return Step("next", words, f"run {{}} --accept-dry-run{names}")
     shares = zip(found.joint_names, found.current_share, strict=True)
     currents = ", ".join(f"{joint} {share:.0%}" for joint, share in shares)
-    return _Found(
-        True,
+    return Step(
+        "done",
         f"accepted by {found.accepted.by} at {found.accepted.at}",
-        details=[
+        details=(
             f"largest current, of its limit: {currents}",
             f"{plural(len(found.archives), 'motion')} at {found.override:.0%} of their speed",
             f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late",
             *(f"{warning}; it was accepted by name" for warning in found.warnings),
-        ],
+        ),
     )
 
 
-def _gate(campaign: Campaign, found: _Found, record: Path) -> _Found:
+def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
     """A step that a simulated arm may leave out, and has, once all is done at full speed."""
     if found.done or record.exists() or not campaign.cell.only_simulated:
         return found
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
-        return _Found(True, "left out, as a simulated arm allows")
+        return Step("done", "left out, as a simulated arm allows")
     return found
 
 
-def _warmed(campaign: Campaign) -> _Found:
+def _warmed(campaign: Campaign) -> Step:
     if not drift_wanted(campaign.cell):
-        return _Found(True, "none wanted (warmup_drift)")
+        return Step("done", "none wanted (warmup_drift)")
     warm = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation", "repetitions").done:
-        return _Found(True, "left out")
-    return replace(_warm_up(warm), done=warm is not None and warm.outcome != "going on")
+        return Step("done", "left out")
+    over = warm is not None and warm.outcome != "going on"
+    return replace(_warm_up(warm), state="done" if over else "next")
 
 
-def _warm_up(found: WarmUp | None) -> _Found:
+def _warm_up(found: WarmUp | None) -> Step:
     """As the report has it: done is an arm that was warm."""
     if found is None:
-        return _Found(False, "not done", "run {}")
+        return Step("next", "not done", "run {}")
     details = []
     if lost := len(found.earlier):
         were = "was" if lost == 1 else "were"
@@ -238,35 +230,36 @@ def _warm_up(found: WarmUp | None) -> _Found:
             "it may have drifted, and what is estimated is its mean over them"
         )
     words = f"{found.outcome} after {plural(len(found.motions), 'motion')}"
-    return _Found(found.outcome == "warm", words, "run {}", details)
+    return Step("done" if found.outcome == "warm" else "next", words, "run {}", tuple(details))
 
 
-def _motions(campaign: Campaign, kind: str, words: str) -> _Found:
+def _motions(campaign: Campaign, kind: str, words: str) -> Step:
     total = sum(one.kind == kind for one in wanted(campaign.cell, campaign.plan))
     whole = len(campaign.folder.completed(kind))
-    return _Found(whole >= total, f"{whole} of {total} {words} whole", "run {}")
+    state: State = "done" if whole >= total else "next"
+    return Step(state, f"{whole} of {total} {words} whole", "run {}")
 
 
-def _identified(folder: CampaignFolder) -> _Found:
+def _identified(folder: CampaignFolder) -> Step:
     if not lies_there(folder.results):
-        return _Found(False, "not identified yet", "identify {}")
+        return Step("next", "not identified yet", "identify {}")
     results = Results.load(folder.results)
     used = {*results.repetitions, *(one.archive for one in results.validation)}
     kinds = ("excitation", "validation")
     new = [path.name for kind in kinds for path in folder.completed(kind) if path.name not in used]
     if new:
         words = f"identified without {len(new)} of the archives ({new[0]})"
-        return _Found(False, words, "identify {}")
-    return _Found(True, results.verdict.line)
+        return Step("next", words, "identify {}")
+    return Step("done", results.verdict.line)
 
 
-def _reported(folder: CampaignFolder) -> _Found:
+def _reported(folder: CampaignFolder) -> Step:
     if not folder.report.exists():
-        return _Found(False, "no report yet", "report {}")
+        return Step("next", "no report yet", "report {}")
     written = folder.report.stat().st_mtime
     if folder.results.exists() and folder.results.stat().st_mtime > written + 1.0:
-        return _Found(False, "older than the results", "report {}")
-    return _Found(True, str(folder.report))
+        return Step("next", "older than the results", "report {}")
+    return Step("done", str(folder.report))
 
 
 def _notes(folder: CampaignFolder) -> tuple[str, ...]:
@@ -310,7 +303,7 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     recorded = [one for one in (_recorded(folder, entry) for entry in folder.manifest()) if one]
     warm: WarmUp | None = None
 
-    def warm_up() -> _Found:
+    def warm_up() -> Step:
         nonlocal warm
         warm = WarmUp.load(folder.warmup, folder.plan_hash)
         return _warm_up(warm)
@@ -324,7 +317,7 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     }
     return ConductResult(
         steps=[
-            StepResult(step=name, done=found.done, words=found.words, details=found.details)
+            StepResult(step=name, done=found.done, words=found.sentence, details=[*found.details])
             for name, found in steps.items()
         ],
         warm_up=None
@@ -339,13 +332,13 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     )
 
 
-def _whole(recorded: list[RecordedResult], kind: str) -> _Found:
+def _whole(recorded: list[RecordedResult], kind: str) -> Step:
     own = [one for one in recorded if one.kind == kind]
     good = [one for one in own if one.outcome == "completed"]
     words = f"{len(good)} whole, {sum(one.seconds for one in good):.0f} s of motion"
     if bad := len(own) - len(good):
         words += f"; {bad} rejected or ended early, and run again"
-    return _Found(bool(good), words)
+    return Step("done" if good else "next", words)
 
 
 def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:

@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.cell import Cell
 from hil.cli import app
-from hil.demo_link import LOOPBACK
 from hil.errors import ControllerFault, InputError, UnsafeError
 from hil.move import posture, straight_way, turned
 from hil.testing import UdpController
@@ -197,38 +195,6 @@ def test_nothing_is_connected_while_a_run_is_at_work_on_the_campaign(
         result = CliRunner().invoke(app, ["move", str(root), "--to", "start", "--json"])
     assert isinstance(result.exception, CampaignFolderError)
     assert not connected
-
-
-def moving(controller: UdpController, output: Path, *options: str) -> list[str]:
-    return [
-        sys.executable, "-m", "hil", "move", str(controller.cell_path), "--to", "home",
-        "--speed", "5", "-o", str(output), *options,
-    ]  # fmt: skip
-
-
-@pytest.mark.slow  # a minute of real time; the links' own tests stop motions too
-def test_over_udp_ctrl_c_brings_the_arm_to_rest_on_its_way(ns16: Cell, tmp_path: Path) -> None:
-    output = tmp_path / "move.mcap"
-    with UdpController.started(ns16, tmp_path) as controller:
-        assert controller.host == LOOPBACK
-        process = subprocess.Popen(
-            moving(controller, output), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        deadline = time.monotonic() + 60.0
-        while time.monotonic() < deadline and not (output.exists() and output.stat().st_size > 4e4):
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-    assert process.returncode == 130, said
-    archive = open_archive(output)
-    assert archive.complete
-    assert archive.outcome is not None
-    assert archive.outcome.entries["outcome"] == "stopped"
-    sent = archive.columns["commanded_position"]
-    sent = sent[np.isfinite(sent).all(axis=1)]
-    share = (sent - ns16.initial) / (ns16.home - ns16.initial)
-    assert 0.0 < share[-1, 0] < 0.99  # it stopped on the way
-    assert np.ptp(share, axis=1).max() < 1e-3  # and never left it
 
 
 @pytest.mark.parametrize("answer", [b"n\n", b"\x03"], ids=["no", "Ctrl-C"])

@@ -16,7 +16,6 @@ import termios
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -110,7 +109,7 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
 
 @pytest.mark.parametrize("width", [20, 40, 48, 63, 64, 79, 80, 132, 300])
 @pytest.mark.parametrize("height", [3, 8, 12, 24, 60])
-def test_at_any_size_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -> None:
+def test_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -> None:
     whole = status()
     nothing = status(following_error=None, following_share=None, current=None, current_share=None)
     between = RunStatus("move", 1, 3, 1.0)
@@ -129,7 +128,7 @@ def test_stop_hold_and_silence_are_said() -> None:
 
 @pytest.mark.parametrize("width", [48, 64, 80])
 @pytest.mark.parametrize("far_end", ["SIMULATED", "10.2.12.150"])
-def test_the_first_line_says_what_is_moved_however_long_the_title(width: int, far_end: str) -> None:
+def test_the_first_line_says_what_is_moved(width: int, far_end: str) -> None:
     shown = Shown("a long title " * 6, NAMES, status(), far_end=far_end, left="0:42 left")
     first = drawn(width, 24, shown)[0]
     assert far_end in first
@@ -137,7 +136,7 @@ def test_the_first_line_says_what_is_moved_however_long_the_title(width: int, fa
     assert "repetition" in first
 
 
-def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
+def test_the_far_end_is_simulated_or_has_an_address() -> None:
     cell = Cell.load(CELL_PATH)
 
     def said(**link: Any) -> str:
@@ -149,7 +148,7 @@ def test_the_far_end_of_a_cell_is_simulated_or_has_an_address() -> None:
     assert said(transport="can", can=can) == "socketcan:can0"
 
 
-def test_in_virtual_time_what_is_left_is_the_time_that_a_person_waits() -> None:
+def test_in_virtual_time_the_time_left_is_that_of_waiting() -> None:
     """A run of 100 s of motion that takes 25 s, with a pause of a person in between."""
     pace = Pace(virtual=True)
     moving = status().motion
@@ -166,18 +165,7 @@ def test_in_virtual_time_what_is_left_is_the_time_that_a_person_waits() -> None:
     assert pace.left(one) == pytest.approx(15.0)
 
 
-def test_the_time_between_motions_counts_in_what_is_left() -> None:
-    """Motions of 10 s, 3 s after each other: the third begins, two more follow."""
-    pace, moving = Pace(virtual=False), status().motion
-    for begin, left in ((0.0, 40.0), (13.0, 30.0), (26.0, 20.0)):
-        pace.take(RunStatus("repetition", 1, 5, left + 10.0), begin - 3.0, held=False)
-        for second in range(11):
-            one = RunStatus("repetition", 1, 5, left + 10.0 - second, moving)
-            pace.take(one, begin + second, held=False)
-    assert pace.left(replace(one, motions_left=2)) == pytest.approx(20.0 + 2 * 3.0, rel=0.1)
-
-
-def test_a_terminal_breaks_lines_between_words_and_a_file_gets_them_whole() -> None:
+def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
     sentence = "one sentence that is [longer] than any line of this terminal is wide :smile:"
     for terminal in (True, False):
         out = StringIO()
@@ -228,7 +216,7 @@ def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
     assert wish.held is held
 
 
-def test_arrows_mean_nothing_and_a_paste_makes_nothing_faster() -> None:
+def test_arrows_mean_nothing_and_a_paste_nothing_faster() -> None:
     assert typed("\x1b[A\x1b[1;5C\x1bOP\x1b[1;") == ""
     assert typed("\x1b[15~-") == "-"
     assert typed("0000000") == ""
@@ -243,7 +231,7 @@ def test_arrows_mean_nothing_and_a_paste_makes_nothing_faster() -> None:
         ("\x1b\x1b[A", "hold"), ("\x1b\x1bs", "stop"), ("\x1b[A\x1bs", "stop"),
     ],
 )  # fmt: skip
-def test_escape_holds_and_takes_nothing_away_from_what_comes_with_it(sent: str, means: str) -> None:
+def test_escape_holds_and_takes_nothing_else_away(sent: str, means: str) -> None:
     screen = Screen(NAMES, stop := Stop(), quiet=True)
     for key in typed(sent):
         screen.press(key)
@@ -252,7 +240,7 @@ def test_escape_holds_and_takes_nothing_away_from_what_comes_with_it(sent: str, 
     assert screen.request().override == 1.0
 
 
-def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
+def test_the_override_of_a_dry_run_ends_with_it() -> None:
     screen = Screen(NAMES, Stop(), quiet=True)
     for phase in ("dry run", "move"):
         screen.show(RunStatus(phase, 1, 1, 1.0))
@@ -266,7 +254,7 @@ def test_the_override_of_a_dry_run_ends_with_it_and_a_hold_does_not() -> None:
     assert screen.request().override == 0.5
 
 
-def test_the_override_of_a_dry_run_is_lowered_from_what_it_is() -> None:
+def test_an_override_is_lowered_from_what_it_is() -> None:
     """What goes on at 20 % by order of the run goes on at 10 % after one key, not at 90 %."""
     screen = Screen(NAMES, Stop(), quiet=True)
     screen.show(status(override=0.2))
@@ -376,7 +364,7 @@ def terminal(folder: Path, ending: str = "return") -> Iterator[Terminal]:
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 
 
-def test_keys_arrive_as_wishes_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
+def test_keys_arrive_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
         end.await_told(override=1.0, held=False)
         end.await_seen(b"repetition 3 of 30")
@@ -415,7 +403,7 @@ def test_keys_arrive_as_wishes_and_the_screen_survives_a_resize(tmp_path: Path) 
         pytest.param("return", signal.SIGHUP, 0, marks=pytest.mark.slow),
     ],
 )
-def test_the_terminal_is_as_it_was_however_the_program_ends(
+def test_the_terminal_is_as_it_was_at_every_end(
     tmp_path: Path, ending: str, signum: signal.Signals | None, code: int
 ) -> None:
     with terminal(tmp_path, ending) as end:
@@ -430,10 +418,21 @@ def test_the_terminal_is_as_it_was_however_the_program_ends(
         assert end.seen.count(ENTER) == end.seen.count(LEAVE) == 1
 
 
-def test_a_dry_run_is_accepted_by_the_word_yes_and_nothing_else(tmp_path: Path) -> None:
-    with terminal(tmp_path, "question") as end:
-        for number, answer in enumerate(("y\n", "\n", "yes\n"), start=1):
-            end.await_seen(b"Type yes to accept")
+@pytest.mark.parametrize(
+    ("ending", "asked", "answers"),
+    [
+        ("question", b"Type yes to accept", ("y\n", "\n", "yes\n")),
+        ("contradiction", b"type joint_2 to accept", ("yes\n", "joint_1\n", "joint_2\n")),
+    ],
+)
+def test_a_dry_run_is_accepted_by_one_word_only(
+    tmp_path: Path, ending: str, asked: bytes, answers: tuple[str, ...]
+) -> None:
+    """By yes, or by the names of the joints whose torque contradicts their weight."""
+    with terminal(tmp_path, ending) as end:
+        for number, answer in enumerate(answers, start=1):
+            end.await_seen(asked)
+            assert (b"joint_2: measured torque runs against" in end.seen) is (ending != "question")
             end.seen = b""
             end.answer(answer, number)
         end.await_seen(b"repetition 3 of 30")  # the screen is back
@@ -442,22 +441,7 @@ def test_a_dry_run_is_accepted_by_the_word_yes_and_nothing_else(tmp_path: Path) 
         assert [said["accepted"] for said in end.said()[:3]] == [False, False, True]
 
 
-def test_a_joint_whose_torque_contradicts_its_weight_is_accepted_by_its_name_and_not_by_yes(
-    tmp_path: Path,
-) -> None:
-    with terminal(tmp_path, "contradiction") as end:
-        for number, answer in enumerate(("yes\n", "joint_1\n", "joint_2\n"), start=1):
-            end.await_seen(b"joint_2: measured torque runs against")
-            end.await_seen(b"type joint_2 to accept")
-            end.seen = b""
-            end.answer(answer, number)
-        end.await_seen(b"repetition 3 of 30")
-        end.press("s")
-        assert end.end() == 0
-        assert [said["accepted"] for said in end.said()[:3]] == [False, False, True]
-
-
-def test_a_terminal_that_takes_nothing_more_delays_no_stop(tmp_path: Path) -> None:
+def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
         end.await_seen(b"repetition 3 of 30")
         end.reads = False
@@ -494,7 +478,7 @@ def test_keys_that_are_cut_in_two_are_put_together(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("what", ["a key that fails", "the terminal is gone"])
-def test_keys_that_are_not_read_any_more_are_told(what: str) -> None:
+def test_keys_that_are_not_read_any_more_are_reported(what: str) -> None:
     near, far = os.pipe()
     screen = Screen(NAMES, Stop(), quiet=True)
     screen._keyboard = keyboard = Keyboard(broken)
@@ -513,7 +497,7 @@ def broken(_: str) -> None:
     raise KeyError("no key")
 
 
-def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
+def test_a_picture_that_cannot_be_drawn_ends_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(layout, "status_line", lambda *_: 1 / 0)
@@ -529,7 +513,7 @@ def test_a_picture_that_cannot_be_drawn_is_told_and_ends_nothing(
 # --- no terminal -----------------------------------------------------------------------------
 
 
-def test_without_a_terminal_there_are_lines_and_nobody_accepts() -> None:
+def test_without_a_terminal_there_are_lines() -> None:
     out = StringIO()
     with Screen(NAMES, Stop(), console=Console(file=out, width=200)) as screen:
         assert not screen.can_answer
@@ -551,7 +535,7 @@ def test_quiet_says_nothing() -> None:
     assert out.getvalue() == ""
 
 
-def test_a_pipe_that_is_full_holds_up_neither_what_is_shown_nor_the_end() -> None:
+def test_a_pipe_that_is_full_holds_nothing_up() -> None:
     reads, writes = os.pipe()
     fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, 4096)
     with os.fdopen(writes, "w", buffering=1) as file:
