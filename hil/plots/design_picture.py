@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import groupby
 from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,34 +34,26 @@ Array = NDArray[np.float64]
 Measures = tuple[float, float]
 """log10 det, I_c."""
 
-_MARKERS = "DsP^vX"
-_MARGIN = 0.09
-_LEAST = (0.1, 2.0)
+POSTURES: Final = 7
+_PERIOD: Final = 0.001
+"""s between samples of the correlations; the criteria are those of the same rate."""
+_MARGIN: Final = 0.09
+_LEAST: Final = (0.1, 2.0)
 """The page shows at least this share of I_c, and so many powers of ten of the determinant."""
-_ARROW = 15.0
-"""pt; shorter ways from the point that a motion grew from get no arrow."""
-_LETTER, _KEY, _LINE = 0.062, 0.36, 0.145
-"""inch: a letter of the legend, the room for its marker, a line of it."""
-_CHOSEN = {
-    "marker": "*",
-    "markersize": 13.0,
-    "markerfacecolor": style.LIMIT,
-    "markeredgecolor": "white",
-    "zorder": 4.0,
-}
-_GREW = {
-    "marker": "o",
-    "markersize": 7.5,
-    "markerfacecolor": "none",
-    "markeredgecolor": style.LIMIT,
-    "zorder": 3.5,
-}
-_REFERENCE = {
-    "markersize": 6.0,
-    "markerfacecolor": "white",
-    "markeredgecolor": style.INK,
-    "zorder": 3.0,
-}
+_ARROW: Final = 0.05
+"""Share of the axes; shorter paths from the point that a motion grew from get no arrow."""
+_LETTERS, _LEGEND_LETTERS = 180, 56
+"""In a line of small print across the page, and in one of the legend."""
+_BARS: Final = "the arm (bars from joint to joint: its shapes are not known here)"
+_MARKERS: Final = "DsP^vX"
+_CHOSEN: Final = {"marker": "*", "markersize": 13.0, "markerfacecolor": style.LIMIT, "zorder": 4.0}
+_GREW: Final = {"marker": "o", "markersize": 7.5, "markeredgecolor": style.LIMIT, "zorder": 3.5}
+_OTHER: Final = {"markersize": 6.0, "markeredgecolor": style.INK, "zorder": 3.0}
+_NO_REFERENCES: Final[Mapping[str, Measures]] = MappingProxyType({})
+# inch
+_WIDTH, _ROW, _FRONT, _LEGEND_LINE = 11.8, 1.05, 2.9, 0.145
+_CELL, _SMALLEST, _LARGEST = 0.1, 2.6, 4.0
+_TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
 
 
 class FrontPoints(Protocol):
@@ -80,12 +70,11 @@ class FrontPoints(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class _Mark:
-    """One motion: what the legend says of it, its measures, and how it is drawn."""
+class Mark(NamedTuple):
+    """One motion: what the legend says of it, its I_c and log10 det, and how it is drawn."""
 
     text: str
-    measures: Measures
+    at: Array
     look: Mapping[str, Any]
     compared: bool = False
 
@@ -113,145 +102,100 @@ class FrontView:
     together: bool = False
 
     @property
-    def has_line(self) -> bool:
-        """Whether there is more than one point to join."""
-        return self.front is not None and len(self.front.coupling_index) > 1
+    def line(self) -> Array:
+        """Points of the front to join, by rising I_c (k, 2); none if there is only one."""
+        if self.front is None or len(self.front.coupling_index) < 2:
+            return np.empty((0, 2))
+        points = np.column_stack((self.front.coupling_index, self.front.log10_det))
+        return points[np.argsort(points[:, 0], kind="stable")]
 
-    @cached_property
-    def marks(self) -> list[_Mark]:
+    @property
+    def marks(self) -> list[Mark]:
         """Single motions; one that leaves a parameter unexcited has no place on the page."""
         polished = self.front is not None and not self.on_front
-        found = [_Mark("chosen, polished" if polished else "chosen", self.chosen, _CHOSEN)]
+        found = [("chosen, polished" if polished else "chosen", self.chosen, _CHOSEN, False)]
         if self.knee is not None:
-            found.append(_Mark("grew from", self.knee, _GREW))
+            found.append(("grew from", self.knee, _GREW, False))
         for k, (name, measures) in enumerate(self.references.items()):
-            wording = f"{label(name)} (kinematic)" if name in self.kinematic else label(name)
-            look = {**_REFERENCE, "marker": _MARKERS[k % len(_MARKERS)]}
-            found.append(_Mark(wording, measures, look, compared=True))
-        return [mark for mark in found if np.all(np.isfinite(mark.measures))]
+            kind = " (kinematic)" if name in self.kinematic else ""
+            look = {**_OTHER, "marker": _MARKERS[k % len(_MARKERS)]}
+            found.append((label(name) + kind, measures, look, True))
+        marks = (
+            Mark(f"{text} ({at[0]:.1f}, {at[1]:.1f})", np.array(at[::-1]), look, compared)
+            for text, at, look, compared in found
+        )
+        return [mark for mark in marks if np.all(np.isfinite(mark.at))]
 
-    @cached_property
+    @property
     def window(self) -> Array:
-        """Return from where to where I_c and log10 det are shown (2, 2), NaN without a motion.
+        """From where to where I_c and log10 det are shown (2, 2), NaN without a motion.
 
         References widen it by no more than the front's own size, so that they do not flatten it.
         """
-        own = [m.measures[::-1] for m in self.marks if not m.compared or not self.has_line]
-        points = np.array(own, dtype=np.float64).reshape(-1, 2)
-        if self.front is not None and self.has_line:
-            line = np.column_stack((self.front.coupling_index, self.front.log10_det))
-            points = np.concatenate((points, line))
+        alone = not len(self.line)
+        own = [mark.at for mark in self.marks if alone or not mark.compared]
+        points = np.concatenate((np.reshape(own, (-1, 2)), self.line))
         if not len(points):
             return np.full((2, 2), np.nan)
         low, high = points.min(axis=0), points.max(axis=0)
         size = np.maximum(high - low, (_LEAST[0] * max(abs(high[0]), 1.0), _LEAST[1]))
         middle = (low + high) / 2.0
         low, high = middle - size / 2.0, middle + size / 2.0
-        others = np.array([m.measures[::-1] for m in self.marks if m.compared]).reshape(-1, 2)
+        others = np.reshape([mark.at for mark in self.marks if mark.compared], (-1, 2))
         far = (others < low - size) | (others > high + size)
         shown = np.concatenate((np.where(far, np.nan, others), [low, high]))
         low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
         room = _MARGIN * (high - low)
         return np.stack((low - room, high + room), axis=1)
 
-    def placed(self, mark: _Mark) -> Array:
+    def placed(self, mark: Mark) -> Array:
         """Return where a mark is, from 0 to 1 across and up the page if it has room there (2,)."""
         low, high = self.window.T
-        return np.asarray((np.array(mark.measures[::-1]) - low) / (high - low), dtype=np.float64)
-
-    def is_beyond(self, mark: _Mark) -> bool:
-        """Whether a mark lies beyond the edge."""
-        place = self.placed(mark)
-        return bool(np.any((place < 0.0) | (place > 1.0)))
-
-    def texts(self, width: float) -> tuple[list[str], int]:
-        """Return what the legend says of the line and the marks, and in how many columns.
-
-        Args:
-            width: of the axes [inch].
-        """
-        line = []
-        if self.front is not None and self.has_line:
-            line.append(f"front, {len(self.front.coupling_index)} motions")
-        for mark in self.marks:
-            wording = f"{mark.text} ({mark.measures[0]:.1f}, {mark.measures[1]:.1f})"
-            line.append(wording + (", beyond the edge" if self.is_beyond(mark) else ""))
-        wide = _KEY + _LETTER * max(map(len, line), default=0)
-        columns = 2 if wide <= width / 2.0 else 1
-        letters = int((width / columns - _KEY) / _LETTER)
-        return ["\n".join(textwrap.wrap(text, letters)) for text in line], columns
-
-    def legend_height(self, width: float) -> float:
-        """Return the height [inch] of the legend above axes of a width [inch]."""
-        texts, columns = self.texts(width)
-        lines = [text.count("\n") + 1 for text in texts]
-        rows = math.ceil(len(lines) / columns)
-        per_column = [sum(lines[k * rows : (k + 1) * rows]) for k in range(columns)]
-        return _LINE * max(per_column, default=0) + (0.1 if lines else 0.0)
+        return np.asarray((mark.at - low) / (high - low), dtype=np.float64)
 
 
-def draw_front(axes: Axes, view: FrontView, width: float) -> None:
-    """Draw the front, the chosen motion, and named ones to compare with; a legend above them.
-
-    Args:
-        axes: where.
-        view: what.
-        width: of the axes [inch].
-    """
-    texts, columns = view.texts(width)
+def draw_front(axes: Axes, view: FrontView) -> None:
+    """Draw the front, the chosen motion, and named ones to compare with; a legend above them."""
+    line, handles = view.line, list[Any]()
     if np.all(np.isfinite(view.window)):
         axes.set_xlim(*view.window[0])
         axes.set_ylim(*view.window[1])
-    handles = [_line(axes, view.front)] if view.front is not None and view.has_line else []
-    for mark in view.marks:
-        look = {"linestyle": "none", "markeredgewidth": 1.0, "clip_on": False, **mark.look}
-        # What has no room stands at the edge beyond which it is; the legend says so.
-        at = np.clip(view.placed(mark), 0.0, 1.0)
-        handles += axes.plot(*at, transform=axes.transAxes, **look)
-    _growth(axes, view)
-    axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], min_n_ticks=3))
-    axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], min_n_ticks=3))
-    _name(axes, together=view.together)
-    if handles:
-        axes.legend(
-            handles,
-            texts,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.02),
-            ncols=columns,
-            borderaxespad=0.0,
-            borderpad=0.0,
-            labelspacing=0.35,
-            columnspacing=1.2,
-            frameon=False,
-            fontsize=style.SMALL,
+    if len(line):
+        handles += axes.plot(
+            *line.T,
+            drawstyle="steps-post",  # what is had at most for a coupling index up to that
+            color=style.POSITION,
+            linewidth=1.0,
+            marker="o",
+            markersize=3.4,
+            label=f"front, {len(line)} motions",
+            clip_on=False,
         )
-    style.bare(axes)
-
-
-def _name(axes: Axes, *, together: bool) -> None:
+    for mark in view.marks:
+        # What has no room stands at the edge beyond which it is; the legend says so.
+        place = view.placed(mark)
+        at = np.clip(place, 0.0, 1.0)
+        text = mark.text if np.array_equal(at, place) else f"{mark.text}, beyond the edge"
+        look = {"markerfacecolor": "white", "markeredgecolor": "white", **mark.look}
+        handles += axes.plot(
+            *at, transform=axes.transAxes, label="\n".join(textwrap.wrap(text, _LEGEND_LETTERS)),
+            linestyle="none", clip_on=False, **look,
+        )  # fmt: skip
+    _growth(axes, view)
+    for axis, steps in ((axes.xaxis, 7), (axes.yaxis, 6)):
+        axis.set_major_locator(MaxNLocator(steps, steps=[1, 2, 5, 10], min_n_ticks=3))
     across, up = "coupling index I_c (less is better)", "log₁₀(det ΦᵀΦ / Nᵖ) (more is better)"
-    if together:
+    if view.together:
         across += "\ntogether with earlier archives, weighted"
         up = "log₁₀ det (more is better)\ntogether, weighted"
     axes.set_xlabel(across)
     axes.set_ylabel(up)
-
-
-def _line(axes: Axes, front: FrontPoints) -> Any:
-    order = np.argsort(front.coupling_index, kind="stable")
-    (line,) = axes.plot(
-        front.coupling_index[order],
-        front.log10_det[order],
-        drawstyle="steps-post",  # what is had at most for a coupling index up to that
-        color=style.POSITION,
-        linewidth=1.0,
-        marker="o",
-        markersize=3.4,
-        label=f"front, {len(order)} motions",
-        clip_on=False,
-    )
-    return line
+    if handles:
+        axes.legend(
+            handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.02), frameon=False,
+            borderaxespad=0.0, borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL,
+        )  # fmt: skip
+    style.bare(axes)
 
 
 def _growth(axes: Axes, view: FrontView) -> None:
@@ -259,95 +203,63 @@ def _growth(axes: Axes, view: FrontView) -> None:
     if view.knee is None or not np.all(np.isfinite((view.knee, view.chosen))):
         return
     begin, end = view.knee[::-1], view.chosen[::-1]
-    way = np.ptp(axes.transData.transform([begin, end]), axis=0)
-    if np.hypot(*way) * 72.0 / axes.figure.dpi < _ARROW:
+    if np.hypot(*(np.subtract(end, begin) / np.ptp(view.window, axis=1))) < _ARROW:
         return
-    axes.annotate(
-        "",
-        end,
-        begin,
-        arrowprops={
-            "arrowstyle": "-|>,head_width=0.18,head_length=0.35",
-            "color": style.LIMIT,
-            "linewidth": 0.8,
-            "shrinkA": 4.0,
-            "shrinkB": 5.0,
-        },
-        zorder=3.6,
-    )
+    arrow = {"arrowstyle": "-|>,head_width=0.18,head_length=0.35", "color": style.LIMIT}
+    more = {"linewidth": 0.8, "shrinkA": 4.0, "shrinkB": 5.0}
+    axes.annotate("", end, begin, arrowprops={**arrow, **more}, zorder=3.6)
 
 
 _JOINT = re.compile(r"\d+")
 
 
-def draw_correlation(axes: Axes, scale: Axes, matrix: Array, names: Sequence[str]) -> None:
+def draw_correlation(axes: Axes, matrix: Array, names: Sequence[str]) -> None:
     """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)``, black for 1 and white for 0, in blocks of links.
 
     Args:
-        axes: for the matrix.
-        scale: for the shades.
+        axes: for the matrix; the shades are beside it.
         matrix: correlations of the parameters without friction (b, b); NaN where a motion leaves
             a parameter without excitation.
         names: of the parameters (b,).
     """
     b = len(names)
-    known = bool(np.all(np.isfinite(matrix)))
-    if known:
+    if np.all(np.isfinite(matrix)):
         axes.imshow(np.abs(matrix), cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none")
     else:
         axes.set_xlim(-0.5, b - 0.5)
         axes.set_ylim(b - 0.5, -0.5)
         axes.set_aspect("equal")
+        text = "no correlations:\nthis motion leaves a parameter\n(or a sum of some) unexcited"
         axes.text(
-            0.5,
-            0.5,
-            "no correlations:\nthis motion leaves a parameter\n(or a sum of some) unexcited",
-            transform=axes.transAxes,
-            ha="center",
-            va="center",
-            color=style.LIMIT,
+            0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=style.LIMIT,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
-        )
-    _blocks(axes, names)
-    shade_scale(scale, style.INK, style.MUTED)
-
-
-def blocks(names: Sequence[str]) -> list[tuple[str, int, int]]:
-    """Return (label, first, one after the last) of neighbours that belong to the same joint."""
-    found = []
-    for joint, members in groupby(range(len(names)), key=lambda k: _joint(names[k])):
-        indices = list(members)
-        found.append((joint, indices[0], indices[-1] + 1))
-    return found
-
-
-def _joint(name: str) -> str:
-    match = _JOINT.search(name)
-    return "" if match is None else match.group()
-
-
-def _blocks(axes: Axes, names: Sequence[str]) -> None:
+        )  # fmt: skip
     found = blocks(names)
     for _, first, _ in found[1:]:
         for line in (axes.axhline, axes.axvline):
             line(first - 0.5, color=style.POSITION, linewidth=0.7)
     middles = [(first + last - 1) / 2.0 for _, first, last in found]
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_ticks(middles, [label for label, _, _ in found], color=style.INK)
+        axis.set_ticks(middles, [joint for joint, _, _ in found], color=style.INK)
     axes.tick_params(length=0.0, pad=3.0)
     axes.set_xlabel("parameters by joint, friction left out")
     for spine in axes.spines.values():
         spine.set_color(style.MUTED)
+    shade_scale(axes.inset_axes((1.03, 0.5, 0.04, 0.5)), style.INK, style.MUTED)
 
 
-_LETTERS = 180
-"""In a line of small print across the page."""
-_BARS = "the arm (bars from joint to joint: its shapes are not known here)"
-_SMALL = style.SMALL + 0.5
+def blocks(names: Sequence[str]) -> list[tuple[str, int, int]]:
+    """Return (label, first, one after the last) of neighbours that belong to the same joint."""
+
+    def joint(k: int) -> str:
+        match = _JOINT.search(names[k])
+        return "" if match is None else match.group()
+
+    groups = ((key, list(members)) for key, members in groupby(range(len(names)), key=joint))
+    return [(key, members[0], members[-1] + 1) for key, members in groups]
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of the heading, its size in points."""
 
     text: str
@@ -356,107 +268,49 @@ class Line:
     weight: str = "normal"
 
 
-@dataclass(frozen=True)
-class Remarks:
-    """What has to be known beside the numbers.
-
-    Attributes:
-        unchecked: what the search did not look at.
-        complete: whether the search came to its end.
-        together: whether the criteria are those together with earlier archives.
-        margins: how close the motion comes to its limits.
-    """
-
-    unchecked: Sequence[str] = ()
-    complete: bool = True
-    together: bool = False
-    margins: str = ""
-
-
-def heading(
-    excitation: Excitation, title: str, remarks: Remarks, *, shapes: bool, outlined: bool
-) -> list[Line]:
-    """Return the lines above the page.
-
-    Args:
-        excitation: the motion.
-        title: the first words.
-        remarks: beside the numbers.
-        shapes: whether the arm is drawn as it is.
-        outlined: whether a view shows a box in front of or behind the arm.
-    """
-    lines = _numbers(excitation, title, together=remarks.together)
-    if remarks.unchecked:
-        missing = ", ".join(remarks.unchecked)
-        lines += _red(f"NOT CHECKED: {missing}; not for a robot")
-    if not remarks.complete:
-        lines += _red("search stopped early: it may have missed better motions")
-    lines += _small(remarks.margins, style.INK)
-    legend = [
-        "red dashes: limits",
-        "grey lines: the postures numbered below",
-        f"blue: all that {'the arm' if shapes else _BARS} sweeps",
-        "brown: the way of its end to the next one",
-    ]
-    if outlined:
-        legend.append("dashed boxes: in front of or behind the arm")
-    return lines + _small("; ".join(legend), style.MUTED)
-
-
 def number(value: float, digits: int) -> str:
     """Return a criterion as text; a motion that leaves a parameter unexcited has infinite ones."""
     return f"{value:.{digits}f}" if np.isfinite(value) else ("∞" if value > 0.0 else "−∞")
 
 
-def _numbers(excitation: Excitation, title: str, *, together: bool) -> list[Line]:
-    """The title, and the criteria: apart from it where they are not those of the motion alone."""
+def _heading(
+    excitation: Excitation,
+    title: str,
+    unchecked: Sequence[str],
+    margins: str,
+    *,
+    complete: bool,
+    together: bool,
+    shapes: bool,
+) -> list[Line]:
+    """The lines above the page: criteria, what was not looked at, and what the colours mean."""
     criteria = excitation.criteria
-    parts = [
-        label(title),
-        f"method {excitation.method}",
-        f"{excitation.trajectory.duration:.2f} s",
-    ]
     determinant, index = number(criteria.log10_det, 2), f"I_c {number(criteria.coupling_index, 1)}"
-    if not together:
-        parts += [f"log₁₀(det ΦᵀΦ / Nᵖ) {determinant}", index]
-        return [Line(" · ".join(parts), style.TITLE, style.INK)]
-    parts.append("together with earlier archives, weighted")
-    return [
-        Line(" · ".join(parts), style.TITLE, style.INK),
-        Line(
+    method, duration = f"method {excitation.method}", f"{excitation.trajectory.duration:.2f} s"
+    alone = [f"log₁₀(det ΦᵀΦ / Nᵖ) {determinant}", index]
+    parts = ["together with earlier archives, weighted"] if together else alone
+    lines = [Line(" · ".join([label(title), method, duration, *parts]), style.TITLE, style.INK)]
+    if together:
+        text = (
             f"log₁₀ det {determinant} and {index} of all of it together: "
-            "not comparable with those of a motion alone",
-            style.TEXT,
-            style.INK,
-        ),
-    ]
-
-
-def _red(text: str) -> list[Line]:
-    wrapped = textwrap.wrap(text, _LETTERS * 2 // 3)
-    return [Line(line, style.TEXT + 1.0, style.LIMIT, "bold") for line in wrapped]
-
-
-def _small(text: str, colour: str) -> list[Line]:
-    printable = "".join(c if c.isprintable() else " " for c in text)
-    return [Line(line, _SMALL, colour) for line in textwrap.wrap(printable, _LETTERS)]
-
-
-POSTURES: Final = 7
-_PERIOD = 0.001
-"""s between samples of the correlations; the criteria are those of the same rate."""
-_NO_REFERENCES: Mapping[str, Measures] = MappingProxyType({})
-
-# All in inches.
-_WIDTH = 11.8
-_LEFT, _RIGHT = 0.78, 0.2
-_TITLE_AT, _BETWEEN_LINES, _HEAD = 0.36, 0.23, 0.53
-_GAP, _FOOT = 0.92, 0.5
-_ROW, _BETWEEN_ROWS, _BETWEEN_COLUMNS = 0.98, 0.1, 0.56
-_AXIS, _SHADES = 0.78, 0.5
-_CELL, _SMALLEST, _LARGEST = 0.1, 2.6, 4.0
-_FRONT, _ABOVE_FRONT = 2.3, 0.62
-_BETWEEN_VIEWS, _BETWEEN_POSTURES = 0.1, 0.07
+            "not comparable with those of a motion alone"
+        )
+        lines.append(Line(text, style.TEXT, style.INK))
+    missing = ", ".join(unchecked)
+    red = [f"NOT CHECKED: {missing}; not for a robot"] if unchecked else []
+    red += [] if complete else ["search stopped early: it may have missed better motions"]
+    for text in red:
+        wrapped = textwrap.wrap(text, _LETTERS * 2 // 3)
+        lines += [Line(line, style.TEXT + 1.0, style.LIMIT, "bold") for line in wrapped]
+    legend = (
+        "red dashes: limits; grey lines: the postures numbered below; blue: all that "
+        f"{'the arm' if shapes else _BARS} sweeps; brown: the path of its end to the next one"
+    )
+    for text, colour in ((margins, style.INK), (legend, style.MUTED)):
+        printable = "".join(c if c.isprintable() else " " for c in text)
+        wrapped = textwrap.wrap(printable, _LETTERS)
+        lines += [Line(line, style.SMALL + 0.5, colour) for line in wrapped]
+    return lines
 
 
 def draw_design(
@@ -490,134 +344,65 @@ def draw_design(
         margins: how close the motion comes to its limits, in words.
         title: stands above the page; the cell's name if empty.
     """
-    strip, arm = _strip(excitation.trajectory, cell)
-    remarks = Remarks(unchecked, complete, together, margins)
-    lines = heading(
+    arm, model, trajectory = Arm.from_urdf(cell.urdf), cell.model, excitation.trajectory
+    strip = Strip.of(arm, trajectory, cell.workspace, POSTURES)
+    lines = _heading(
         excitation,
         title or cell.name,
-        remarks,
+        unchecked,
+        margins,
+        complete=complete,
+        together=together,
         shapes=arm.has_shapes,
-        outlined=strip.has_outlines,
     )
     view = None
     if front is not None or references:
-        measures = _chosen(excitation, front, chosen)
+        criteria = excitation.criteria
+        measures = criteria.log10_det, criteria.coupling_index
+        if front is not None and chosen is not None:  # those by which it lies on the front
+            measures = float(front.log10_det[chosen]), float(front.coupling_index[chosen])
         view = FrontView(front, measures, chosen is not None, knee, references, kinematic, together)
-    with style.page():
-        return _page(excitation.trajectory, cell, strip, lines, view)
-
-
-def _strip(trajectory: Trajectory, cell: Cell) -> tuple[Strip, Arm]:
-    arm = Arm.from_urdf(cell.urdf)
-    return Strip.of(arm, trajectory, cell.workspace, POSTURES), arm
-
-
-def _page(
-    trajectory: Trajectory, cell: Cell, strip: Strip, lines: list[Line], front: FrontView | None
-) -> Figure:
-    """Place everything from top to bottom."""
-    model = cell.model
     side = float(np.clip(_CELL * len(model.base.names), _SMALLEST, _LARGEST))
-    head = _TITLE_AT + _BETWEEN_LINES * (len(lines) - 1) + _HEAD
-    beside = side
-    if front is not None:
-        beside += _ABOVE_FRONT + front.legend_height(side + _SHADES) + _FRONT
-    upper = max(_ROW * model.n_joints, beside)
-    gap = _GAP + (_BETWEEN_LINES if front is not None and front.together else 0.0)
-    width = (_WIDTH - _LEFT - _RIGHT + _BETWEEN_POSTURES) / POSTURES - _BETWEEN_POSTURES
-    views = [width * strip.shape(view) for view in VIEWS]
-    sheet = _Sheet(head + upper + gap + sum(views) + _BETWEEN_VIEWS * (len(views) - 1) + _FOOT)
-    matrix = _WIDTH - _RIGHT - _SHADES - side
-    rows = sheet.rows((_LEFT, head, matrix - _AXIS - _LEFT, upper), model.n_joints)
-    limits, frame = cell.joint_limits, AngleFrame.of(cell)
-    draw_motion(rows, trajectory, limits, cell.joint_names, frame, strip.postures)
-    axes = sheet.axes(matrix, head, side, side)
-    shades = sheet.axes(matrix + side + 0.1, head, 0.13, min(side, 1.6))
-    _correlations(axes, shades, trajectory, model)
-    if front is not None:
-        at = sheet.axes(matrix, head + upper - _FRONT, side + _SHADES, _FRONT)
-        draw_front(at, front, side + _SHADES)
-    draw_strip(sheet.strip(head + upper + gap, width, views), strip)
-    sheet.head(lines)
-    return sheet.figure
-
-
-class _Sheet:
-    """A page on which axes are placed in inches from its upper left corner."""
-
-    def __init__(self, height: float) -> None:
-        self.height = height
-        self.figure = Figure(figsize=(_WIDTH, height))
-
-    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
-        bottom = self.height - top - height
-        return self.figure.add_axes(
-            (left / _WIDTH, bottom / self.height, width / _WIDTH, height / self.height)
-        )
-
-    def rows(self, place: tuple[float, float, float, float], count: int) -> list[list[Axes]]:
-        """Two axes in each of so many rows at (left, top, width, height)."""
-        left, top, width, height = place
-        wide = (width - _BETWEEN_COLUMNS) / 2.0
-        high = (height + _BETWEEN_ROWS) / count - _BETWEEN_ROWS
-        return [
-            [
-                self.axes(
-                    left + column * (wide + _BETWEEN_COLUMNS),
-                    top + row * (high + _BETWEEN_ROWS),
-                    wide,
-                    high,
-                )
-                for column in range(2)
-            ]
-            for row in range(count)
-        ]
-
-    def strip(self, top: float, width: float, heights: list[float]) -> list[list[Axes]]:
-        """One row of postures per view."""
-        rows = []
-        for height in heights:
-            rows.append(
-                [
-                    self.axes(_LEFT + k * (width + _BETWEEN_POSTURES), top, width, height)
-                    for k in range(POSTURES)
-                ]
-            )
-            top += height + _BETWEEN_VIEWS
-        return rows
-
-    def head(self, lines: list[Line]) -> None:
-        """Write lines above everything else."""
+    beside = 0.0 if view is None else _FRONT + _LEGEND_LINE * (1.5 * len(view.marks) + 1)
+    head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT
+    upper = max(_ROW * model.n_joints + 0.6, side + 1.0 + beside)
+    shapes = [strip.shape(one) for one in VIEWS]
+    lower = 0.9 + sum(shapes) * (_WIDTH - 1.2) / POSTURES
+    height = head + upper + lower
+    with style.page():
+        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        parts: Any = figure.subfigures(3, 1, height_ratios=(head, upper, lower))
+        _, top, bottom = parts
+        left, right = top.subfigures(1, 2, width_ratios=(_WIDTH - side - 1.7, side + 1.7))
+        rows = left.subplots(model.n_joints, 2, squeeze=False).tolist()
+        frame = AngleFrame.of(cell)
+        draw_motion(rows, trajectory, cell.joint_limits, cell.joint_names, frame, strip.postures)
+        left.align_ylabels()
+        if view is None:
+            _correlations(right.subplots(), trajectory, model)
+        else:
+            matrix, below = right.subplots(2, 1, height_ratios=(side + 0.6, beside))
+            _correlations(matrix, trajectory, model)
+            draw_front(below, view)
+        draw_strip(bottom.subplots(2, POSTURES, height_ratios=shapes).tolist(), strip)
         for k, line in enumerate(lines):
-            self.figure.text(
-                _LEFT / _WIDTH,
-                1.0 - (_TITLE_AT + k * _BETWEEN_LINES) / self.height,
-                line.text,
-                fontsize=line.size,
-                color=line.colour,
-                fontweight=line.weight,
+            at = 1.0 - (_TITLE_AT + k * _HEAD_LINE) / height
+            figure.text(
+                0.07, at, line.text, fontsize=line.size, color=line.colour, fontweight=line.weight
             )
+    return figure
 
 
-def _correlations(axes: Axes, shades: Axes, trajectory: Trajectory, model: RobotModel) -> None:
+def _correlations(axes: Axes, trajectory: Trajectory, model: RobotModel) -> None:
     motion = sampled(trajectory, _PERIOD)
     unknown = np.zeros_like(motion.position)  # torque plays no part in the excitation
     gram = information(Factor.from_samples(model, motion, unknown))
-    b = len(model.base.names)
-    draw_correlation(axes, shades, correlation(gram)[:b, :b], model.base.names)
-    p = model.n_parameters
-    index = number(coupling_index(gram), 1)
+    b, p = len(model.base.names), model.n_parameters
+    draw_correlation(axes, correlation(gram)[:b, :b], model.base.names)
     axes.set_title(
-        f"|correlation| from this motion alone\n"
-        f"all {p} parameters: I_c {index} of {coupling_index_max(p):.0f}",
+        f"|correlation| from this motion alone\nall {p} parameters: I_c "
+        f"{number(coupling_index(gram), 1)} of {coupling_index_max(p):.0f}",
         loc="left",
         color=style.MUTED,
         pad=5.0,
     )
-
-
-def _chosen(excitation: Excitation, front: FrontPoints | None, chosen: int | None) -> Measures:
-    """Return the measures of the motion, those by which it lies on the front if it does."""
-    if front is None or chosen is None:
-        return excitation.criteria.log10_det, excitation.criteria.coupling_index
-    return float(front.log10_det[chosen]), float(front.coupling_index[chosen])

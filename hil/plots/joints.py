@@ -23,8 +23,6 @@ _SAMPLES = 4000
 _LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
 _LETTERS = 12
 """As many as a line along a row's height takes."""
-_NAME = 0.4
-"""inch from the axes to the name, which leaves room for the limits' numbers."""
 
 
 def draw_motion(
@@ -64,21 +62,15 @@ def draw_motion(
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
             style.bare(axes)
             axes.grid(False, axis="x")
-        _name(row[0], broken(name))
+        name = broken(name)
+        size = style.TEXT - (1.0 if "\n" in name else 0.0)
+        row[0].set_ylabel(name, color=style.INK, fontsize=size)
     for axes, (title, *_) in zip(rows[0], columns, strict=False):
         axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
         for number, at in enumerate(postures, 1):
             _number(axes, number, at, fontweight="bold", annotation_clip=False)
     for axes in rows[-1]:
         axes.set_xlabel("time [s]")
-
-
-def _name(axes: Axes, name: str) -> None:
-    """Write a name as far from the axes as all others, whatever their width."""
-    size = style.TEXT if "\n" not in name else style.TEXT - 1.0
-    axes.set_ylabel(name, color=style.INK, fontsize=size)
-    width = axes.bbox.width / axes.figure.dpi
-    axes.yaxis.set_label_coords(-_NAME / width, 0.5)
 
 
 def broken(name: str) -> str:

@@ -211,6 +211,7 @@ def draw_plan(
         )
         rows = [[figure.add_subplot(grid[j, k]) for k in range(3)] for j in range(n)]
         draw_joints(rows, plan, joint_names, frame)
+        figure.align_ylabels([row[0] for row in rows])
         if corner is not None:
             lower = figure.add_gridspec(
                 1, 2, left=0.08, right=0.76, top=(_BOTTOM + _CORNER) / height,

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from hil.arm import Arm, reach
 from hil.plots import style
-from identification.excitation import Box, Workspace
+from identification.excitation import Workspace
 from planner import Trajectory
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ VIEWS = (SIDE, TOP)
 _SWEPT, _SWEPT_EDGE = "#dfe8f1", "#8fa9c4"
 _BASE, _ARM, _ARM_EDGE = "#8a8a8a", "#4b5763", "#ffffff"
 _PATH = style.ACCELERATION
-_SOLID, _HATCH, _OUTLINE = "#ede7d9", "#b5a98c", "#8a7c58"
+_SOLID, _HATCH = "#ede7d9", "#a09270"
 _STEP = 0.03
 """s between two looks at the arm for what it sweeps."""
 _LONGEST = 1500
@@ -112,8 +112,6 @@ _NEAR = 0.2
 _GRID = 500
 """Points of the grid across a view, as many as a printer's dots."""
 _HIGHEST, _FLATTEST = 1.3, 0.5
-_OVERLAID = 0.01
-"""A box covers the arm that lies over more than this share of what is swept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,34 +193,6 @@ class Strip:
             for view in VIEWS
         )
 
-    @cached_property
-    def overlaid(self) -> tuple[tuple[bool, ...], ...]:
-        """Return of each of VIEWS which boxes it lays over the arm: in front of it or behind."""
-        return tuple(
-            tuple(self._is_overlaid(box, view, sweep) for box in self.workspace.boxes)
-            for view, sweep in zip(VIEWS, self.sweeps, strict=True)
-        )
-
-    @property
-    def has_outlines(self) -> bool:
-        """Whether the edge of a box that is laid over the arm is seen in a view."""
-        return any(
-            self.extents[axis][0] < edge < self.extents[axis][1]
-            for view, overlaid in zip(VIEWS, self.overlaid, strict=True)
-            for box, over in zip(self.workspace.boxes, overlaid, strict=True)
-            for axis in view.axes
-            for edge in (box.lower[axis], box.upper[axis])
-            if over
-        )
-
-    def _is_overlaid(self, box: Box, view: Projection, sweep: Array) -> bool:
-        inside = np.ones(sweep.shape, dtype=bool)
-        for axis, shape in ((view.across, (1, -1)), (view.up, (-1, 1))):
-            low, high = self.extents[axis]
-            grid = np.linspace(low, high, sweep.shape[shape.index(-1)])
-            inside &= ((grid > box.lower[axis]) & (grid < box.upper[axis])).reshape(shape)
-        return bool(sweep[inside].sum() > _OVERLAID * sweep.sum())
-
     def shape(self, view: Projection) -> float:
         """Return height over width of a view."""
         size = np.ptp(self.extents, axis=1)
@@ -238,12 +208,12 @@ def posture_times(trajectory: Trajectory, count: int) -> Array:
 
 def draw_strip(rows: Sequence[Sequence[Axes]], strip: Strip) -> None:
     """Draw one row of axes per view, one of its axes per posture."""
-    for row, view, sweep, overlaid in zip(rows, VIEWS, strip.sweeps, strip.overlaid, strict=True):
+    for row, view, sweep in zip(rows, VIEWS, strip.sweeps, strict=True):
         for k, axes in enumerate(row):
             axes.set_aspect("equal")
             axes.set_xlim(*strip.extents[view.across])
             axes.set_ylim(*strip.extents[view.up])
-            _surroundings(axes, strip.workspace, view, overlaid)
+            _surroundings(axes, strip.workspace, view)
             _room(axes, sweep)
             _path(axes, strip, k, view)
             _bones(axes, strip.bones[k][..., view.axes])
@@ -303,21 +273,16 @@ def _path(axes: Axes, strip: Strip, k: int, view: Projection) -> None:
         )
 
 
-def _surroundings(
-    axes: Axes, workspace: Workspace, view: Projection, overlaid: Sequence[bool]
-) -> None:
-    """Draw obstacles below what the arm sweeps, and their outlines above it: both are seen.
-
-    Of boxes that the view lays over the arm the outline is all: they would hide it.
-    """
+def _surroundings(axes: Axes, workspace: Workspace, view: Projection) -> None:
+    """Draw obstacles below what the arm sweeps, and their outlines above it: both are seen."""
     left, right = axes.get_xlim()
     bottom, _ = axes.get_ylim()
     if view.up == 2 and workspace.floor is not None:
         _solid(axes, (left, bottom), (right, workspace.floor))
         axes.axhline(workspace.floor, color=style.INK, linewidth=1.0, zorder=1.6)
-    for box, over in zip(workspace.boxes, overlaid, strict=True):
+    for box in workspace.boxes:
         low, high = ((corner[view.across], corner[view.up]) for corner in (box.lower, box.upper))
-        (_outline if over else _solid)(axes, low, high)
+        _solid(axes, low, high)
     for wall in workspace.walls:
         length = float(np.linalg.norm(wall.normal))
         across, up = wall.normal[view.across] / length, wall.normal[view.up] / length
@@ -328,27 +293,12 @@ def _surroundings(
 
 def _solid(axes: Axes, low: tuple[float, float], high: tuple[float, float]) -> None:
     size = (high[0] - low[0], high[1] - low[1])
-    axes.add_patch(Rectangle(low, *size, facecolor=_SOLID, edgecolor="none", zorder=0.5))
     axes.add_patch(
         Rectangle(
-            low, *size, facecolor="none", edgecolor=_HATCH, linewidth=0.8, hatch="////", zorder=1.5
+            low, *size, facecolor=_SOLID, edgecolor=_HATCH, hatch="////", linewidth=0.0, zorder=0.5
         )
     )
-
-
-def _outline(axes: Axes, low: tuple[float, float], high: tuple[float, float]) -> None:
-    axes.add_patch(
-        Rectangle(
-            low,
-            high[0] - low[0],
-            high[1] - low[1],
-            facecolor="none",
-            edgecolor=_OUTLINE,
-            linewidth=0.9,
-            linestyle=(0, (4, 2)),
-            zorder=1.5,
-        )
-    )
+    axes.add_patch(Rectangle(low, *size, fill=False, edgecolor=_HATCH, linewidth=0.9, zorder=1.5))
 
 
 def _dress(axes: Axes, view: Projection, *, first: bool) -> None:
