@@ -1,5 +1,6 @@
-"""The public names of the package, which stand in `identification` as well."""
+"""The public names of the package, which are names of `identification` as well."""
 
+# ruff: noqa: F401
 from identification.errors import IdentificationError, ModelError, ShapeError
 from identification.estimators.consistent import (
     Consistency,
@@ -65,91 +66,4 @@ from identification.validation.evidence import Evidence, gather
 from identification.validation.prediction import PredictionError, prediction_error
 from identification.validation.verdict import Thresholds, Verdict, judge
 
-__all__ = [
-    # model
-    "Anchors",
-    "BaseParameters",
-    "Coupling",
-    "ExtensionSpring",
-    "FrictionLaw",
-    "GasCylinder",
-    "JointElements",
-    "JointFriction",
-    "Motion",
-    "Payload",
-    "Regressor",
-    "RobotModel",
-    "TorsionSpring",
-    # recordings and their preparation
-    "Recording",
-    "Clock",
-    "TimeBase",
-    "time_base",
-    "true_times",
-    "Preprocessing",
-    "Samples",
-    "prepare",
-    "smooth",
-    "standstill_variance",
-    "DelayEstimate",
-    "estimate_delays",
-    "delay_sensitivity",
-    "rate_products",
-    "with_uncertain_delay",
-    "compensate",
-    "Gains",
-    "identify_gains",
-    # reduction of samples
-    "Factor",
-    "NormalEquations",
-    "QRFactor",
-    "PhaseFactor",
-    "instrument_factor",
-    # estimators: from recordings
-    "Estimate",
-    "fit_least_squares",
-    "RobustEstimate",
-    "robust_estimate",
-    "Huber",
-    "Tukey",
-    "GaussianPrior",
-    "PosteriorEstimate",
-    "fit_with_prior",
-    "nominal_prior",
-    "RepeatedEstimate",
-    "estimate_repetitions",
-    # estimators: from factors
-    "estimate",
-    "ordinary_least_squares",
-    "with_prior",
-    "with_block_covariance",
-    "Consistency",
-    "ConsistentEstimate",
-    "consistent_estimate",
-    "planned_motion",
-    "InstrumentalEstimate",
-    "estimate_instrumental",
-    "EndogeneityTest",
-    "endogeneity_test",
-    "Elimination",
-    "eliminate",
-    # validation
-    "PredictionError",
-    "prediction_error",
-    "Evidence",
-    "gather",
-    "Thresholds",
-    "Verdict",
-    "judge",
-    # back to other tools
-    "write_urdf",
-    "parameters_csv",
-    "parameters_json",
-    "friction_in_words",
-    "friction_source",
-    # errors
-    "IdentificationError",
-    "ModelError",
-    "ShapeError",
-    "RecordingError",
-]
+__all__ = [name for name in globals() if not name.startswith("_")]

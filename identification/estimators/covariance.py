@@ -25,14 +25,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.estimators.losses import LeastSquares, Loss
+from identification.estimators.losses import Loss
 from identification.factor.factor import (
     Estimate,
     Solution,
@@ -113,7 +113,7 @@ def block_covariance(
         part = slice(start, start + _AT_ONCE)
         information = longer.blocks(part).weighted(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
-    return _sandwich(shares, scores, solution, prior, length * FINE_BLOCK)
+    return _sandwich(shares, scores, solution, length * FINE_BLOCK, prior)
 
 
 def cluster_covariance(
@@ -139,11 +139,15 @@ def cluster_covariance(
     length = block_length(scores)
     length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
     shares = _shares(merged(information, length), solution.root, solution.root)
-    return _sandwich(shares, merged(scores, length), solution, prior, length * block)
+    return _sandwich(shares, merged(scores, length), solution, length * block, prior)
 
 
 def _sandwich(
-    shares: Array, scores: Array, solution: Solution, prior: Array | None, duration: float
+    shares: Array,
+    scores: Array,
+    solution: Solution,
+    duration: float,
+    prior: Array | None = None,
 ) -> Clustered:
     """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p)."""
     corrected = leverage_corrected(shares, scores @ solution.root)
@@ -296,18 +300,12 @@ _FLAT: Final = 1e-3
 _PARTICIPATION: Final = 1e-3
 
 
-class _Blocks(NamedTuple):
-    information: Array  # (B, k, k), in coordinates in which that of squares sums to 1
-    scores: Array  # (B, p)
-    rows: NDArray[np.intp]  # (B,)
-
-
 def clustered_covariance(
     model: RobotModel,
     recordings: Sequence[Samples],
     solution: Solution,
     weights: Array,
-    loss: Loss = LeastSquares(),  # noqa: B008 - frozen
+    loss: Loss = Loss(),  # noqa: B008 - frozen
 ) -> Clustered:
     """Covariance of weighted estimates with any loss; samples are read once, one at a time.
 
@@ -319,60 +317,35 @@ def clustered_covariance(
             residual is.
         loss: what was minimised.
     """
-    blocks = _reduce(model, recordings, solution, weights, loss)
-    used = blocks.rows > 0
-    length = block_length(blocks.scores[used])
-    information = merged(blocks.information[used], length)
+    count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
+    k = solution.root.shape[1]
+    information = np.zeros((count, k, k))  # in coordinates in which that of squares sums to 1
+    scores, rows = np.zeros((count, model.n_parameters)), np.zeros(count, dtype=np.intp)
+    for samples in recordings:
+        index = fine_blocks(samples)
+        np.add.at(rows, index, np.count_nonzero(samples.usable, axis=1))
+        for part, tables in augmented_rows(model, samples):
+            for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
+                columns = table[:-1]
+                error = table[-1] - solution.values[used] @ columns
+                scaled = error * np.sqrt(weights[joint])
+                score = weights[joint] * loss.weight(scaled) * error
+                unit = columns.T @ solution.root[used]
+                curved = unit * (weights[joint] * loss.slope(scaled))[:, None]
+                for block, at in block_runs(index[part]):
+                    scores[block, used] += columns[:, at] @ score[at]
+                    information[block] += curved[at].T @ unit[at]
+    length = block_length(scores[rows > 0])
+    information = merged(information[rows > 0], length)
     curvature, vectors = np.linalg.eigh(information.sum(axis=0))
     steep = curvature > _FLAT
     # In these coordinates all blocks together have the information 1.
     to_unit = vectors[:, steep] / np.sqrt(curvature[steep])
-    scores = merged(blocks.scores[used], length) @ solution.root @ to_unit
-    corrected = leverage_corrected(to_unit.T @ information @ to_unit, scores)
-    spread = solution.root @ to_unit @ corrected.T
     size = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
     flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)
-    determined = solution.determined & (flat < _PARTICIPATION * size)
-    covariance = spread @ spread.T
-    mark_undetermined(covariance, determined)
-    count = len(scores)
-    return Clustered(
-        covariance=covariance,
-        determined=determined,
-        design_effect=float((corrected**2).sum() / max(1, corrected.shape[1])),
-        interval_factor=float(student_limit(0.025, max(1, count - 1))),
-        words=f"cluster-robust covariance over {count} blocks of {length * FINE_BLOCK:g} s",
-        blocks=count,
+    steep_solution = solution._replace(
+        root=solution.root @ to_unit,
+        determined=solution.determined & (flat < _PARTICIPATION * size),
     )
-
-
-def _reduce(
-    model: RobotModel,
-    recordings: Sequence[Samples],
-    solution: Solution,
-    weights: Array,
-    loss: Loss,
-) -> _Blocks:
-    k = solution.root.shape[1]
-    count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
-    blocks = _Blocks(
-        np.zeros((count, k, k)),
-        np.zeros((count, model.n_parameters)),
-        np.zeros(count, dtype=np.intp),
-    )
-    for samples in recordings:
-        index = fine_blocks(samples)
-        np.add.at(blocks.rows, index, np.count_nonzero(samples.usable, axis=1))
-        for part, rows in augmented_rows(model, samples):
-            for joint, (table, used) in enumerate(zip(rows, model.plan.columns, strict=True)):
-                columns, root = table[:-1], solution.root[used]
-                error = table[-1] - solution.values[used] @ columns
-                scaled = error * np.sqrt(weights[joint])
-                score = weights[joint] * loss.weight(scaled) * error
-                slope = weights[joint] * loss.slope(scaled)
-                unit = columns.T @ root
-                curved = unit * slope[:, None]
-                for block, at in block_runs(index[part]):
-                    blocks.scores[block, used] += columns[:, at] @ score[at]
-                    blocks.information[block] += curved[at].T @ unit[at]
-    return blocks
+    shares = to_unit.T @ information @ to_unit
+    return _sandwich(shares, merged(scores[rows > 0], length), steep_solution, length * FINE_BLOCK)

@@ -20,7 +20,7 @@ from identification.estimators.covariance import clustered_covariance, with_bloc
 from identification.factor.factor import (
     Estimate,
     Factor,
-    JointFactor,
+    QRFactor,
     estimate,
     joint_weights,
     mark_undetermined,
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Weighting = Literal["ordinary", "weighted"]
 
 
-def ordinary_least_squares(model: RobotModel, factor: JointFactor) -> Estimate:
+def ordinary_least_squares(model: RobotModel, factor: Factor) -> Estimate:
     r"""Least squares with the same weight for every joint's residual.
 
     The covariance is the sandwich for white residuals whose variance differs by joint
@@ -85,7 +85,7 @@ def fit_least_squares(
     if not factor.samples.any():
         raise IdentificationError(nothing_usable(model))
     weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(factor)
-    if isinstance(factor, Factor):
+    if not isinstance(factor, QRFactor):
         classical = estimate(model, factor, weights)
         return with_block_covariance(classical, phase, weights, f"{weighting} least squares")
     solution = factor.solve(weights)

@@ -7,7 +7,6 @@ covariance by the slope :math:`\psi'(x)`, with x the residual in standard deviat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,43 +16,25 @@ from identification.errors import IdentificationError
 Array = NDArray[np.float64]
 
 
-class Loss(Protocol):
-    """A loss, by what a fit needs of it."""
+class Loss:
+    """The square, and what every loss has."""
 
     @property
     def name(self) -> str:
         """Name and constant, in words."""
-        ...
-
-    def weight(self, x: Array) -> Array:
-        """Return psi(x)/x, between 0 and 1, for residuals in standard deviations."""
-        ...
-
-    def slope(self, x: Array) -> Array:
-        """Return psi'(x), at most 1."""
-        ...
-
-
-@dataclass(frozen=True)
-class LeastSquares:
-    """The square: every row has weight one."""
-
-    @property
-    def name(self) -> str:
-        """Name, in words."""
         return "squares"
 
     def weight(self, x: Array) -> Array:
-        """Return one."""
+        """Return psi(x)/x, between 0 and 1, for residuals in standard deviations."""
         return np.ones_like(x)
 
     def slope(self, x: Array) -> Array:
-        """Return one."""
+        """Return psi'(x), at most 1."""
         return np.ones_like(x)
 
 
 @dataclass(frozen=True)
-class Huber:
+class Huber(Loss):
     """Square within `tuning` standard deviations, linear beyond (Huber 1964).
 
     Has one minimum, whatever the start. An outlier counts as much as `tuning` deviations,
@@ -66,7 +47,9 @@ class Huber:
     tuning: float = 1.345
 
     def __post_init__(self) -> None:
-        _check(self.tuning)
+        if not (np.isfinite(self.tuning) and self.tuning > 0.0):
+            text = f"a loss with the constant {self.tuning}: it must be positive"
+            raise IdentificationError(text)
 
     @property
     def name(self) -> str:
@@ -83,7 +66,7 @@ class Huber:
 
 
 @dataclass(frozen=True)
-class Tukey:
+class Tukey(Huber):
     """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974).
 
     Has more than one minimum and must be started close to the right one, from Huber's.
@@ -93,9 +76,6 @@ class Tukey:
     """
 
     tuning: float = 4.685
-
-    def __post_init__(self) -> None:
-        _check(self.tuning)
 
     @property
     def name(self) -> str:
@@ -114,8 +94,3 @@ class Tukey:
     def _squared(self, x: Array) -> Array:
         # Clipped, so that an infinite residual has weight zero and not NaN.
         return np.minimum(np.abs(x) / self.tuning, 1.0) ** 2
-
-
-def _check(tuning: float) -> None:
-    if not (np.isfinite(tuning) and tuning > 0.0):
-        raise IdentificationError(f"a loss with the constant {tuning}: it must be positive")

@@ -22,7 +22,7 @@ from identification.estimators.covariance import block_covariance, clustered_cov
 from identification.factor.factor import (
     Estimate,
     Factor,
-    JointFactor,
+    QRFactor,
     estimate_of,
     joint_weights,
     mark_undetermined,
@@ -161,7 +161,7 @@ class PosteriorEstimate:
 
 def with_prior(
     model: RobotModel,
-    factor: JointFactor,
+    factor: Factor,
     prior: GaussianPrior,
     weights: Array | None = None,
     *,
@@ -239,9 +239,9 @@ def fit_with_prior(
     weights = _weights(factor)
     solution = factor.solve(weights)
     clustered = (
-        block_covariance(phase, weights, solution.values)
-        if isinstance(factor, Factor)
-        else clustered_covariance(model, recordings, solution, weights)
+        clustered_covariance(model, recordings, solution, weights)
+        if isinstance(factor, QRFactor)
+        else block_covariance(phase, weights, solution.values)
     )
     effect = max(1.0, clustered.design_effect)
     result = with_prior(model, factor, prior, weights, design_effect=effect)
@@ -256,7 +256,7 @@ def fit_with_prior(
     )
 
 
-def _weights(factor: JointFactor) -> Array:
+def _weights(factor: Factor) -> Array:
     rows = int(factor.samples.sum())
     if 0 < rows < _FEWEST_ROWS * factor.n_parameters:
         raise IdentificationError(

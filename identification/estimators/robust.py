@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import clustered_covariance
-from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
+from identification.estimators.losses import Huber, Loss, Tukey
 from identification.factor.factor import (
     Estimate,
     Factor,
-    JointFactor,
     Solution,
     augmented_rows,
     nothing_usable,
@@ -94,7 +93,7 @@ class _State:
         converged: whether the last pass changed nothing.
     """
 
-    factor: JointFactor
+    factor: Factor
     solution: Solution
     scale: Array
     residuals: list[Array]
@@ -152,7 +151,7 @@ def _iterate(
 ) -> _State:
     # The first pass finds the residuals of the start; only then there is a scale.
     if not np.isfinite(state.scale).any():
-        state = _pass(model, recordings, state, LeastSquares())
+        state = _pass(model, recordings, state, Loss())
     for _ in range(most):
         new = _pass(model, recordings, state, loss)
         step = _deviations(new.factor, new.scale, new.solution.values - state.solution.values)
@@ -226,7 +225,7 @@ def _weights(scale: Array) -> Array:
     return np.where(known, 1.0 / np.where(known, scale, 1.0) ** 2, 0.0)
 
 
-def _deviations(factor: JointFactor, scale: Array, change: Array) -> float:
+def _deviations(factor: Factor, scale: Array, change: Array) -> float:
     """Change of parameters (p,) in standard deviations, root mean square over the parameters."""
     squares = factor.products(change[:, None])[:, 0, 0]
     return float(np.sqrt(max(float(_weights(scale) @ squares), 0.0) / len(change)))

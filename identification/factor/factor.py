@@ -14,7 +14,6 @@ weight needs a second pass. A Gram matrix squares the condition number: from a s
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple, Self
@@ -78,8 +77,8 @@ class Solution(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class JointFactor(ABC):
-    """Rows of [W | y], reduced joint by joint.
+class Factor:
+    """Rows of [W | y], reduced joint by joint to their Gram matrices.
 
     Attributes:
         matrices: (n, p + 1, p + 1).
@@ -91,9 +90,9 @@ class JointFactor(ABC):
     samples: NDArray[np.intp]
     parameter_names: tuple[str, ...]
 
-    words: ClassVar[str]
+    words: ClassVar[str] = ""
     """Behind the name of an estimator."""
-    smallest_noise: ClassVar[float]
+    smallest_noise: ClassVar[float] = 1e-6
     """Share of the torque's own RMS below which a residual is rounding, not noise: it would make a
     joint that happens to fit exactly the only one that counts."""
 
@@ -117,6 +116,40 @@ class JointFactor(ABC):
         )
 
     @classmethod
+    def from_samples(
+        cls,
+        model: RobotModel,
+        motion: Motion,
+        torque: Array,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> Self:
+        """Reduce m samples.
+
+        Args:
+            model: the robot.
+            motion: m samples of its joints.
+            torque: what W pi should equal [N·m, N], shape (m, n).
+            mask: which rows count, shape (m, n); all without it. See :meth:`RobotModel.moving`.
+
+        Raises:
+            ShapeError: an array does not have the shape it should have.
+        """
+        q, qd, qdd, torque = joint_arrays(
+            model.n_joints,
+            position=motion.position,
+            velocity=motion.velocity,
+            acceleration=motion.acceleration,
+            torque=torque,
+        )
+        if mask is not None and mask.shape != q.shape:
+            raise ShapeError("mask", mask.shape, str(q.shape))
+        usable = np.ones(q.shape, dtype=np.bool_) if mask is None else mask
+        chunks = model.plan.chunks(q, qd, qdd, motion.direction, response=torque)
+        return cls.from_blocks(
+            model, (rows.blocks for rows in masked_rows(chunks, usable)), usable.sum(axis=0)
+        )
+
+    @classmethod
     def from_blocks(
         cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
     ) -> Self:
@@ -133,12 +166,15 @@ class JointFactor(ABC):
             for joint, block in enumerate(blocks):
                 sums[joint] = cls._more(sums[joint], block)
         factor = cls.zero(model)
-        for joint, (small, used) in enumerate(zip(sums, columns, strict=True)):
-            factor.matrices[joint] = cls._wide(
-                small, np.append(used, model.n_parameters), factor.matrices[joint]
-            )
+        for small, used, target in zip(sums, columns, factor.matrices, strict=True):
+            target[:] = cls._wide(small, np.append(used, model.n_parameters), target)
         factor.samples[:] = samples
         return factor
+
+    @property
+    def gram(self) -> Array:
+        """The Gram matrices (n, p + 1, p + 1), symmetric."""
+        return self.matrices
 
     @property
     def n_joints(self) -> int:
@@ -166,82 +202,6 @@ class JointFactor(ABC):
         both = self._both(other)
         return type(self)(both, self.samples + other.samples, self.parameter_names)
 
-    @abstractmethod
-    def rows(self, weights: Array) -> tuple[Array, Array]:
-        """Rows (k, p) and target (k,) that stand for all samples, joints weighted (n,)."""
-
-    @abstractmethod
-    def solve(self, weights: Array) -> Solution:
-        """Solve the weighted least-squares problem, weights (n,)."""
-
-    @abstractmethod
-    def products(self, directions: Array) -> Array:
-        """Return ``D' G_j D`` (n, k, k) for directions D (p, k), or (p + 1, k) with the torque."""
-
-    @abstractmethod
-    def _both(self, other: Self) -> Array: ...
-
-    @staticmethod
-    @abstractmethod
-    def _more(matrix: Array, block: Array) -> Array: ...
-
-    @staticmethod
-    @abstractmethod
-    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array: ...
-
-    def _checked(self, weights: Array) -> Array:
-        """Raises ShapeError where there is not one weight per joint."""
-        weights = np.asarray(weights, dtype=np.float64)
-        if weights.shape != (self.n_joints,):
-            raise ShapeError("weights", weights.shape, f"({self.n_joints},)")
-        return weights
-
-
-class Factor(JointFactor):
-    """Gram matrices of [W | y], one per joint."""
-
-    words = ""
-    smallest_noise = 1e-6
-
-    @classmethod
-    def from_samples(
-        cls,
-        model: RobotModel,
-        motion: Motion,
-        torque: Array,
-        mask: NDArray[np.bool_] | None = None,
-    ) -> Factor:
-        """Reduce m samples.
-
-        Args:
-            model: the robot.
-            motion: m samples of its joints.
-            torque: what W pi should equal [N·m, N], shape (m, n).
-            mask: which rows count, shape (m, n); all without it. See :meth:`RobotModel.moving`.
-
-        Raises:
-            ShapeError: an array does not have the shape it should have.
-        """
-        q, qd, qdd, torque = joint_arrays(
-            model.n_joints,
-            position=motion.position,
-            velocity=motion.velocity,
-            acceleration=motion.acceleration,
-            torque=torque,
-        )
-        if mask is not None and mask.shape != q.shape:
-            raise ShapeError("mask", mask.shape, str(q.shape))
-        usable = np.ones(q.shape, dtype=np.bool_) if mask is None else mask
-        chunks = model.plan.chunks(q, qd, qdd, motion.direction, response=torque)
-        return cls.from_blocks(
-            model, (rows.blocks for rows in masked_rows(chunks, usable)), usable.sum(axis=0)
-        )
-
-    @property
-    def gram(self) -> Array:
-        """The Gram matrices (n, p + 1, p + 1), symmetric."""
-        return self.matrices
-
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint, shape (n,): 1/variance."""
         total = np.tensordot(self._checked(weights), self.gram, axes=1)
@@ -266,15 +226,18 @@ class Factor(JointFactor):
         return float(np.sqrt(self.squared_errors(values).sum() / power)) if power > 0.0 else np.nan
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
-        """Directions that hold nothing but the rounding of the Gram matrix are left out."""
+        """Rows (k, p) and target (k,) that stand for all samples, joints weighted (n,).
+
+        Directions that hold nothing but the rounding of the Gram matrix are left out.
+        """
         return rows_of(self.weighted(weights))
 
     def solve(self, weights: Array) -> Solution:
-        """Solve the normal equations."""
+        """Solve the weighted least-squares problem, weights (n,)."""
         return solve(self.weighted(weights))
 
     def products(self, directions: Array) -> Array:
-        """Products with the Gram matrices."""
+        """Return ``D' G_j D`` (n, k, k) for directions D (p, k), or (p + 1, k) with the torque."""
         size = len(directions)
         return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
 
@@ -291,28 +254,29 @@ class Factor(JointFactor):
         target[np.ix_(place, place)] = matrix
         return target
 
+    def _checked(self, weights: Array) -> Array:
+        """Raises ShapeError where there is not one weight per joint."""
+        weights = np.asarray(weights, dtype=np.float64)
+        if weights.shape != (self.n_joints,):
+            raise ShapeError("weights", weights.shape, f"({self.n_joints},)")
+        return weights
 
-class QRFactor(JointFactor):
-    """Upper triangular factors of [W | y], one per joint."""
+
+class QRFactor(Factor):
+    """Upper triangular factors of [W | y], one per joint, in place of Gram matrices."""
 
     words = " by QR"
     # A triangular factor gives the residual to about 1e-13 of the torque.
     smallest_noise = 1e-12
 
     @property
-    def triangle(self) -> Array:
-        """The triangles (n, p + 1, p + 1)."""
-        return self.matrices
-
-    @property
-    def gram(self) -> Factor:
-        """The same samples as Gram matrices, for what works on those; loses digits."""
-        products = np.asarray(self.triangle.transpose(0, 2, 1) @ self.triangle)
-        return Factor(products, self.samples, self.parameter_names)
+    def gram(self) -> Array:
+        """The Gram matrices, for what works on those; loses digits."""
+        return np.asarray(self.matrices.transpose(0, 2, 1) @ self.matrices)
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
         """The triangle of all joints together."""
-        rows = np.sqrt(self._checked(weights))[:, None, None] * self.triangle
+        rows = np.sqrt(self._checked(weights))[:, None, None] * self.matrices
         triangle = _triangle(rows.reshape(-1, rows.shape[2]))
         return triangle[:-1, :-1], triangle[:-1, -1]
 
@@ -322,7 +286,7 @@ class QRFactor(JointFactor):
 
     def products(self, directions: Array) -> Array:
         """Squares of the triangles times the directions."""
-        through = self.triangle[:, :, : len(directions)] @ directions
+        through = self.matrices[:, :, : len(directions)] @ directions
         return np.asarray(through.transpose(0, 2, 1) @ through)
 
     def _both(self, other: Self) -> Array:
@@ -421,7 +385,7 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     return singular[:, None] * basis * scale, (basis @ (equations.b / scale)) / singular
 
 
-def residual_variance(factor: JointFactor, values: Array, root: Array, weights: Array) -> Array:
+def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
     """Variance of the torque residual per joint (n,), NaN for a joint without rows.
 
     The parameters cost degrees of freedom, shared among the joints by how much each contributes
@@ -436,7 +400,7 @@ def residual_variance(factor: JointFactor, values: Array, root: Array, weights: 
     return np.where(factor.samples > 0, np.maximum(variance, floor), np.nan)
 
 
-def joint_weights(factor: JointFactor) -> Array:
+def joint_weights(factor: Factor) -> Array:
     """Inverse variance of each joint's residual in an ordinary fit (n,), zero without rows."""
     ordinary = np.ones(factor.n_joints)
     first = factor.solve(ordinary)
@@ -493,7 +457,7 @@ class Estimate:
         return float(self.values[self.names.index(name)])
 
 
-def estimate(model: RobotModel, factor: JointFactor, weights: Array | None = None) -> Estimate:
+def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
     """Weighted least squares (eq. 4).
 
     The covariance is the classical one, A^-1: honest only if the residuals are white. See
@@ -518,7 +482,7 @@ def estimate(model: RobotModel, factor: JointFactor, weights: Array | None = Non
 
 def estimate_of(
     model: RobotModel,
-    factor: JointFactor,
+    factor: Factor,
     solution: Solution,
     covariance: Array,
     weights: Array,
@@ -571,9 +535,7 @@ def total(factors: Sequence[Factor]) -> Factor:
     return sum(factors[1:], factors[0])
 
 
-def reduced(
-    model: RobotModel, recordings: Iterable[Samples], gram: Factor | None = None
-) -> Factor | QRFactor:
+def reduced(model: RobotModel, recordings: Iterable[Samples], gram: Factor | None = None) -> Factor:
     """Reduce recordings to Gram matrices, or to triangles where the condition demands it.
 
     The Gram matrices come first, being five times as fast; the samples are read a second time

@@ -39,10 +39,6 @@ from identification.validation.prediction import (
 )
 from identification.validation.residuals import ResidualChecks, check_residuals
 
-# Whether recordings make more sense with gravity pulling another way than declared.
-#
-# An arm on a wall, on a ceiling or on a tilted base, described as upright, spoils every axis
-# that gravity loads, and looks like many wrong torque constants at once.
 Array = NDArray[np.float64]
 
 _STANDARD: Final = 9.81  # m/s²
@@ -52,6 +48,9 @@ _PASSES: Final = 2
 @dataclass(frozen=True, eq=False)
 class GravityDirection:
     """The direction of gravity that fits the recordings best.
+
+    An arm on a wall or a tilted base, described as upright, spoils every axis that gravity loads,
+    and looks like many wrong torque constants at once.
 
     Attributes:
         declared: gravity of the model (3,) [m/s²].
@@ -176,58 +175,34 @@ def repeatability(
     Raises:
         IdentificationError: fewer than two repetitions, or no row that two of them share.
     """
-    moments = _Moments(model.n_joints)
-    step = 0.0
+    step, parts = 0.0, []
     for samples in recordings:
-        if step == 0.0:
-            step = float(np.median(np.diff(samples.motion.time)))
+        step = step or float(np.median(np.diff(samples.motion.time)))
         index = np.rint((samples.motion.time - samples.origin) / step).astype(np.int64)
-        usable = samples.usable & (index >= 0)[:, None]
-        moments.add(index, usable, residual(model, values, samples, bandwidth))
-    return moments.split()
-
-
-class _Moments:
-    """Mean and spread over repetitions at each time and joint (Welford's updates)."""
-
-    def __init__(self, n_joints: int) -> None:
-        self.count = np.zeros((0, n_joints))
-        self.mean = np.zeros((0, n_joints))
-        self.spread = np.zeros((0, n_joints))
-        self.repetitions = 0
-
-    def add(self, index: NDArray[np.int64], usable: NDArray[np.bool_], values: Array) -> None:
-        missing = max(0, int(index[-1]) + 1 - len(self.count))
-        for name in ("count", "mean", "spread"):
-            setattr(self, name, np.pad(getattr(self, name), ((0, missing), (0, 0))))
-        rows, joints = np.nonzero(usable)
-        at = index[rows], joints
-        self.count[at] += 1.0
-        change = values[rows, joints] - self.mean[at]
-        self.mean[at] += change / self.count[at]
-        self.spread[at] += change * (values[rows, joints] - self.mean[at])
-        self.repetitions += 1
-
-    def split(self) -> Repeatability:
-        shared = self.count >= 2.0
-        rows = np.count_nonzero(shared, axis=0)
-        if self.repetitions < 2 or not rows.any():
-            raise IdentificationError(
-                "what repeats cannot be distinguished from noise: it takes two repetitions in which"
-                f" joints move at the same times, here are {self.repetitions} with"
-                f" {rows.tolist()} common rows per joint"
-            )
-        freedom = np.where(shared, self.count - 1.0, 0.0).sum(axis=0)
-        freedom[rows == 0], rows = np.nan, np.where(rows == 0, np.nan, rows)
-        noise = np.where(shared, self.spread, 0.0).sum(axis=0) / freedom
-        # The mean over repetitions still holds its share of the noise.
-        common = self.mean**2 - noise / np.maximum(self.count, 1.0)
-        systematic = np.where(shared, common, 0.0).sum(axis=0) / rows
-        return Repeatability(
-            noise=np.sqrt(noise),
-            systematic=np.sqrt(np.maximum(systematic, 0.0)),
-            repetitions=self.repetitions,
+        rows, joints = np.nonzero(samples.usable & (index >= 0)[:, None])
+        left = residual(model, values, samples, bandwidth)
+        parts.append((index[rows], joints, left[rows, joints]))
+    length = max((int(index.max(initial=-1)) for index, _, _ in parts), default=-1) + 1
+    table = np.full((len(parts), length, model.n_joints), np.nan)
+    for own, (index, joints, left) in zip(table, parts, strict=True):
+        own[index, joints] = left
+    count = np.count_nonzero(~np.isnan(table), axis=0)
+    shared = count >= 2
+    rows = np.count_nonzero(shared, axis=0)
+    if len(parts) < 2 or not rows.any():
+        raise IdentificationError(
+            "what repeats cannot be distinguished from noise: it takes two repetitions in which"
+            f" joints move at the same times, here are {len(parts)} with {rows.tolist()} common"
+            " rows per joint"
         )
+    mean = np.nansum(table, axis=0) / np.maximum(count, 1)
+    spread = np.nansum((table - mean) ** 2, axis=0)
+    divisor = np.where(rows > 0, rows, np.nan)
+    freedom = np.where(shared, count - 1.0, 0.0).sum(axis=0) * divisor / divisor
+    noise = np.where(shared, spread, 0.0).sum(axis=0) / freedom
+    # The mean over repetitions still holds its share of the noise.
+    common = np.where(shared, mean**2 - noise / np.maximum(count, 1), 0.0).sum(axis=0) / divisor
+    return Repeatability(np.sqrt(noise), np.sqrt(np.maximum(common, 0.0)), len(parts))
 
 
 # A joint's error is beyond that of the fit if its power is this many times larger.
@@ -514,13 +489,19 @@ def gather(
         carried = weigh_load(model, few, unseen_few, carried)
     steady = repeatability(model, values, training, slow) if repeated else None
     slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
+    change = None  # of each joint the largest
+    if slow_errors:
+        changes = np.array([one.friction_change for one in slow_errors])
+        change = np.take_along_axis(changes, np.abs(changes).argmax(axis=0)[None], axis=0)[0]
+    gram = information(result.factor)
+    postures = position[:: max(1, len(position) // _POSTURES)]
     return Evidence(
         estimate=result.pooled,
         held_out=error,
         training=over_all(prediction_error(model, values, training)),
         held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
         held_out_apart=over_all(one.apart for one in slow_errors) if repeated else None,
-        friction_change=_largest([one.friction_change for one in slow_errors]),
+        friction_change=change,
         slow=steady,
         noise_floor=_noise_floor(model, values, training[:_MOST_RECORDINGS], slow, steady),
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
@@ -528,14 +509,14 @@ def gather(
         causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
         load=carried,
-        loaded=gravity_loads(model, position[:: max(1, len(position) // _POSTURES)]),
+        loaded=gravity_loads(model, postures),
         nominal=None if nominal is None else over_all(prediction_error(model, nominal, held_out)),
         implausible=implausibilities(
             model,
             result.pooled,
             unseen,
             error.rms,
-            position=position[:: max(1, len(position) // _POSTURES)],
+            position=postures,
             speed=np.abs(velocity).max(axis=0),
             sigmas=sigmas,
         ),
@@ -547,7 +528,7 @@ def gather(
             same_motion=same_motion,
             motor_from_joint=surroundings.motor_from_joint,
         ),
-        coupling=_coupling(result.factor),
+        coupling=CouplingIndex(float(coupling_index(gram)), coupling_index_max(len(gram))),
         surroundings=surroundings,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
@@ -578,19 +559,6 @@ def _noise_floor(
         rows += np.count_nonzero(samples.usable, axis=0)
     white = squares / np.where(rows > 0.0, rows, np.nan)
     return np.sqrt(white if steady is None else white + np.nan_to_num(steady.noise) ** 2)
-
-
-def _coupling(factor: Factor) -> CouplingIndex:
-    gram = information(factor)
-    return CouplingIndex(float(coupling_index(gram)), coupling_index_max(len(gram)))
-
-
-def _largest(changes: list[Array]) -> Array | None:
-    """Of several vectors (n,), for each entry the one of largest magnitude; None of none."""
-    if not changes:
-        return None
-    stacked = np.array(changes)
-    return np.asarray(stacked[np.abs(stacked).argmax(axis=0), np.arange(stacked.shape[1])])
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:

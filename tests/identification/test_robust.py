@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from hil.importers import Robot, import_rosbag2
 from hil.recordings import open_recording
 from identification.errors import IdentificationError
-from identification.estimators.losses import Huber, LeastSquares, Loss, Tukey
+from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
 from identification.model.friction import FrictionLaw
@@ -53,7 +53,7 @@ def distance(values: Array, samples: Samples) -> float:
 # Losses -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loss", [LeastSquares(), *LOSSES, Huber(0.7), Tukey(3.0)])
+@pytest.mark.parametrize("loss", [Loss(), *LOSSES, Huber(0.7), Tukey(3.0)])
 @given(x=st.floats(-1e6, 1e6))
 def test_weights_lie_between_zero_and_one_and_fall_with_the_residual(loss: Loss, x: float) -> None:
     one, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
@@ -62,7 +62,7 @@ def test_weights_lie_between_zero_and_one_and_fall_with_the_residual(loss: Loss,
     assert loss.weight(np.zeros(1)) == 1.0
 
 
-@pytest.mark.parametrize("loss", [LeastSquares(), *LOSSES])
+@pytest.mark.parametrize("loss", [Loss(), *LOSSES])
 def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> None:
     x = np.linspace(-7.0, 7.0, 1401)
     x = x[np.abs(np.abs(x) - 1.345) > 0.01]  # Huber's has a corner there
