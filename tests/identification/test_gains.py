@@ -7,7 +7,9 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from hil.identify.prepared import _warnings
 from identification.errors import IdentificationError, ShapeError
+from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.estimators.gains import GainMethod, Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.friction import FrictionLaw
@@ -16,6 +18,7 @@ from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
+from tests.identification.two_link import MODEL, a_motion, coloured
 
 Array = NDArray[np.float64]
 
@@ -286,3 +289,33 @@ def test_wrong_shapes_are_refused() -> None:
         gain_factor(model, samples_of(model, motion), np.zeros((5, 2)))
     with pytest.raises(ShapeError, match="transmission"):
         gain_factor(model, samples_of(model, motion), motion.position, transmission=np.eye(3))
+
+
+GAINS = np.array([12.0, 3.0])  # N·m/A
+
+
+def scale(signs: tuple[float, float]) -> CurrentScale:
+    """Gains from currents of the nominal arm with rotors and friction, times signs."""
+    motion = a_motion()
+    values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
+    noise = 0.1 * coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
+    torque = MODEL.torque(values, *motion[1:]) + noise
+    return scale_from_nominal(MODEL, [motion], [torque / (GAINS * np.array(signs))])
+
+
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+def test_a_current_of_the_wrong_sign_is_named(signs: tuple[float, float]) -> None:
+    found = scale(signs)
+    np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
+    np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
+    negative = [text for text in _warnings(MODEL.joint_names, found) if "negative" in text]
+    assert len(negative) == any(found.turned)
+    for name, turned in zip(MODEL.joint_names, found.turned, strict=True):
+        assert any(name in text for text in negative) == turned
+
+
+def test_a_gain_that_is_not_known_is_not_turned() -> None:
+    unknown = CurrentScale(
+        np.array([-1.0, 2.0]), np.array([np.inf, 0.1]), np.zeros(2, dtype=np.bool_)
+    )
+    assert not unknown.turned.any()

@@ -1,14 +1,29 @@
+"""The body on the flange: weighed, possible, with intervals that hold the truth."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, Recording, RobotModel, prepare
+from identification.estimators.payload import (
+    NAMES,
+    PayloadError,
+    PayloadEstimate,
+    Run,
+    find_difference,
+    identify_payload,
+)
 from identification.model.payload import Payload
+from identification.model.pseudo_inertia import inertial_parameters, margin
 from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text
+from tests.identification.test_gains import URDF, lively, load_torque, samples_of, two_link
 
 TILTED = (2.0, -3.0, -9.0)
 INERTIA = (0.05, 0.01, -0.02, 0.04, 0.005, 0.03)
@@ -115,3 +130,198 @@ def test_a_recording_of_the_loaded_arm_gives_the_parameters_of_the_bare_one() ->
 
     assert largest_error(model) < 0.01
     assert largest_error(bare) > 0.1
+
+
+Array = NDArray[np.float64]
+
+LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
+OTHER = Payload(2.0, (0.2, 0.0, 0.1))
+NOISE = np.array([3.0, 1.0])  # N·m
+SEEDS = 24
+
+
+def recordings(
+    loads: list[Payload | None],
+    *,
+    noise: Array = NOISE,
+    drift: float = 0.0,
+    pace: float = 1.0,
+    seed: int = 0,
+) -> tuple[RobotModel, list[Run]]:
+    """Recordings of one motion of two links that turn about y, with friction that drifts."""
+    model, truth = two_link()
+    rng, motion = np.random.default_rng(seed), lively(2, speed=pace)
+    runs = []
+    for k, load in enumerate(loads):
+        own = truth.copy()
+        own[-4:] *= 1.0 + drift * np.tile(rng.standard_normal(2), 2)
+        torque = model.torque(own, *motion[1:])
+        if load is not None:
+            torque += load_torque(model, load, motion)
+        torque += noise * rng.standard_normal(torque.shape)
+        samples = replace(samples_of(model, motion), torque=torque)
+        runs.append(Run.of(f"run {k + 1}", model, samples, None, loaded=load is not None))
+    return model, runs
+
+
+def estimate(loads: list[Payload | None], **options: float) -> PayloadEstimate:
+    return identify_payload(*recordings(loads, **options))  # type: ignore[arg-type]
+
+
+class TestMass:
+    def test_without_noise_the_body_comes_back(self) -> None:
+        found = identify_payload(*recordings([None, LOAD], noise=np.zeros(2)))
+        assert found.body is not None
+        assert found.body.mass == pytest.approx(4.0, rel=1e-6)
+        assert found.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
+        assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
+
+    def test_order_and_number_of_recordings_do_not_matter(self) -> None:
+        found = estimate([LOAD, None, None, LOAD, LOAD])
+        assert found.intervals[0, 0] < 4.0 < found.intervals[0, 1]
+        once = estimate([LOAD, None])
+        assert np.diff(found.intervals[0]) < np.diff(once.intervals[0])
+
+    def test_nothing_carried_is_no_body(self) -> None:
+        """The loaded recordings carry what the bare ones do."""
+        model, runs = recordings([None, None])
+        found = identify_payload(model, [runs[0], replace(runs[1], loaded=True)])
+        assert found.body is None
+        assert found.intervals[0, 0] == 0.0
+
+    def test_exchanged_recordings_are_refused(self) -> None:
+        model, runs = recordings([None, LOAD])
+        exchanged = [replace(run, loaded=not run.loaded) for run in runs]
+        with pytest.raises(PayloadError, match=r"carry 4\.\d* kg more .* exchanged"):
+            identify_payload(model, exchanged)
+
+    def test_one_kind_alone_is_refused(self) -> None:
+        with pytest.raises(PayloadError, match="is a difference"):
+            estimate([LOAD, LOAD])
+
+
+@pytest.fixture(scope="module")
+def many() -> list[PayloadEstimate]:
+    return [estimate([None, LOAD], drift=0.04, seed=seed) for seed in range(SEEDS)]
+
+
+class TestIntervals:
+    def test_they_hold_the_truth_under_drifting_friction(self, many: list[PayloadEstimate]) -> None:
+        """Of 24 draws with 95 %, fewer than 19 inside come once in a thousand times."""
+        truth = {"mass": 4.0, "cx": 0.2, "cz": 0.1, "Iyy": 0.03}
+        for name, value in truth.items():
+            intervals = np.array([one.intervals[NAMES.index(name)] for one in many])
+            inside = (intervals[:, 0] <= value) & (value <= intervals[:, 1])
+            assert inside.sum() >= 19, name
+
+    def test_they_are_no_wider_than_the_scatter_asks(self, many: list[PayloadEstimate]) -> None:
+        masses = np.array([one.parameters[9] for one in many])
+        half = np.median([np.diff(one.intervals[0]) / 2.0 for one in many])
+        assert half < 1.5 * 1.96 * masses.std(ddof=1)
+
+    def test_friction_of_another_day_does_not_bias_the_mass(self) -> None:
+        """Drift of 30 % of the friction, three times what the prior expects."""
+        model, runs = recordings([None, LOAD])
+        low, high = identify_payload(model, runs).intervals[0]
+        drifting = estimate([None, LOAD], drift=0.3, seed=3)
+        assert drifting.intervals[0, 0] < 4.0 < drifting.intervals[0, 1]
+        assert np.diff(drifting.intervals[0])[0] < 3.0 * (high - low)
+
+    def test_the_moment_is_mass_times_distance(self) -> None:
+        value, low, high = identify_payload(*recordings([None, LOAD], noise=0.1 * NOISE)).moment
+        assert value == pytest.approx(4.0 * np.hypot(0.2, 0.1), rel=1e-2)
+        assert low < value < high
+
+
+class TestPossibleBody:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_a_motion_that_says_little_gives_a_possible_body(self, seed: int) -> None:
+        found = identify_payload(*recordings([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed))
+        assert found.body is not None
+        own = inertial_parameters(found.body)
+        assert margin(own) > -1e-9 * own[9]
+
+    def test_what_no_axis_feels_is_named(self) -> None:
+        """Both axes turn about y: only mass, moments in the plane and Iyy act on them."""
+        found = estimate([None, LOAD])
+        assert found.undetermined == ("cy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
+        assert found.body is not None
+        assert found.body.centre[1] == pytest.approx(0.0, abs=1e-6)
+
+    def test_a_large_body_is_not_moved_towards_a_point(self) -> None:
+        """A bar of 1 m: its inertia is many times that of the reference, and significant."""
+        bar = Payload(2.0, (0.2, 0.0, 0.1), (0.17, 0.0, 0.0, 0.17, 0.0, 0.001))
+        found = estimate([None, bar])
+        low, high = found.intervals[NAMES.index("Iyy")]
+        middle = (low + high) / 2.0
+        assert "Iyy" not in found.undetermined
+        assert found.body is not None
+        assert found.body.inertia[1, 1] == pytest.approx(middle, abs=0.05 * (high - low))
+
+    def test_an_undetermined_inertia_is_that_of_a_box(self) -> None:
+        """Slow motion is weight alone."""
+        model, runs = recordings([None, LOAD], pace=0.1, noise=3.0 * NOISE)
+        point, box = identify_payload(model, runs), identify_payload(model, runs, (0.2, 0.3, 0.1))
+        assert {"Ixx", "Iyy", "Izz"} <= {*point.undetermined} & {*box.undetermined}
+        assert point.body is not None
+        assert box.body is not None
+        expected = box.body.mass / 12.0 * np.array([0.1, 0.05, 0.13])
+        assert np.diag(box.body.inertia) == pytest.approx(expected, rel=0.2)
+        assert np.trace(point.body.inertia) < 0.2 * np.trace(box.body.inertia)
+
+    def test_an_impossible_body_is_said_to_contradict(self) -> None:
+        """A tensor that no distribution of mass has: negative about the centre of mass."""
+        impossible = Payload(4.0, (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, -0.15, 0.0, 0.0))
+        found = identify_payload(*recordings([None, impossible], noise=0.01 * NOISE))
+        assert found.contradicted
+        assert not estimate([None, LOAD]).contradicted
+
+
+class TestDifference:
+    def test_recordings_of_one_payload_do_not_differ(self) -> None:
+        loads = [None, LOAD, LOAD, None]
+        assert find_difference(*recordings(loads, drift=0.04)) is None
+        assert find_difference(*recordings([None, LOAD])) is None
+
+    def test_a_second_payload_is_found(self) -> None:
+        found = find_difference(*recordings([None, LOAD, OTHER]))
+        assert found is not None
+        assert (found.run.name, found.reference.name) == ("run 3", "run 2")
+        assert found.mass == pytest.approx(-2.0, abs=0.2)
+
+    def test_a_tool_on_a_bare_arm_is_found(self) -> None:
+        model, runs = recordings([None, LOAD, OTHER])
+        found = find_difference(model, [*runs[:2], replace(runs[2], loaded=False)])
+        assert found is not None
+        assert found.run.name == "run 3"
+        assert not found.run.loaded
+        assert found.mass == pytest.approx(2.0, abs=0.2)
+
+
+class TestFrame:
+    def test_figures_are_in_the_frame_asked_for(self) -> None:
+        """A body stated in the frame of a tool comes back in that frame."""
+        tool = (
+            '<link name="tool"/><joint name="mount" type="fixed"><parent link="lower"/>'
+            '<child link="tool"/><origin xyz="0.1 0 0.3" rpy="0 0.5 0"/></joint></robot>'
+        )
+        urdf = URDF.replace("</robot>", tool)
+        model, motion = RobotModel.from_urdf(urdf, friction=FrictionLaw(third=None)), lively(2)
+        bare = model.torque(two_link()[1], *motion[1:])
+        loaded = bare + load_torque(model, replace(LOAD, frame="tool"), motion)
+        runs = [
+            Run.of(
+                "run", model, replace(samples_of(model, motion), torque=torque), "tool", loaded=kind
+            )
+            for kind, torque in ((False, bare), (True, loaded))
+        ]
+        found = identify_payload(model, runs)
+        assert found.body is not None
+        assert found.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
+        assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
+
+    def test_a_frame_that_is_not_there_is_refused(self) -> None:
+        model, _ = recordings([None, LOAD])
+        samples = samples_of(model, lively(2))
+        with pytest.raises(PayloadError, match="'tool9' is no link"):
+            Run.of("a", model, samples, "tool9", loaded=False)

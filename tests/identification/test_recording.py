@@ -1,14 +1,23 @@
+"""Repetitions are recognised from positions, whatever their clocks say."""
+
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.signals.recording import Recording, RecordingError
+from identification.signals.clock import time_base
+from identification.signals.recording import (
+    Recording,
+    RecordingError,
+    offsets_of_repetitions,
+    without_repeats,
+)
 
 NAMES = ("shoulder", "elbow", "wrist")
 
@@ -197,3 +206,132 @@ def test_a_motion_starts_where_the_command_begins_to_move() -> None:
 
 def test_without_a_command_a_motion_starts_with_the_recording() -> None:
     assert a_recording(commanded=False).motion_start == 0.0
+
+
+STEP = 2e-3
+
+
+def recorded(
+    seed: int, *, start: float = 0.0, clock: float = 0.0, pace: float = 1.0, noise: int = 0
+) -> Recording:
+    """Eight seconds of a motion from `start` on, by a clock that is fast by `clock` [s]."""
+    rng = np.random.default_rng(seed)
+    amplitude, rate = rng.uniform(0.2, 1.0, (3, 2)), rng.uniform(0.5, 3.0, (3, 2))
+    time = start + STEP * np.arange(4000)
+    angle = pace * rate * time[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
+    position = (amplitude * np.sin(angle)).sum(axis=1)
+    position += 1e-4 * np.random.default_rng(noise).standard_normal(position.shape)
+    return Recording(time=time + clock, position=position, joint_names=("a", "b"))
+
+
+class TestRepetitions:
+    """One motion, several times."""
+
+    @settings(max_examples=20, deadline=None)
+    @given(
+        seed=st.integers(0, 50),
+        clock=st.floats(-1e3, 1e3),
+        start=st.floats(-0.4, 0.4).map(lambda one: round(one / STEP) * STEP),
+    )
+    def test_offsets_of_clocks_are_found(self, seed: int, clock: float, start: float) -> None:
+        runs = [recorded(seed), recorded(seed, start=start, clock=clock, noise=1)]
+        offsets = offsets_of_repetitions(runs)
+        assert offsets is not None
+        np.testing.assert_allclose(offsets, [0.0, clock], atol=2e-3)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_other_motions_are_none(self, seed: int) -> None:
+        assert offsets_of_repetitions([recorded(seed), recorded(seed + 100)]) is None
+
+    def test_another_speed_is_another_motion(self) -> None:
+        assert offsets_of_repetitions([recorded(1), recorded(1, pace=1.05)]) is None
+
+    def test_half_of_a_motion_is_no_repetition(self) -> None:
+        assert offsets_of_repetitions([recorded(1), recorded(1, start=4.0)]) is None
+
+    def test_one_of_three_that_differs_makes_none(self) -> None:
+        runs = [recorded(1), recorded(1, noise=1), recorded(2)]
+        assert offsets_of_repetitions(runs) is None
+
+    def test_a_single_recording_repeats_nothing(self) -> None:
+        assert offsets_of_repetitions([recorded(1)]) is None
+
+
+Array = NDArray[np.float64]
+
+
+@pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
+def test_an_even_clock_is_uniform_and_needs_nothing(rate: float) -> None:
+    base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
+    assert base.uniform
+    assert base.rate == pytest.approx(rate, rel=1e-4)
+    assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
+    assert len(base.describe()) == 1
+
+
+def test_jitter_is_measured_against_the_usual_step() -> None:
+    rng = np.random.default_rng(1)
+    steps = 0.002 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, 20000))
+    base = time_base(np.cumsum(steps))
+    assert base.jitter == pytest.approx(0.2 / np.sqrt(3.0), rel=0.02)
+    assert base.largest_deviation == pytest.approx(0.2, rel=0.02)
+    assert not base.uniform
+    assert "uneven" in base.describe()[1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stamps_that_come_late_are_not_taken_for_missing_samples(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
+    lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
+
+    whole, torn = time_base(late), time_base(np.delete(late, lost))
+
+    assert whole.dropped == 0
+    assert torn.dropped == 25
+    assert whole.rate == pytest.approx(100.0, rel=1e-3)
+    assert torn.rate == pytest.approx(100.0, rel=1e-3)
+
+
+def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
+    index = np.arange(1000.0)
+    index[100] = index[99]  # repeats
+    index[200] = index[199] - 0.5  # falls back
+    index = np.delete(index, [300, 301, 400])  # two and one samples missing
+    index[600:] += 50.0  # a gap
+    base = time_base(index * 1e-3)
+    assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
+    # The long steps after the repeat and the fall make up for the short ones: nothing is missing.
+    assert base.dropped == 3
+    assert not base.uniform
+    words = " ".join(base.describe())
+    for part in ("repeat", "older", "missing", "gaps", "resampled"):
+        assert part in words
+
+
+def test_a_reported_gap_counts_although_the_clock_runs_on() -> None:
+    gap = np.zeros(100, dtype=np.bool_)
+    gap[50] = True
+    assert time_base(np.arange(100) * 1e-3, gap).gaps == 1
+
+
+def test_a_clock_that_stands_still_is_refused() -> None:
+    with pytest.raises(RecordingError, match="stands still"):
+        time_base(np.full(5, 3.0))
+
+
+def test_samples_of_one_stamp_become_their_mean() -> None:
+    time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
+    torque = np.arange(14.0).reshape(7, 2)
+    merged = without_repeats(
+        Recording(time=time, position=torque, joint_names=("a", "b"), torque=torque)
+    )
+    np.testing.assert_array_equal(merged.time, [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(merged.position, [[0, 1], [3, 4], [6, 7], [10, 11]])
+    even = Recording(np.arange(7.0), torque, ("a", "b"))
+    assert without_repeats(even) is even
+
+
+def test_a_clock_that_falls_back_is_not_put_in_order() -> None:
+    with pytest.raises(RecordingError, match="falls back at sample 2"):
+        without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))

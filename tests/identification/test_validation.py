@@ -1,5 +1,8 @@
+"""Intervals of predicted torque hold what is measured on motion that was not fitted."""
+
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +13,15 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError, ShapeError
+from identification.estimators.least_squares import estimate_repetitions
+from identification.factor.factor import Factor, joint_weights, solve
+from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.signals.samples import Samples
+from identification.validation.calibration import Calibration, TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repeatability
 from identification.validation.prediction import (
     PredictionError,
@@ -23,6 +31,7 @@ from identification.validation.prediction import (
     residual,
     slow_error,
 )
+from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
 Array = NDArray[np.float64]
 
@@ -221,3 +230,143 @@ def test_without_a_usable_row_there_is_no_error_to_be_told() -> None:
 
     assert np.isnan(error.overall)
     assert np.isnan(error.relative).all()
+
+
+MOTION = a_motion(20.0)
+LENGTH = len(MOTION.time)
+CUT = 2800  # of 4000 rows: what is fitted
+
+
+def least_squares(factor: Factor) -> Array:
+    return solve(factor.weighted(joint_weights(factor))).values
+
+
+def calibrated(fitted: Samples, held_out: Samples) -> Calibration:
+    result = estimate_repetitions(MODEL, [fitted])
+    means = [TorqueMeans.of(MODEL, [one]) for one in (fitted, held_out)]
+    return calibrate(result.pooled, result.phase, means[0], means[1], least_squares)
+
+
+def split(error: Array) -> Calibration:
+    """The beginning of the planted arm's motion fitted, the rest held out."""
+    samples = recording(error, MOTION)
+    return calibrated(samples.between(0, CUT), samples.between(CUT, LENGTH))
+
+
+def shares(correlation: float, model_error: float = 0.0, seeds: int = 50) -> tuple[float, ...]:
+    """Share inside, share inside if residuals were white, and mean half width over noise."""
+    systematic = model_error * NOISE * np.sin(6.0 * MOTION.position)
+    found = []
+    for seed in range(seeds):
+        noise = coloured(np.random.default_rng(seed), LENGTH, 5e-3, correlation)
+        one = split(noise + systematic)
+        found.append((one.overall, one.white_overall, float(np.mean(one.half_width / NOISE))))
+    return tuple(np.mean(found, axis=0).tolist())
+
+
+class TestIntervals:
+    """Of held-out means of torque 95 % lie inside their 95 % intervals."""
+
+    @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1, 0.2])
+    def test_they_are_honest_for_noise_of_any_colour(self, correlation: float) -> None:
+        """Between 93 and 98 % inside; those of white residuals fail wherever there is colour."""
+        inside, white, _ = shares(correlation)
+        assert 0.93 <= inside <= 0.98
+        assert (white < 0.7) == (correlation > 0.0)
+
+    def test_they_grow_with_an_error_of_the_model_and_hold(self) -> None:
+        """A torque that the model has no term for, as large as the noise, at 93 to 98 % inside."""
+        _, _, without = shares(0.02)
+        inside, white, half_width = shares(0.02, model_error=1.0)
+        assert 0.93 <= inside <= 0.98
+        assert half_width > 1.3 * without
+        assert white < 0.7
+
+    def test_they_do_not_shrink_with_repetitions_of_one_error(self) -> None:
+        """An error that is the same in each repetition is no less of one for being repeated."""
+        noise = coloured(np.random.default_rng(1), LENGTH, 5e-3, 0.05)
+        one = recording(noise, MOTION).between(0, CUT)
+        rest = TorqueMeans.of(MODEL, [recording(noise, MOTION).between(CUT, LENGTH)])
+        widths = []
+        for runs in ([one], [one] * 4):
+            result = estimate_repetitions(MODEL, runs)
+            found = calibrate(
+                result.pooled, result.phase, TorqueMeans.of(MODEL, runs), rest, least_squares
+            )
+            widths.append(found.half_width)
+        np.testing.assert_allclose(widths[1], widths[0], rtol=1e-6)
+
+
+class TestHeldOutTorque:
+    """It is compared with intervals, and has no part in them."""
+
+    def test_it_does_not_widen_its_own_intervals(self) -> None:
+        noise = coloured(np.random.default_rng(2), LENGTH, 5e-3, 0.05)
+        spoiled = noise.copy()
+        spoiled[CUT:] += 20.0 * NOISE
+        sound, off = split(noise), split(spoiled)
+        np.testing.assert_array_equal(off.half_width, sound.half_width)
+        assert off.overall == 0.0 < 0.8 < sound.overall
+
+    def test_none_is_no_share(self) -> None:
+        samples = recording(coloured(np.random.default_rng(3), LENGTH, 5e-3, 0.05), MOTION)
+        found = calibrated(samples, samples.between(0, 0))
+        assert np.isnan(found.overall)
+        assert not found.blocks.any()
+
+
+class TestInnerFolds:
+    def test_each_stretch_is_predicted_from_the_others(self) -> None:
+        """Leaving out by hand gives the errors of the first fifth."""
+        noise = coloured(np.random.default_rng(4), LENGTH, 5e-3, 0.05)
+        samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
+        phase, means = PhaseFactor.from_samples(MODEL, samples), TorqueMeans.of(MODEL, [samples])
+        errors = inner_errors(phase, means, least_squares)
+        rest = least_squares(Factor.of(MODEL, samples.between(800, LENGTH)))
+        left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
+        np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
+
+    def test_a_joint_that_moves_in_one_stretch_only_has_no_interval(self) -> None:
+        samples = recording(coloured(np.random.default_rng(5), LENGTH, 5e-3, 0.05), MOTION)
+        usable = samples.usable.copy()
+        usable[200:, 1] = False
+        fitted = replace(samples, usable=usable).between(0, CUT)
+        found = calibrated(fitted, samples.between(CUT, LENGTH))
+        assert np.isnan(found.inside[1])
+        assert found.blocks.tolist() == [12, 0]
+        assert found.overall == found.inside[0]
+
+    def test_two_seconds_are_too_short(self) -> None:
+        samples = recording(np.zeros((LENGTH, 2)), MOTION)
+        with pytest.raises(IdentificationError, match="too short"):
+            calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
+
+    def test_rest_behind_the_last_row_belongs_to_the_last_stretch(self) -> None:
+        """Rows that are not fitted are predicted all the same."""
+        samples = recording(coloured(np.random.default_rng(6), LENGTH, 5e-3, 0.05), MOTION)
+        usable = samples.usable.copy()
+        usable[2400:] = False
+        fitted = replace(samples, usable=usable).between(0, CUT)
+        phase, means = PhaseFactor.from_samples(MODEL, fitted), TorqueMeans.of(MODEL, [fitted])
+        assert np.isfinite(inner_errors(phase, means, least_squares)).all()
+
+
+class TestTorqueMeans:
+    def test_a_block_less_than_half_full_has_no_mean(self) -> None:
+        samples = recording(np.zeros((LENGTH, 2)), MOTION)
+        for length, known in ((1040, 10), (1060, 11)):
+            errors = TorqueMeans.of(MODEL, [samples.between(0, length)]).errors(truth())
+            assert len(errors) == 11
+            np.testing.assert_array_equal(np.isfinite(errors).sum(axis=0), known)
+
+    def test_rows_beside_an_end_are_left_out_and_those_at_rest_are_not(self) -> None:
+        """Where motion or torque are not known no model can be right; at rest it has to be."""
+        ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
+        ends[:20], slow[40:60] = True, True
+        reasons = {TORN: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
+        mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))
+        error = np.where(ends, 1e3, np.where(slow, 1.0, 0.0))
+        samples = replace(recording(error, MOTION), usable=mask.usable, mask=mask)
+        means = TorqueMeans.of(MODEL, [samples])
+        np.testing.assert_array_equal(means.count[:2], [[80, 80], [100, 100]])
+        np.testing.assert_allclose(means.errors(truth())[:2], [[0.25] * 2, [0.0] * 2], atol=1e-9)
