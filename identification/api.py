@@ -26,7 +26,6 @@ from identification.estimators.least_squares import (
     RepeatedEstimate,
     estimate_repetitions,
     fit_least_squares,
-    ordinary_least_squares,
 )
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.prior import (

@@ -123,14 +123,16 @@ def identify_gains(
         fit = _total_least_squares(total, rows, fit)
         blocks = _errors_in_currents(grams, factor.samples, fit)
     else:
-        blocks = _currents_predicted(grams, fit)
+        blocks = _linearised(grams, fit.unknowns, fit.noise)[:2]
     clustered = cluster_covariance(*blocks, fit.solution)
     covariance = clustered.covariance
     reasons = _reasons(total, rows, fit, np.sqrt(np.diag(covariance)[p:]), worst_relative_std)
     known = np.array([reason is None for reason in reasons])
     gains, own = fit.unknowns[p:], covariance[p:, p:]
     if method == "weighted":
-        gains, own = _inverted(gains, own, known)
+        # From the inverses, to first order.
+        gains = 1.0 / np.where(known, gains, 1.0)
+        own = own * np.outer(gains**2, gains**2)
     mark_undetermined(own, known)
     return Gains(
         motor_names=tuple(motor_names),
@@ -153,16 +155,24 @@ def _reasons(
     found, determined = fit.unknowns[p:], fit.solution.determined[p:]
     size = np.abs(found)
     relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
-    return tuple(
-        _why_not(int(rows[m]), bool(determined[m]), relative[m], found[m], _loaded(gram, p), worst)
-        for m, gram in enumerate(total)
-    )
+    # Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding.
+    powers = np.diagonal(total, axis1=1, axis2=2)
+    loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)
 
+    def why_not(m: int) -> str | None:
+        if rows[m] == 0:
+            return "the motor has no usable row"
+        if determined[m] and found[m] > 0.0 and relative[m] <= worst:
+            return None
+        if not loaded[m]:
+            return "the payload does not load it, and nothing else fixes its scale"
+        if not determined[m]:
+            return "the payload's torque on it looks like the robot's own"
+        if not found[m] > 0.0:
+            return "its best value is not positive: what the payload adds to its current is noise"
+        return f"its relative standard deviation would be {relative[m]:.0%}, more than {worst:.0%}"
 
-def _inverted(inverses: Array, covariance: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Gains (n,) and their covariance from those of their inverses, to first order."""
-    safe = np.where(known, inverses, 1.0)
-    return 1.0 / safe, covariance / np.outer(safe**2, safe**2)
+    return tuple(why_not(m) for m in range(len(total)))
 
 
 class _Fit(NamedTuple):
@@ -296,11 +306,6 @@ def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Arra
     return information, scores, squares
 
 
-def _currents_predicted(gram: Array, fit: _Fit) -> tuple[Array, Array]:
-    information, scores, _ = _linearised(gram, fit.unknowns, fit.noise)
-    return information, scores
-
-
 def _errors_in_currents(gram: Array, rows: NDArray[np.intp], fit: _Fit) -> tuple[Array, Array]:
     """Information (B, k, k) and scores (B, k) of total least squares, block by block."""
     p, n = gram.shape[2] - 2, gram.shape[1]
@@ -312,25 +317,3 @@ def _errors_in_currents(gram: Array, rows: NDArray[np.intp], fit: _Fit) -> tuple
         information.append(full[:-1, :-1])
         scores.append(-(full[:-1] @ np.append(fit.unknowns, 1.0)))
     return np.array(information), np.array(scores)
-
-
-def _loaded(gram: Array, p: int) -> bool:
-    """Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding."""
-    largest = float(np.diag(gram)[:p].max(initial=0.0))
-    return bool(gram[p, p] > _NO_LOAD**2 * largest)
-
-
-def _why_not(
-    rows: int, determined: bool, relative: float, gain: float, loaded: bool, worst: float
-) -> str | None:
-    if rows == 0:
-        return "the motor has no usable row"
-    if determined and gain > 0.0 and relative <= worst:
-        return None
-    if not loaded:
-        return "the payload does not load it, and nothing else fixes its scale"
-    if not determined:
-        return "the payload's torque on it looks like the robot's own"
-    if not gain > 0.0:
-        return "its best value is not positive: what the payload adds to its current is noise"
-    return f"its relative standard deviation would be {relative:.0%}, more than {worst:.0%}"

@@ -23,7 +23,6 @@ from identification.factor.factor import (
     QRFactor,
     estimate,
     joint_weights,
-    mark_undetermined,
     nothing_usable,
     reduced,
 )
@@ -35,31 +34,6 @@ Array = NDArray[np.float64]
 
 
 Weighting = Literal["ordinary", "weighted"]
-
-
-def ordinary_least_squares(model: RobotModel, factor: Factor) -> Estimate:
-    r"""Least squares with the same weight for every joint's residual.
-
-    The covariance is the sandwich for white residuals whose variance differs by joint
-    (White 1980), with :math:`A = \sum_j G_j`:
-
-    .. math:: A^{-1} \left(\sum_j \sigma_j^2\, G_j\right) A^{-1}
-
-    Raises:
-        IdentificationError: the factor holds no rows.
-    """
-    ones = np.ones(factor.n_joints)
-    result = estimate(model, factor, ones)
-    solution = factor.solve(ones)
-    variance = np.nan_to_num(result.noise_std**2)
-    middle = np.tensordot(variance, factor.products(solution.root), axes=1)
-    covariance = solution.root @ middle @ solution.root.T
-    mark_undetermined(covariance, solution.determined)
-    return replace(
-        result,
-        covariance=covariance,
-        method="ordinary least squares, sandwich covariance (white residuals, noise per joint)",
-    )
 
 
 def fit_least_squares(

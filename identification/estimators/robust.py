@@ -57,14 +57,12 @@ class RobustEstimate:
 
     Attributes:
         estimate: values and cluster-robust covariance; `noise_std` is the robust scale per joint.
-        mean_weight: of a joint's rows (n,), NaN without rows: 1 if none was doubted.
         outlying: share of a joint's rows more than `OUTLYING` scales off (n,), NaN without rows.
         iterations: passes over the samples.
         converged: whether the last one changed nothing more.
     """
 
     estimate: Estimate
-    mean_weight: Array
     outlying: Array
     iterations: int
     converged: bool
@@ -238,7 +236,6 @@ def _result(
     scaled = np.concatenate(state.residuals) / state.scale
     finite = np.isfinite(scaled)
     rows = np.where(np.isfinite(state.scale), np.count_nonzero(finite, axis=0), np.nan)
-    doubt = np.where(finite, loss.weight(np.where(finite, scaled, 0.0)), 0.0)
     ended = "" if state.converged else ", NOT converged"
     return RobustEstimate(
         estimate=Estimate(
@@ -254,7 +251,6 @@ def _result(
             undetermined=undetermined_names(model.parameter_names, clustered.determined),
             interval_factor=clustered.interval_factor,
         ),
-        mean_weight=doubt.sum(axis=0) / rows,
         outlying=np.count_nonzero(finite & (np.abs(scaled) > OUTLYING), axis=0) / rows,
         iterations=state.passes,
         converged=state.converged,

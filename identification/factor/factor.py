@@ -442,16 +442,6 @@ class Estimate:
         """Standard deviations (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    @property
-    def correlation(self) -> Array:
-        """Correlation matrix (p, p); an undetermined parameter correlates with nothing."""
-        std = self.std
-        scale = np.where(np.isfinite(std) & (std > 0.0), std, 1.0)
-        correlation = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
-        correlation = correlation / np.outer(scale, scale)
-        np.fill_diagonal(correlation, 1.0)
-        return np.asarray(correlation)
-
     def value(self, name: str) -> float:
         """Value of one parameter by name."""
         return float(self.values[self.names.index(name)])

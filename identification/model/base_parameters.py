@@ -70,12 +70,13 @@ class BaseParameters:
         Shares are of the longest column of the same unit, after what those before it
         explain; a parameter is dropped below :data:`TOLERANCE`.
         """
-        dropped = len(self.standard_names) - self.rank - len(self.unobservable)
+        absent = len(self.unobservable)
         text = (
             f"{self.rank} of {len(self.standard_names)} standard parameters are independent,"
-            f" {dropped} are grouped into them, {len(self.unobservable)} act on no torque."
+            f" {len(self.standard_names) - self.rank - absent} are grouped into them, {absent} act"
+            " on no torque."
         )
-        if dropped + len(self.unobservable) == 0:
+        if self.rank == len(self.standard_names):
             return f"{text} Nothing had to be decided."
         weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         text += (
@@ -89,16 +90,10 @@ class BaseParameters:
                 f" zero or not, decide whether {weakest} is a parameter of its own. Check them; a"
                 " parameter that hardly acts is named where data do not determine it."
             )
+        text += f" A gap of {np.log10(self.gap):.0f} orders of magnitude: the decision is clear."
         if self.largest_dropped < _EXACT:
-            return (
-                f"{text} A gap of {np.log10(self.gap):.0f} orders of magnitude: the decision is"
-                " clear, any threshold in between gives the same groups."
-            )
-        return (
-            f"{text} What is dropped is not quite zero, from figures of the robot description that"
-            " are rounded (1.5708 for pi/2): with exact ones the gap would be wider, the groups"
-            " the same."
-        )
+            return text
+        return f"{text} Figures of the robot description are rounded (1.5708 for pi/2)."
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group in words: ``I1yy + I1m + 0.09 m2 + ...``."""

@@ -116,7 +116,9 @@ class Settings:
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
             *self.model.friction.laws[0].words(),
-            _ripple_in_words(self.ripple),
+            f"torque ripple, {' and '.join(map(str, self.ripple))} per motor turn"
+            if self.ripple
+            else "no torque ripple",
             {"slow": "slow rows and reversals", "rests": "long rests", "none": "none"}.get(
                 how.left_out or "", "by the friction law"
             ),
@@ -263,7 +265,7 @@ def choose_settings(
     if "rows" in questions:
         now = _with(now, left_out=LEFT_OUT[0])
     if "presliding" in questions:
-        now = replace(now, model=now.model.with_friction(presliding=PRESLIDING[0]))
+        now = _friction(now, presliding=PRESLIDING[0])
     if "estimator" in questions:
         # The consistent solution is found once: what is compared on the way has to follow the data.
         quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
@@ -277,7 +279,9 @@ def choose_settings(
     # Models with other columns are compared, each with a centre of its own: now it needs one, too.
     trial.renew_centres()
     if "friction" in questions:
-        found = trial.decide("friction at speed", _friction_terms(now), TERM_WORTHWHILE)
+        found = trial.decide(
+            "friction at speed", [_friction(now, **one) for one in FRICTION_TERMS], TERM_WORTHWHILE
+        )
         now, choices = found.settings, [*choices, found.choice]
     if "ripple" in questions:
         rippled = [replace(now, model=now.model.with_elements(one)) for one in ripples]
@@ -285,8 +289,9 @@ def choose_settings(
         now, choices = found.settings, [*choices, found.choice]
     if "estimator" in questions:
         weights = PRIOR_WEIGHTS if now.shrinkage.strength > 0.0 else (now.shrinkage.prior_weight,)
-        candidates = [replace(now, shrinkage=one) for one in _shrinkages(weights)]
-        found = trial.decide("estimator", candidates, TIE)
+        some = [strength for strength in STRENGTHS if strength > 0.0]
+        each = [Shrinkage(), *(Shrinkage(strength, w) for w in weights for strength in some)]
+        found = trial.decide("estimator", [replace(now, shrinkage=one) for one in each], TIE)
         now, choices = found.settings, [*choices, found.choice]
     if not math.isfinite(trial.errors(now).overall):
         return start, ()
@@ -487,24 +492,6 @@ def _sweep(
     return now, choices
 
 
-def _bandwidths(now: Settings) -> list[Settings]:
-    return [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS]
-
-
-def _velocities(now: Settings) -> list[Settings]:
-    return [_with(now, velocity=source) for source in get_args(VelocitySource)]
-
-
-def _rows(now: Settings) -> list[Settings]:
-    return [_with(now, left_out=rows) for rows in LEFT_OUT]
-
-
-def _presliding(now: Settings) -> list[Settings]:
-    return [
-        replace(now, model=now.model.with_friction(presliding=distance)) for distance in PRESLIDING
-    ]
-
-
 class _Swept(NamedTuple):
     """A question that is decided again and again.
 
@@ -518,19 +505,32 @@ class _Swept(NamedTuple):
     question: Question
     name: str
     vary: Callable[[Settings], list[Settings]]
-    share: float | None = None
+    share: float = WORTHWHILE
 
 
 _SWEPT: Final = (
-    _Swept("bandwidth", "bandwidth of the motion", _bandwidths),
-    _Swept("velocity", "velocity", _velocities),
-    _Swept("presliding", "presliding displacement", _presliding),
-    _Swept("rows", "rows that are left out", _rows, share=0.0),
+    _Swept(
+        "bandwidth",
+        "bandwidth of the motion",
+        lambda now: [_with(now, rigid_bandwidth=width) for width in BANDWIDTHS],
+    ),
+    _Swept(
+        "velocity",
+        "velocity",
+        lambda now: [_with(now, velocity=source) for source in get_args(VelocitySource)],
+    ),
+    _Swept(
+        "presliding",
+        "presliding displacement",
+        lambda now: [_friction(now, presliding=distance) for distance in PRESLIDING],
+    ),
+    _Swept(
+        "rows",
+        "rows that are left out",
+        lambda now: [_with(now, left_out=rows) for rows in LEFT_OUT],
+        share=0.0,
+    ),
 )
-
-
-def _friction_terms(now: Settings) -> list[Settings]:
-    return [replace(now, model=now.model.with_friction(**terms)) for terms in FRICTION_TERMS]
 
 
 def _widths(now: Settings) -> list[Settings]:
@@ -545,19 +545,12 @@ def _lags(now: Settings, filtered: Settings) -> list[Settings]:
     return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
 
 
-def _shrinkages(prior_weights: Sequence[float]) -> list[Shrinkage]:
-    some = [strength for strength in STRENGTHS if strength > 0.0]
-    return [Shrinkage(), *(Shrinkage(strength, w) for w in prior_weights for strength in some)]
+def _friction(settings: Settings, **changes: Any) -> Settings:
+    return replace(settings, model=settings.model.with_friction(**changes))
 
 
 def _with(settings: Settings, **changes: Any) -> Settings:
     return replace(settings, preprocessing=replace(settings.preprocessing, **changes))
-
-
-def _ripple_in_words(orders: Sequence[int]) -> str:
-    if not orders:
-        return "no torque ripple"
-    return f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
 
 
 def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal
@@ -92,16 +92,6 @@ class RowMask:
             counts[reason] = np.count_nonzero(rows & left, axis=0)
             left &= ~rows
         return counts
-
-    def describe(self, joint_names: Sequence[str]) -> list[str]:
-        """One line per joint: how many rows count, and why the others do not."""
-        total, counts, used = self.shape[0], self.counts, np.count_nonzero(self.usable, axis=0)
-        lines = []
-        for j, name in enumerate(joint_names):
-            lost = [f"{rows[j]} {reason}" for reason, rows in counts.items() if rows[j]]
-            line = f"{name}: {used[j]} of {total} rows count"
-            lines.append(f"{line}; {', '.join(lost)}" if lost else line)
-        return lines
 
 
 def mask_rows(

@@ -54,14 +54,12 @@ class SmoothingSpline:
         spacing: knot spacing [s].
         coefficients: B-spline coefficients (intervals + 5, c).
         bandwidth: frequency at which the smoothing halves a sine, per channel (c,) [Hz].
-        residual_variance: mean squared residual at the samples (c,).
     """
 
     start: float
     spacing: float
     coefficients: Array
     bandwidth: Array
-    residual_variance: Array
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
         """Value or derivative at ``time`` (m,): (m, c), per second to the power ``derivative``.
@@ -105,7 +103,7 @@ def fit_smoothing_spline(
     while True:
         problem = _Problem.build(time, values, samples_per_knot * _median_step(time))
         fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
-        close = bool(np.all(problem.closest_residual_variance <= tolerance))
+        close = bool(np.all(np.mean(problem.closest_residual**2, axis=0) <= tolerance))
         if fine or close or samples_per_knot == 1:
             break
         samples_per_knot = max(1, samples_per_knot // 2)
@@ -166,10 +164,6 @@ class _Problem:
             start, spacing, density, rows, gram, penalty, closest, residual, _roughness(closest)
         )
 
-    @property
-    def closest_residual_variance(self) -> Array:
-        return np.asarray(np.mean(self.closest_residual**2, axis=0))
-
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """How the coefficients of a channel, or all, differ from the least smoothed ones."""
         factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
@@ -209,13 +203,11 @@ class _Problem:
         coefficients = self.closest.copy()
         for channel, penalty in enumerate(penalties):
             coefficients[:, channel] += self.correction(channel, float(penalty))
-        residual = self.closest_residual - self.rows @ (coefficients - self.closest)
         return SmoothingSpline(
             start=self.start,
             spacing=self.spacing,
             coefficients=coefficients,
             bandwidth=(self.density / penalties) ** (1 / 6) / (2.0 * np.pi * self.spacing),
-            residual_variance=np.mean(residual**2, axis=0),
         )
 
 

@@ -452,8 +452,6 @@ def gather(
     surroundings: Surroundings = Surroundings(),
     in_sample: bool = False,
     names: Sequence[str] = (),
-    slow: float = SLOW,
-    sigmas: float = SIGMAS,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
@@ -468,8 +466,6 @@ def gather(
         surroundings: what is known of the cell beside its model.
         in_sample: whether the held-out motions are those of the training after all.
         names: of the training recordings.
-        slow: bandwidth in which systematic errors are looked for [Hz].
-        sigmas: standard deviations that make a wrong sign certain.
 
     Raises:
         IdentificationError: nothing was held out.
@@ -487,8 +483,8 @@ def gather(
     if carried.explained > Thresholds().load:
         few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
         carried = weigh_load(model, few, unseen_few, carried)
-    steady = repeatability(model, values, training, slow) if repeated else None
-    slow_errors = [slow_error(model, values, run, slow) for run in held_out if repeated]
+    steady = repeatability(model, values, training, SLOW) if repeated else None
+    slow_errors = [slow_error(model, values, run, SLOW) for run in held_out if repeated]
     change = None  # of each joint the largest
     if slow_errors:
         changes = np.array([one.friction_change for one in slow_errors])
@@ -503,7 +499,7 @@ def gather(
         held_out_apart=over_all(one.apart for one in slow_errors) if repeated else None,
         friction_change=change,
         slow=steady,
-        noise_floor=_noise_floor(model, values, training[:_MOST_RECORDINGS], slow, steady),
+        noise_floor=_noise_floor(model, values, training[:_MOST_RECORDINGS], SLOW, steady),
         estimation_noise=_estimation_noise(result, unseen) if repeated else None,
         disagreement=_disagreement(result) if repeated else None,
         causes=find_causes(model, training, values, names),
@@ -518,7 +514,6 @@ def gather(
             error.rms,
             position=postures,
             speed=np.abs(velocity).max(axis=0),
-            sigmas=sigmas,
         ),
         residuals=check_residuals(
             model,

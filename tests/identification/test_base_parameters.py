@@ -128,7 +128,7 @@ def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
     assert "the decision is clear" in text
     rounded = urdf_text().replace("1.5707963267948966", "1.5708")
     assert (
-        "figures of the robot description that are rounded"
+        "Figures of the robot description are rounded"
         in RobotModel.from_urdf(rounded).base.explanation()
     )
 

@@ -10,7 +10,6 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import (
     fit_least_squares,
-    ordinary_least_squares,
 )
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, QRFactor, estimate, joint_weights
@@ -34,22 +33,9 @@ def test_ordinary_least_squares_is_the_stacked_unweighted_solution() -> None:
     samples = recording(gaussian(np.random.default_rng(8), motion), motion)
     rows = MODEL.regressor(*motion[1:]).dense(P)[samples.usable]
     expected, *_ = np.linalg.lstsq(rows, samples.torque[samples.usable], rcond=None)
-    for factor in (Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)):
-        result = ordinary_least_squares(MODEL, factor)
-        np.testing.assert_allclose(result.values, expected, rtol=1e-8)
-        assert result.method.startswith("ordinary least squares")
-
-
-def test_its_covariance_is_that_of_many_trials_though_joints_differ_in_noise() -> None:
-    motion = a_motion(4.0)
-    trials = []
-    for seed in range(200):
-        samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
-        trials.append(ordinary_least_squares(MODEL, Factor.of(MODEL, samples)))
-    scatter = np.std([trial.values for trial in trials], axis=0)
-    np.testing.assert_allclose(trials[0].std, scatter, rtol=0.2)
-    by_qr = ordinary_least_squares(MODEL, QRFactor.of(MODEL, samples))
-    np.testing.assert_allclose(by_qr.covariance, trials[-1].covariance, rtol=1e-6, atol=1e-12)
+    result = fit_least_squares(MODEL, [samples], "ordinary")
+    np.testing.assert_allclose(result.values, expected, rtol=1e-8)
+    assert result.method.startswith("ordinary least squares")
 
 
 def test_the_covariance_from_rows_is_that_from_gram_matrices_of_blocks() -> None:

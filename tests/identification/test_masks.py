@@ -131,14 +131,6 @@ def test_rows_beside_a_reversal_of_a_coupled_motor_are_left_out(friction: bool) 
         assert (np.count_nonzero(expected & ~own) > 50) == friction
 
 
-def test_the_words_name_the_joint_the_number_and_the_reason(model: RobotModel) -> None:
-    motion, recording = motion_and_recording(model, clip=15.0)
-    mask = mask_rows(recording, model, motion, np.full(2, 40.0))
-    line = mask.describe(model.joint_names)[1]
-    assert line.startswith(f"elbow: {mask.usable[:, 1].sum()} of 4000 rows count; ")
-    assert f"{mask.counts[SATURATED][1]} torque or current saturated" in line
-
-
 @pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
 def test_a_row_read_earlier_is_torn_where_it_is_read(model: RobotModel, delay: float) -> None:
     """Its motion comes from `delay` before; there has to be some, and not at an end."""
