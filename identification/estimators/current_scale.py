@@ -20,7 +20,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import SHORTEST_STRETCH
@@ -72,17 +71,9 @@ def scale_from_nominal(
         motions: smoothed, of each recording.
         currents: in their rows (m, n) [A].
         motor_from_joint: motor angles per joint angle (n, n); identity: gains include the gears.
-
-    Raises:
-        ShapeError: an array does not have the shape it should have.
     """
     n = model.n_joints
     turns = np.eye(n) if motor_from_joint is None else np.asarray(motor_from_joint, np.float64)
-    if turns.shape != (n, n):
-        raise ShapeError("motor_from_joint", turns.shape, f"({n}, {n})")
-    for motion, current in zip(motions, currents, strict=True):
-        if current.shape != motion.position.shape:
-            raise ShapeError("current", current.shape, f"{motion.position.shape}")
     parts = [_columns(model, motion, turns) for motion in motions]
     columns = np.concatenate([part[0] for part in parts])  # (m, n, 5)
     moving = np.concatenate([part[1] for part in parts])

@@ -27,7 +27,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
 from identification.factor.factor import (
     Estimate,
@@ -64,15 +64,10 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
         delays: by which torque and current lag the position (n,) [s].
 
     Raises:
-        ShapeError: not one delay per joint.
         IdentificationError: no sample is left.
     """
-    shift = np.asarray(delays, dtype=np.float64)
-    if shift.shape != (recording.n_joints,) or not np.all(np.isfinite(shift)):
-        raise ShapeError("delays", shift.shape, f"({recording.n_joints},), finite")
-    time = recording.time
-    keep = np.zeros(recording.n_samples, dtype=np.bool_)
-    gap = np.zeros(recording.n_samples, dtype=np.bool_)
+    shift, time = np.asarray(delays, dtype=np.float64), recording.time
+    keep, gap = np.zeros((2, recording.n_samples), dtype=np.bool_)
     channels = {"torque": recording.torque, "motor_current": recording.motor_current}
     moved = {name: array.copy() for name, array in channels.items() if array is not None}
     for segment in recording.segments():
@@ -84,22 +79,12 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
         gap[segment.start + int(np.argmax(covered))] = True
         for array in moved.values():
             for joint in np.flatnonzero(shift):
-                array[segment, joint] = read_at(
-                    inside, array[segment, joint], inside + shift[joint]
-                )
+                at = inside + shift[joint]
+                array[segment, joint] = read_at(inside, array[segment, joint], at)
     if not keep.any():
         raise IdentificationError("every stretch of the recording is shorter than the delay")
-    commanded = recording.commanded_position
-    return replace(
-        recording,
-        time=time[keep],
-        position=recording.position[keep],
-        velocity=None if recording.velocity is None else recording.velocity[keep],
-        commanded_position=None if commanded is None else commanded[keep],
-        gap_before=gap[keep],
-        torque=moved["torque"][keep] if "torque" in moved else None,
-        motor_current=moved["motor_current"][keep] if "motor_current" in moved else None,
-    )
+    changes: dict[str, Any] = {**moved, "gap_before": gap}
+    return replace(recording, **changes).rows(keep)
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:

@@ -27,7 +27,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread, with_block_covariance
 from identification.factor.factor import (
     WORST_CONDITION,
@@ -97,12 +97,9 @@ def planned_motion(
         lag: of each axis where it is known from the same motion (n,) [s]; else it is sought.
 
     Raises:
-        ShapeError: the commanded positions do not have the shape of the samples.
         IdentificationError: no row has a commanded position, or no joint is commanded to move.
     """
     measured, time = samples.motion.position, samples.motion.time
-    if commanded.shape != measured.shape:
-        raise ShapeError("commanded", commanded.shape, str(measured.shape))
     known = np.asarray(np.isfinite(commanded).all(axis=1))
     splines = []
     for segment in samples.segments:

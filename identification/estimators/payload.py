@@ -45,7 +45,6 @@ from identification.factor.phases import (
     fine_blocks,
     samples_by_cell,
 )
-from identification.model.kinematics import Chain
 from identification.model.pseudo_inertia import (
     Body,
     body,
@@ -127,13 +126,11 @@ class Run:
             loaded: whether the arm carried the body.
 
         Raises:
-            PayloadError: the description has no such frame, or it is fixed to the base.
+            ModelError: the description has no such frame, or it is fixed to the base.
         """
-        joint, moved = _placed(model.chain, frame)
-        n, p = model.n_joints, model.n_parameters
-        links: list[list[int]] = [[] for _ in range(n)]
-        links[joint] = list(range(_BODY))
-        plan = RegressorPlan(model.chain, model.gravity, links, [False] * n, None)
+        joint, rotation, translation = model.chain.frame(frame)
+        moved, p = _moved(rotation, translation), model.n_parameters
+        plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
         blocks, columns = samples.regressor(model)
         loads = plan.evaluate(*samples.motion[1:4])
         index = fine_blocks(samples)
@@ -684,21 +681,6 @@ def _torque_share(model: RobotModel, run: Run, delta: Array, whole: Array, weigh
             own = weight * gram[:, at[:, None], at].sum(axis=0)
             squares += delta @ own @ delta, whole @ own @ whole
     return float(np.sqrt(squares[0] / max(squares[1], np.finfo(np.float64).tiny)))
-
-
-def _placed(chain: Chain, frame: str | None) -> tuple[int, Array]:
-    """The joint that moves a frame, and the map of parameters about it to the joint's (10, 10)."""
-    if frame is None:
-        return chain.n_joints - 1, np.eye(_BODY)
-    if frame not in chain.frames:
-        raise PayloadError(
-            f"the frame {frame!r} is no link of the robot description; it has"
-            f" {', '.join(chain.frames)}"
-        )
-    joint, rotation, translation = chain.frames[frame]
-    if joint < 0:
-        raise PayloadError(f"the frame {frame!r} is fixed to the base")
-    return joint, _moved(rotation, translation)
 
 
 def _moved(rotation: Array, translation: Array) -> Array:

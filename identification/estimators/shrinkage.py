@@ -32,6 +32,7 @@ from identification.factor.factor import (
     estimate,
     joint_weights,
     solve,
+    undetermined_names,
 )
 from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.robot import RobotModel
@@ -147,19 +148,13 @@ def fit_shrunk(
     equations = factor.weighted(weights)
     values = shrunk_values(equations, centre, shrinkage.strength)
     found = block_covariance(phase, weights, free.values)
-    augmented = np.append(-values, 1.0)
-    squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
-    variance = np.maximum(squares, 0.0) / np.maximum(factor.samples, 1)
+    variance = factor.squared_errors(values) / np.maximum(factor.samples, 1)
     return replace(
         free,
         values=values,
         covariance=found.covariance,
         noise_std=np.where(factor.samples > 0, np.sqrt(variance), np.nan),
         interval_factor=found.interval_factor,
-        undetermined=tuple(
-            name
-            for name, known in zip(model.parameter_names, found.determined, strict=True)
-            if not known
-        ),
+        undetermined=undetermined_names(model.parameter_names, found.determined),
         method=f"weighted least squares, {shrinkage.describe()}; {found.words}",
     )

@@ -44,7 +44,7 @@ from identification.model.friction import Coulomb, Cubic, JointTerm, Kind, Quadr
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -388,15 +388,9 @@ def _rigid(arm: Arm, motion: Motion) -> Array:
     Of the links themselves: the base parameters leave out what rounded angles of a URDF make of
     columns that depend on others but for the rounding.
     """
-    model, n = arm.model, arm.model.n_joints
-    everything = [range(len(LINK_SYMBOLS))] * n
-    plan = RegressorPlan(model.chain, model.gravity, everything, [False] * n, None)
-    inertial = arm.standard[model.layout.links].reshape(-1)
-    torque = np.empty(motion.position.shape)
-    for part, rows in plan.chunks(*motion[1:4]):
-        for joint, block in enumerate(rows):
-            torque[part, joint] = inertial[plan.columns[joint]] @ block
-    return torque
+    model = arm.model
+    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
+    return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
 
 
 def _friction(arm: Arm, motion: Motion, which: Callable[[JointTerm], bool]) -> Array:

@@ -511,11 +511,8 @@ def _compare(
         raise WriteBackError("the description is of another robot: its joints are not the model's")
     n = model.n_joints
     q, qd, qdd = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, n))
-    plan = RegressorPlan(
-        model.chain, model.gravity, [range(_N_LINK)] * n, [False] * n, friction=None
-    )
-    columns = plan.evaluate(q, qd, qdd).dense(_N_LINK * n)
-    expected = columns @ inertial.reshape(-1)
+    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
+    expected = plan.torque(inertial.reshape(-1), q, qd, qdd)
     error = np.abs(_inverse_dynamics(text, model, q, qd, qdd) - expected).max(axis=0)
     # Links of very different mass share the rounding of the largest.
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)

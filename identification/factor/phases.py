@@ -22,7 +22,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.factor.factor import Factor, augmented_rows
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
@@ -178,13 +178,7 @@ def instrument_factor(
         usable: where the instrument is known (m, n); everywhere without it. Rows count in
             which the samples are usable and the instrument moves as well: which rows count
             must not depend on the noise.
-
-    Raises:
-        ShapeError: the instrument does not have the rows and joints of the samples.
     """
-    shape = samples.torque.shape
-    if instrument.position.shape != shape:
-        raise ShapeError("instrument", instrument.position.shape, str(shape))
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
         rows &= usable
@@ -227,16 +221,9 @@ def gain_factor(
         payload: what the robot carried.
         transmission: motors' angles per joint angle (n, n); identity: motors are joints, and
             gains include the gear ratio.
-
-    Raises:
-        ShapeError: an array does not have the shape it should have.
     """
     n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
-    if turns.shape != (n, n):
-        raise ShapeError("transmission", turns.shape, f"({n}, {n})")
-    if motor_current.shape != (m, n):
-        raise ShapeError("motor_current", motor_current.shape, f"({m}, {n})")
     blocks, columns = samples.regressor(model)
     load = model.elements.known(samples.motion.position)
     if payload is not None:

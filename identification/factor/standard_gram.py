@@ -79,8 +79,7 @@ class StandardGram:
 def gravity_loads(model: RobotModel, position: Array) -> NDArray[np.bool_]:
     """Whether gravity can load each joint (n,) in some of the positions (m, n)."""
     still = np.zeros_like(position)
-    links = [list(range(10))] * model.n_joints
-    plan = RegressorPlan(model.chain, model.gravity, links, [False] * model.n_joints, None)
+    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     blocks = plan.evaluate(position, still, still).blocks
     # Of a unit first moment the torque is g; rounding in the URDF's angles leaves far less.
     floor = 1e-3 * float(np.linalg.norm(model.gravity))

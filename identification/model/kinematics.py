@@ -148,6 +148,23 @@ class Chain:
         """Number n of joints."""
         return len(self.joint_names)
 
+    def frame(self, name: str | None) -> LinkFrame:
+        """Return the frame of a link that moves; that of the last joint without a name.
+
+        Raises:
+            ModelError: the description has no such frame, or it is fixed to the base.
+        """
+        if name is None:
+            return LinkFrame(self.n_joints - 1, np.eye(3), np.zeros(3))
+        if name not in self.frames:
+            raise ModelError(
+                f"the payload's frame {name!r} is no link of the robot description; it has"
+                f" {', '.join(self.frames)}"
+            )
+        if self.frames[name].joint < 0:
+            raise ModelError(f"the payload's frame {name!r} is fixed to the base")
+        return self.frames[name]
+
     def ancestors(self, joint: int) -> tuple[int, ...]:
         """Return the joints that move link `joint`, from the base to the joint itself."""
         path = [joint]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
 from identification.model.pseudo_inertia import Body, inertial_parameters
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan, joint_arrays
+from identification.model.regressor import RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
 
@@ -70,16 +70,7 @@ class Payload:
         Raises:
             ModelError: the description has no such frame, or it is fixed to the base.
         """
-        if self.frame is None:
-            return chain.n_joints - 1, self.parameters
-        if self.frame not in chain.frames:
-            raise ModelError(
-                f"the payload's frame {self.frame!r} is no link of the robot description; it has"
-                f" {', '.join(chain.frames)}"
-            )
-        joint, rotation, translation = chain.frames[self.frame]
-        if joint < 0:
-            raise ModelError(f"the payload's frame {self.frame!r} is fixed to the base")
+        joint, rotation, translation = chain.frame(self.frame)
         centre = rotation @ np.array(self.centre) + translation
         tensor = rotation @ _tensor(self.inertia) @ rotation.T
         return joint, inertial_parameters(Body(self.mass, centre, tensor))
@@ -99,19 +90,12 @@ class Load:
 
     def __init__(self, chain: Chain, gravity: Array, payload: Payload) -> None:
         self.joint, self.parameters = payload.carried_by(chain)
-        links: list[list[int]] = [[] for _ in range(chain.n_joints)]
-        links[self.joint] = list(range(len(LINK_SYMBOLS)))
-        self._plan = RegressorPlan(chain, gravity, links, [False] * chain.n_joints, None)
+        self._plan = RegressorPlan.of_bodies(chain, gravity, self.joint)
 
     def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the joint torques (m, n) [N·m or N] that moving it alone takes."""
         q, qd, qdd = joint_arrays(self._plan.chain.n_joints, q=q, qd=qd, qdd=qdd)
-        torque = np.zeros(q.shape)
-        weights = [self.parameters[columns] for columns in self._plan.columns]
-        for part, rows in self._plan.chunks(q, qd, qdd):
-            for joint, block in enumerate(rows):
-                torque[part, joint] = weights[joint] @ block
-        return torque
+        return self._plan.torque(self.parameters, q, qd, qdd)
 
 
 def _tensor(six: tuple[float, ...]) -> Array:

@@ -193,6 +193,13 @@ class RegressorPlan:
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state, _spare=[], _lock=Lock())
 
+    @classmethod
+    def of_bodies(cls, chain: Chain, gravity: Array, joint: int | None = None) -> RegressorPlan:
+        """Plan of the ten parameters of the link of one joint, or of all links, and no others."""
+        n, ten = chain.n_joints, range(len(LINK_SYMBOLS))
+        links = [ten if joint in (None, own) else [] for own in range(n)]
+        return cls(chain, gravity, links, [False] * n, None)
+
     def chunks(
         self,
         q: Array,
@@ -250,6 +257,17 @@ class RegressorPlan:
             for target, block in zip(full, rows, strict=True):
                 target[:, part] = block
         return Regressor(tuple(block.T for block in full), self.columns)
+
+    def torque(
+        self, values: Array, q: Array, qd: Array, qdd: Array, direction: Array | None = None
+    ) -> Array:
+        """Return the torques (m, n) of parameters (p,) for motion arrays (m, n)."""
+        torque = np.empty(q.shape)
+        weights = [values[columns] for columns in self.columns]
+        for part, rows in self.chunks(q, qd, qdd, direction):
+            for joint, block in enumerate(rows):
+                torque[part, joint] = weights[joint] @ block
+        return torque
 
     def response_row(self, joint: int) -> int:
         """Return the row behind all columns of a joint."""

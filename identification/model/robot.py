@@ -290,14 +290,11 @@ class RobotModel:
 
         Everything else is known, and no part of the regressor.
         """
-        n = self.n_joints
-        links: list[list[int]] = [[] for _ in range(n)]
-        links[-1] = list(range(_N_LINK))
         return replace(
             self,
             parameter_names=LINK_SYMBOLS,
             units=tuple(self.layout.units[k] for k in self.layout.links[-1]),
-            plan=RegressorPlan(self.chain, self.gravity, links, [False] * n, None),
+            plan=RegressorPlan.of_bodies(self.chain, self.gravity, self.n_joints - 1),
         )
 
     @property
@@ -382,12 +379,7 @@ class RobotModel:
         if values.shape != (self.n_parameters,):
             raise ShapeError("values", values.shape, f"({self.n_parameters},)")
         q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
-        torque = np.empty(q.shape)
-        weights = [values[columns] for columns in self.plan.columns]
-        for part, rows in self.plan.chunks(q, qd, qdd, direction):
-            for joint, block in enumerate(rows):
-                torque[part, joint] = weights[joint] @ block
-        return torque
+        return self.plan.torque(values, q, qd, qdd, direction)
 
     @property
     def has_load(self) -> bool:

@@ -207,8 +207,7 @@ class Folds:
         targets = self.predicted if rows == "all" else self.fitted
         squares = np.zeros((FOLDS, targets[0].n_joints))
         for k, target in enumerate(targets):
-            augmented = np.append(-estimate(k, self.without(k)), 1.0)
-            squares[k] = np.einsum("i,jik,k->j", augmented, target.gram, augmented)
+            squares[k] = target.squared_errors(estimate(k, self.without(k)))
         torque = np.array([target.gram[:, -1, -1] for target in targets])
         if not torque.any():
             return Errors(math.nan, math.nan)

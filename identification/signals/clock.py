@@ -218,13 +218,7 @@ class Clock:
         rows = ~self.repeated
         if rows.all() and self.decision == "as recorded":
             return recording
-        gap = recording.gap_before
-        return replace(
-            recording,
-            time=self.time[rows],
-            gap_before=None if gap is None else gap[rows],
-            **recording.each_channel(lambda values: values[rows]),
-        )
+        return replace(recording, time=self.time).rows(rows)
 
     def describe(self) -> list[str]:
         """What was decided and why, in sentences; none where the stamps are even."""

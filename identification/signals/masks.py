@@ -10,7 +10,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
@@ -123,16 +122,8 @@ def mask_rows(
             "none": neither.
         reversal_periods: with "slow", periods of the smoothing's bandwidth on either side of a
             reversal.
-
-    Raises:
-        ShapeError: an array does not have the shape it should have.
     """
     shape = recording.position.shape
-    if motion.velocity.shape != shape:
-        raise ShapeError("motion", motion.velocity.shape, f"{shape}, as recorded")
-    bandwidth = np.asarray(bandwidth, dtype=np.float64)
-    if bandwidth.shape != shape[1:]:
-        raise ShapeError("bandwidth", bandwidth.shape, f"{shape[1:]}")
     still = ~model.moving(motion.velocity)
     saturated = np.zeros(shape, dtype=np.bool_)
     for values, limit in (
@@ -168,14 +159,7 @@ def long_rests(time: Array, still: Rows) -> Rows:
 
 
 def at_limit(values: Array, limit: Array) -> Rows:
-    """Rows (m, n) in which a channel is at its limit (n,), either way.
-
-    Raises:
-        ShapeError: not one limit per channel.
-    """
-    limit = np.asarray(limit, dtype=np.float64)
-    if limit.shape != values.shape[1:]:
-        raise ShapeError("limit", limit.shape, f"{values.shape[1:]}")
+    """Rows (m, n) in which a channel is at its limit (n,), either way."""
     return np.asarray(np.abs(values) >= AT_LIMIT * np.abs(limit))
 
 

@@ -114,11 +114,15 @@ class Recording:
 
     def between(self, start: int, stop: int) -> Recording:
         """Return samples start to stop (exclusive) as a recording of its own."""
+        return self.rows(slice(start, stop))
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Recording:
+        """Return some of the samples."""
         return replace(
             self,
-            time=self.time[start:stop],
-            gap_before=None if self.gap_before is None else self.gap_before[start:stop],
-            **self.each_channel(lambda array: array[start:stop]),
+            time=self.time[which],
+            gap_before=None if self.gap_before is None else self.gap_before[which],
+            **self.each_channel(lambda array: array[which]),
         )
 
     @property

@@ -374,9 +374,7 @@ class _Tables:
 def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
     """Columns of some rows of each joint (n, k, q)."""
     n, p = model.n_joints, model.n_parameters
-    links: list[list[int]] = [[] for _ in range(n)]
-    links[-1] = list(range(_LOAD))
-    payload = RegressorPlan(model.chain, model.gravity, links, [False] * n, None)
+    payload = RegressorPlan.of_bodies(model.chain, model.gravity, n - 1)
     filtered = samples.torque_bandwidth is not None or samples.whole is not None
     part = np.arange(len(samples.torque)) if filtered else some
     motion = samples.motion.rows(part)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators.prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -192,8 +192,6 @@ def diagonal_inertia(model: RobotModel, values: Array, position: Array) -> Array
     the same for all standard parameters behind them.
     """
     n = model.n_joints
-    if position.ndim != 2 or position.shape[1] != n:
-        raise ShapeError("position", position.shape, f"(m, {n})")
     rigid = values.copy()
     rigid[model.base.rank :] = 0.0
     still = np.zeros_like(position)

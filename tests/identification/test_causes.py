@@ -16,6 +16,7 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Causes, find_causes
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -40,13 +41,7 @@ def moved(seed: int) -> Motion:
     centre = np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0])
     amplitude = np.array([0.7, 0.25, 0.5, 1.2, 0.7, 1.5]) * rng.uniform(0.5, 1.0, (3, 6))
     rate = np.array([1.6, 2.4, 2.2, 2.0, 2.6, 2.4]) * rng.uniform(0.4, 1.3, (3, 6))
-    angle = rate * time[:, None, None] + rng.uniform(0.0, 2.0 * np.pi, (3, 6))
-    return Motion(
-        time,
-        centre + (amplitude * np.sin(angle)).sum(axis=1),
-        (amplitude * rate * np.cos(angle)).sum(axis=1),
-        (-amplitude * rate**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, amplitude, rate, rng.uniform(0.0, 2.0 * np.pi, (3, 6)), centre)
 
 
 def recorded(model: RobotModel, seed: int, load: Array | None = None) -> Samples:
@@ -60,14 +55,7 @@ def recorded(model: RobotModel, seed: int, load: Array | None = None) -> Samples
         torque = torque + load[:, None] * of_one_kilogram(motion)
     rng = np.random.default_rng(seed + 1000)
     torque = torque + NOISE * torque.std(axis=0) * rng.standard_normal(torque.shape)
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=np.abs(motion.velocity) > SLOW,
-        segments=(slice(0, len(torque)),),
-        origin=0.0,
-        position_bandwidth=np.full(6, np.inf),
-    )
+    return as_samples(model, motion, torque, usable=np.abs(motion.velocity) > SLOW)
 
 
 def of_one_kilogram(motion: Motion) -> Array:

@@ -13,6 +13,7 @@ from identification.model.coupling import Coupling
 from identification.model.elements import TorsionSpring
 from identification.model.payload import Payload
 from tests.identification.closed_loop import JointServo, simulated_motion
+from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
 
@@ -25,13 +26,7 @@ def command() -> Motion:
     rng = np.random.default_rng(12)
     time = np.arange(2000, dtype=np.float64) * 2e-3
     a, w, phase = rng.uniform([[[0.2]], [[1.0]], [[0.0]]], [[[0.5]], [[5.0]], [[6.0]]], (3, 4, 2))
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, a, w, phase)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from identification.estimators.consistent import (
 from identification.factor.factor import Estimate, estimate, joint_weights
 from identification.model.pseudo_inertia import pseudo_inertia
 from sim_fixtures.ns16 import load_truth, standard_parameters, table2, urdf_text
+from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
 
@@ -45,17 +46,11 @@ def two_link_truth(model: RobotModel, friction: tuple[float, ...] = (4.0, 2.0, 1
 def a_motion(model: RobotModel, seed: int, samples: int = 2000, rate: float = 4.0) -> Motion:
     """Five sines per joint; another seed is another motion, about as far and as fast."""
     rng = np.random.default_rng(seed)
-    shape = (5, 1, model.n_joints)
+    shape = (5, model.n_joints)
     time = np.arange(samples) * 4e-3
-    size = np.linspace(1.0, 0.2, 5)[:, None, None]
-    pace = np.linspace(0.5, rate, 5)[:, None, None] * rng.uniform(0.9, 1.1, shape)
-    angle = pace * time[None, :, None] + rng.uniform(0.0, 6.0, shape)
-    return Motion(
-        time,
-        (size * np.sin(angle)).sum(axis=0),
-        (size * pace * np.cos(angle)).sum(axis=0),
-        -(size * pace**2 * np.sin(angle)).sum(axis=0),
-    )
+    size = np.linspace(1.0, 0.2, 5)[:, None]
+    pace = np.linspace(0.5, rate, 5)[:, None] * rng.uniform(0.9, 1.1, shape)
+    return sine_motion(time, size, pace, rng.uniform(0.0, 6.0, shape))
 
 
 def measured(model: RobotModel, motion: Motion, truth: Array, noise: float, seed: int) -> Array:

@@ -14,6 +14,7 @@ from identification.export.urdf import NotConsistentError, not_in_urdf, write_ur
 from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
 from sim_fixtures.ns16 import standard_parameters, urdf_text
+from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
 
@@ -24,15 +25,9 @@ TURNS = np.array([[1.0, 0.0], [0.5, 1.0]])
 def lively(n: int, seed: int, samples: int = 1500) -> Motion:
     rng = np.random.default_rng(seed)
     time = np.arange(samples) * 4e-3
-    size = rng.uniform(0.2, 0.6, (5, 1, n))
-    pace = rng.uniform(0.5, 6.0, (5, 1, n))
-    angle = pace * time[None, :, None] + rng.uniform(0.0, 6.0, (5, 1, n))
-    return Motion(
-        time,
-        (size * np.sin(angle)).sum(axis=0),
-        (size * pace * np.cos(angle)).sum(axis=0),
-        -(size * pace**2 * np.sin(angle)).sum(axis=0),
-    )
+    size = rng.uniform(0.2, 0.6, (5, n))
+    pace = rng.uniform(0.5, 6.0, (5, n))
+    return sine_motion(time, size, pace, rng.uniform(0.0, 6.0, (5, n)))
 
 
 def fitted(model: RobotModel, truth: Array, noise: float, seed: int = 1) -> ConsistentEstimate:

@@ -22,6 +22,7 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.signals.samples import Samples, prepare
 from identification.validation.prediction import over_all, prediction_error
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.two_link import as_samples, sine_motion
 from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
@@ -48,13 +49,7 @@ def a_motion(seed: int, n: int = 2, duration: float = 12.0, step: float = 5e-3) 
     rng = np.random.default_rng(seed)
     a = rng.uniform(0.2, 0.5, (3, n))
     w, phase = rng.uniform(2.0, 9.0, (3, n)), rng.uniform(0.0, 6.0, (3, n))
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, a, w, phase)
 
 
 def samples_of(
@@ -62,14 +57,7 @@ def samples_of(
 ) -> Samples:
     torque = model.torque(values, *motion[1:])
     torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=0.0,
-        position_bandwidth=np.full(model.n_joints, np.inf),
-    )
+    return as_samples(model, motion, torque)
 
 
 def factors(model: RobotModel, values: Array, seed: int = 0) -> tuple[PhaseFactor, PhaseFactor]:

@@ -22,6 +22,7 @@ from identification.factor.factor import (
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
 
@@ -44,13 +45,7 @@ def truth(model: RobotModel) -> Array:
 def a_motion(samples: int = 3000, *, step: float = 2e-3, held_elbow: bool = False) -> Motion:
     time = np.arange(samples) * step
     amplitude, rate = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])
-    angle = rate * time[:, None] + np.array([0.3, 1.1])
-    return Motion(
-        time,
-        amplitude * np.sin(angle) + np.array([0.0, 0.4]),
-        amplitude * rate * np.cos(angle),
-        -amplitude * rate**2 * np.sin(angle),
-    )
+    return sine_motion(time, amplitude, rate, np.array([0.3, 1.1]), np.array([0.0, 0.4]))
 
 
 def noisy_factor(model: RobotModel, truth: Array, seed: int, noise: Array = NOISE) -> Factor:

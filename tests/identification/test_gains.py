@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from hil.identify.prepared import _warnings
-from identification.errors import IdentificationError, ShapeError
+from hil.identify.prepared import current_warnings
+from identification.errors import IdentificationError
 from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.estimators.gains import GainMethod, Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
@@ -18,7 +18,7 @@ from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
-from tests.identification.two_link import MODEL, a_motion, coloured
+from tests.identification.two_link import MODEL, a_motion, as_samples, coloured, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -56,24 +56,11 @@ def lively(n: int, *, count: int = 2000, step: float = 5e-3, speed: float = 1.0)
     rng = np.random.default_rng(12)
     a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, n))
     w = w * speed
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, a, w, phase)
 
 
 def samples_of(model: RobotModel, motion: Motion) -> Samples:
-    return Samples(
-        motion=motion,
-        torque=np.zeros_like(motion.position),
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, motion.n_samples),),
-        origin=0.0,
-        position_bandwidth=np.full(motion.n_joints, np.inf),
-    )
+    return as_samples(model, motion, np.zeros_like(motion.position))
 
 
 def factor_of(
@@ -282,15 +269,6 @@ def test_without_a_known_payload_it_refuses() -> None:
         identify_gains(factor, model.joint_names)
 
 
-def test_wrong_shapes_are_refused() -> None:
-    model, _ = two_link()
-    motion = lively(2)
-    with pytest.raises(ShapeError, match="motor_current"):
-        gain_factor(model, samples_of(model, motion), np.zeros((5, 2)))
-    with pytest.raises(ShapeError, match="transmission"):
-        gain_factor(model, samples_of(model, motion), motion.position, transmission=np.eye(3))
-
-
 GAINS = np.array([12.0, 3.0])  # N·m/A
 
 
@@ -308,7 +286,7 @@ def test_a_current_of_the_wrong_sign_is_named(signs: tuple[float, float]) -> Non
     found = scale(signs)
     np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
     np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
-    negative = [text for text in _warnings(MODEL.joint_names, found) if "negative" in text]
+    negative = [text for text in current_warnings(MODEL.joint_names, found) if "negative" in text]
     assert len(negative) == any(found.turned)
     for name, turned in zip(MODEL.joint_names, found.turned, strict=True):
         assert any(name in text for text in negative) == turned

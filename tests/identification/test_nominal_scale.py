@@ -18,6 +18,7 @@ from identification.validation.finding import Finding, Thresholds
 from identification.validation.findings import Case, inertia, scale
 from identification.validation.nominal_scale import diagonal_inertia, inertia_ratio, nominal_scale
 from tests.hil.identified_arm import a_motion, packaged_urdf
+from tests.identification.two_link import as_samples
 
 Array = NDArray[np.float64]
 AXES = range(1, 4)  # of the UR5, whose weight and inertia stand out of their friction
@@ -55,16 +56,7 @@ def runs(model: RobotModel, values: Array, seed: int) -> list[Samples]:
         torque += (
             0.02 * torque.std(axis=0) * np.random.default_rng(seed).standard_normal(torque.shape)
         )
-        found.append(
-            Samples(
-                motion=motion,
-                torque=torque,
-                usable=model.moving(motion.velocity),
-                segments=(slice(0, len(motion.time)),),
-                origin=0.0,
-                position_bandwidth=np.full(model.n_joints, np.inf),
-            )
-        )
+        found.append(as_samples(model, motion, torque))
     return found
 
 

@@ -323,5 +323,5 @@ class TestFrame:
     def test_a_frame_that_is_not_there_is_refused(self) -> None:
         model, _ = recordings([None, LOAD])
         samples = samples_of(model, lively(2))
-        with pytest.raises(PayloadError, match="'tool9' is no link"):
+        with pytest.raises(ModelError, match="'tool9' is no link"):
             Run.of("a", model, samples, "tool9", loaded=False)

@@ -14,6 +14,7 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.validation.plausibility import Implausible, _inertia_columns, implausibilities
+from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
 
@@ -45,13 +46,7 @@ def estimate(model: RobotModel) -> Estimate:
 def a_motion() -> Motion:
     time = np.arange(2000) * 2e-3
     amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
-    angle = rate * time[:, None] + np.array([0.3, 1.1])
-    return Motion(
-        time,
-        amplitude * np.sin(angle),
-        amplitude * rate * np.cos(angle),
-        -amplitude * rate**2 * np.sin(angle),
-    )
+    return sine_motion(time, amplitude, rate, np.array([0.3, 1.1]))
 
 
 def found(model: RobotModel, estimate: Estimate, *, error: float = 0.1) -> Implausible:

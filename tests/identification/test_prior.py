@@ -25,6 +25,7 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -46,24 +47,12 @@ def truth() -> Array:
 def a_motion(duration: float = 6.0, *, held_elbow: bool = False) -> Motion:
     time = np.arange(0.0, duration, 5e-3)
     a, w = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])
-    angle = w * time[:, None] + np.array([0.3, 1.1])
-    return Motion(
-        time,
-        a * np.sin(angle) + np.array([0.0, 0.4]),
-        a * w * np.cos(angle),
-        -a * w**2 * np.sin(angle),
-    )
+    return sine_motion(time, a, w, np.array([0.3, 1.1]), np.array([0.0, 0.4]))
 
 
 def recording(values: Array, error: Array | float, motion: Motion) -> Samples:
-    return Samples(
-        motion=motion,
-        torque=MODEL.torque(values, *motion[1:]) + error,
-        usable=MODEL.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=float(motion.time[0]),
-        position_bandwidth=np.full(2, np.inf),
-    )
+    torque = MODEL.torque(values, *motion[1:]) + error
+    return as_samples(MODEL, motion, torque, origin=float(motion.time[0]))
 
 
 @cache

@@ -16,6 +16,7 @@ from identification.signals.samples import Samples
 from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import some_bodies
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -38,25 +39,12 @@ def samples_of(arm: Simulated, step: float = 2e-3) -> Samples:
     time = np.arange(0.0, 3.0, step)
     rng = np.random.default_rng(2)
     size, rate, phase = (rng.uniform(low, high, 6) for low, high in ((0.2, 0.5), (2, 4), (0, 6)))
-    angle = rate * time[:, None] + phase
-    motion = Motion(
-        time,
-        size * np.sin(angle),
-        size * rate * np.cos(angle),
-        -size * rate**2 * np.sin(angle),
-    )
-    return samples(motion, arm.model.torque(arm.values[0], *motion[1:]))
+    motion = sine_motion(time, size, rate, phase)
+    return samples(arm.model, motion, arm.model.torque(arm.values[0], *motion[1:]))
 
 
-def samples(motion: Motion, torque: Array) -> Samples:
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=np.ones(torque.shape, dtype=np.bool_),
-        segments=(slice(0, len(motion.time)),),
-        origin=0.0,
-        position_bandwidth=np.full(6, np.inf),
-    )
+def samples(model: RobotModel, motion: Motion, torque: Array) -> Samples:
+    return as_samples(model, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
 
 
 OPTIONS = {
@@ -99,7 +87,7 @@ class TestReplay:
         values[:, arm.model.friction_part] = 1e4
         time, still = np.arange(0.0, 0.2, 2e-3), np.full((100, 6), 0.5)
         motion = Motion(time, still, 0.0 * still, 0.0 * still)
-        error = replay(arm._replace(values=values), samples(motion, 0.0 * still))
+        error = replay(arm._replace(values=values), samples(arm.model, motion, 0.0 * still))
         assert np.abs(error).max() < 1e-9
 
     def test_a_gap_begins_anew(self) -> None:

@@ -32,6 +32,7 @@ from identification.validation.residuals import (
     check_residuals,
     find_outliers,
 )
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 Disturbance = Callable[[Motion, int], Array]
@@ -70,25 +71,12 @@ def a_run(
     time = np.arange(round(duration / STEP)) * STEP
     rng = np.random.default_rng(seed)
     amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
-    angle = rate * time[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
-    motion = Motion(
-        time,
-        (amplitude * np.sin(angle)).sum(axis=1),
-        (amplitude * rate * np.cos(angle)).sum(axis=1),
-        (-amplitude * rate**2 * np.sin(angle)).sum(axis=1),
-    )
+    motion = sine_motion(time, amplitude, rate, rng.uniform(0.0, 6.0, (3, 2)))
     torque = model.torque(values_of(model), *motion[1:])
     torque = torque + noise * coloured(rng, torque.shape)
     if disturbance is not None:
         torque = torque + disturbance(motion, seed)
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, len(time)),),
-        origin=0.0,
-        position_bandwidth=np.full(2, np.inf),
-    )
+    return as_samples(model, motion, torque)
 
 
 def checked(

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.model.elements import TorsionSpring
 from identification.model.friction import FrictionLaw
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.noise import noiseless_above, spectrum
 from identification.signals.samples import Samples
 from identification.signals.smoothing import LowPassShape, low_passed
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -38,19 +38,12 @@ def values_of(model: RobotModel) -> Array:
 def samples_of(model: RobotModel, bandwidth: float | None = None) -> Samples:
     time = np.arange(3000) * 2e-3
     rate, amplitude = np.array([2.1, 3.7]), np.array([0.9, 1.2])
-    angle = rate * time[:, None]
-    motion = Motion(
-        time,
-        amplitude * np.sin(angle),
-        amplitude * rate * np.cos(angle),
-        -amplitude * rate**2 * np.sin(angle),
-    )
-    samples = Samples(
-        motion=motion,
-        torque=np.zeros((3000, 2)),
+    motion = sine_motion(time, amplitude, rate, np.zeros(2))
+    samples = as_samples(
+        model,
+        motion,
+        np.zeros((3000, 2)),
         usable=np.ones((3000, 2), dtype=np.bool_),
-        segments=(slice(0, 3000),),
-        origin=0.0,
         position_bandwidth=np.full(2, 10.0),
         torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
     ).directed(model)

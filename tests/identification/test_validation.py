@@ -17,7 +17,6 @@ from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.signals.samples import Samples
@@ -31,7 +30,16 @@ from identification.validation.prediction import (
     residual,
     slow_error,
 )
-from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
+from tests.identification.two_link import (
+    MODEL,
+    NOISE,
+    a_motion,
+    as_samples,
+    coloured,
+    recording,
+    sine_motion,
+    truth,
+)
 
 Array = NDArray[np.float64]
 
@@ -49,21 +57,9 @@ def samples_with(model: RobotModel, error: Array, *, origin: float = 0.0) -> Sam
     """A motion whose torque is that of parameters 1, 1, 1, ... plus an error (m, 2)."""
     time = np.arange(len(error)) * 2e-3
     amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
-    angle = rate * time[:, None] + np.array([0.3, 1.1])
-    motion = Motion(
-        time + origin,
-        amplitude * np.sin(angle),
-        amplitude * rate * np.cos(angle),
-        -amplitude * rate**2 * np.sin(angle),
-    )
-    return Samples(
-        motion=motion,
-        torque=model.torque(np.ones(model.n_parameters), *motion[1:]) + error,
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, len(time)),),
-        origin=origin,
-        position_bandwidth=np.full(2, np.inf),
-    )
+    motion = sine_motion(time, amplitude, rate, np.array([0.3, 1.1]))._replace(time=time + origin)
+    torque = model.torque(np.ones(model.n_parameters), *motion[1:]) + error
+    return as_samples(model, motion, torque, origin=origin)
 
 
 def test_the_measures_are_those_of_their_definitions() -> None:

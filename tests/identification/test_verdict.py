@@ -23,6 +23,7 @@ from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
 from identification.validation.verdict import Thresholds, Verdict, judge
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -77,13 +78,7 @@ def a_motion(seed: int, *, duration: float = 8.0, step: float = 0.01) -> Motion:
     amplitude = np.array([0.7, 0.25, 0.5, 1.2, 0.7, 1.5]) * rng.uniform(0.5, 1.0, (3, 6))
     rate = np.array([1.6, 2.4, 2.2, 2.0, 2.6, 2.4]) * rng.uniform(0.4, 1.3, (3, 6))
     phase = rng.uniform(0.0, 2.0 * np.pi, (3, 6))
-    angle = rate * time[:, None, None] + phase
-    return Motion(
-        time,
-        centre + (amplitude * np.sin(angle)).sum(axis=1),
-        (amplitude * rate * np.cos(angle)).sum(axis=1),
-        (-amplitude * rate**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, amplitude, rate, phase, centre)
 
 
 def executed(
@@ -104,14 +99,8 @@ def executed(
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
     seen = np.linalg.solve(believed.motor_from_joint, real.motor_from_joint).T
     motion = Motion(motion.time, *(part @ seen for part in motion[1:4]))
-    return Samples(
-        motion=motion,
-        torque=(current * np.array(believed.constant)) @ believed.motor_from_joint,
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=0.0,
-        position_bandwidth=np.full(6, np.inf),
-    )
+    torque = (current * np.array(believed.constant)) @ believed.motor_from_joint
+    return as_samples(model, motion, torque)
 
 
 def campaign(

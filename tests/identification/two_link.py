@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,32 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
+
+
+def sine_motion(
+    time: Array, size: Array, pace: Array, phase: Array, centre: Array | float = 0.0
+) -> Motion:
+    """Sums of sines about a centre, of sizes, paces and phases (k, n) or (n,)."""
+    a, w, own = np.broadcast_arrays(*map(np.atleast_2d, (size, pace, phase)))
+    angle = w * time[:, None, None] + own
+    return Motion(
+        time,
+        centre + (a * np.sin(angle)).sum(axis=1),
+        (a * w * np.cos(angle)).sum(axis=1),
+        (-a * w**2 * np.sin(angle)).sum(axis=1),
+    )
+
+
+def as_samples(model: RobotModel, motion: Motion, torque: Array, **changes: Any) -> Samples:
+    """Samples of a motion without gaps, smoothed by nothing; where a joint moves its row counts."""
+    fields = {
+        "usable": model.moving(motion.velocity),
+        "segments": (slice(0, len(motion.time)),),
+        "origin": 0.0,
+        "position_bandwidth": np.full(model.n_joints, np.inf),
+    }
+    return Samples(motion, torque, **(fields | changes))
+
 
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
@@ -34,25 +61,13 @@ def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
     time = np.arange(0.0, duration, step)
     rng = np.random.default_rng(12)
     a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    angle = w * time[:, None, None] + phase
-    return Motion(
-        time,
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(time, a, w, phase)
 
 
 def recording(error: Array, motion: Motion) -> Samples:
     """What the planted arm's torques were in a motion, with an error (m, 2) [N·m]."""
-    return Samples(
-        motion=motion,
-        torque=MODEL.torque(truth(), *motion[1:]) + error,
-        usable=MODEL.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=float(motion.time[0]),
-        position_bandwidth=np.full(2, np.inf),
-    )
+    torque = MODEL.torque(truth(), *motion[1:]) + error
+    return as_samples(MODEL, motion, torque, origin=float(motion.time[0]))
 
 
 def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
