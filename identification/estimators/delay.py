@@ -94,14 +94,6 @@ def read_at(time: Array, values: Array, at: Array) -> Array:
     return np.asarray(source(np.clip(at, time[0], time[-1])))
 
 
-def payload_torque(model: RobotModel, samples: Samples) -> Array:
-    """Torque of the known payload (m, n), as the torque channel would have recorded it."""
-    load = model.load_torque(*samples.motion[1:4])
-    for joint in range(model.n_joints if model.has_load else 0):
-        load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]
-    return load
-
-
 def predicted_rate(samples: Samples, torque: Array) -> Array:
     """Time derivative of predicted torques (m, ...), zero in stretches too short for one."""
     rate = np.zeros_like(torque)
@@ -117,7 +109,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
     The torque t is that of the known payload.
     """
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
-    load = payload_torque(model, samples)
+    load = samples.known_torque(model)
     for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
         rows = samples.usable[:, joint]
         rate = predicted_rate(samples, np.column_stack([block, load[:, joint]]))
@@ -574,7 +566,7 @@ class _Reader:
         binned = replace(
             samples,
             motion=Motion(bins(motion.time).mean(axis=1), still, still, still),
-            torque=bins(samples.torque + payload_torque(model, samples)).mean(axis=1),
+            torque=bins(samples.torque + samples.known_torque(model)).mean(axis=1),
             usable=every(samples.usable),
             segments=tuple(b for _, b in parts),
             mask=None,
@@ -595,7 +587,7 @@ class _Reader:
             near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
             usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
         result = replace(self.binned, motion=Motion(time, *moved), usable=usable)
-        return replace(result, torque=result.torque - payload_torque(model, result))
+        return replace(result, torque=result.torque - result.known_torque(model))
 
     def phase(self, model: RobotModel, shift: Array, values: Array, count: int) -> PhaseFactor:
         """Gram matrices of `count` blocks, of p parameters and n steps of the delay.
@@ -611,7 +603,7 @@ class _Reader:
         for value in np.unique(shift):
             samples = self.at(model, float(value))
             blocks, columns = samples.regressor(model)
-            load = payload_torque(model, samples)
+            load = samples.known_torque(model)
             for j in np.flatnonzero(shift == value):
                 rate = predicted_rate(samples, load[:, j] + blocks[j] @ values[columns[j]])
                 table = np.column_stack([blocks[j], -rate, samples.torque[:, j]])

@@ -152,7 +152,10 @@ def _iterate(
         state = _pass(model, recordings, state, Loss())
     for _ in range(most):
         new = _pass(model, recordings, state, loss)
-        step = _deviations(new.factor, new.scale, new.solution.values - state.solution.values)
+        # In standard deviations, root mean square over the parameters.
+        change = new.solution.values - state.solution.values
+        squares = new.factor.products(change[:, None])[:, 0, 0]
+        step = float(np.sqrt(max(float(_weights(new.scale) @ squares), 0.0) / len(change)))
         known = np.isfinite(new.scale)
         moved = np.abs(new.scale[known] / state.scale[known] - 1.0).max(initial=0.0)
         settled = bool(moved <= _SETTLED and step <= _ROUGH)
@@ -221,12 +224,6 @@ def _weights(scale: Array) -> Array:
     """Inverse squares of scales (n,), zero where there is none yet."""
     known = np.isfinite(scale)
     return np.where(known, 1.0 / np.where(known, scale, 1.0) ** 2, 0.0)
-
-
-def _deviations(factor: Factor, scale: Array, change: Array) -> float:
-    """Change of parameters (p,) in standard deviations, root mean square over the parameters."""
-    squares = factor.products(change[:, None])[:, 0, 0]
-    return float(np.sqrt(max(float(_weights(scale) @ squares), 0.0) / len(change)))
 
 
 def _result(

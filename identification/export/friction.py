@@ -67,14 +67,14 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     """
     friction, n = model.friction, model.n_joints
     laws, table = friction.all_laws, friction.table(coefficients)
+    linear = [repr(float(law.standstill) if law.zone == "linear" else 0.0) for law in laws]
     lines = [
         '"""Identified friction of a robot\'s joints. Source: hil."""',
         "",
         f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
         f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
         "# Of the joints, then of these motors:",
-        f"LINEAR = {_tuple(repr(_linear(law)) for law in laws)}"
-        "  # rad/s or m/s: slower, the sign was fitted as linear",
+        f"LINEAR = {_tuple(linear)}  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
     kinds = friction.kinds
     if Tanh in kinds:
@@ -172,11 +172,6 @@ def _motor_lines(model: RobotModel, table: Sequence[Mapping[str, float]]) -> lis
             " that torque times its factor"
         )
     return lines
-
-
-def _linear(law: FrictionLaw) -> float:
-    """Return the speed below which the fitted sign is linear; 0 where it is not."""
-    return float(law.standstill) if law.zone == "linear" else 0.0
 
 
 def _formula(kinds: Sequence[Kind]) -> str:

@@ -64,8 +64,16 @@ def parameters_dict(
         "provenance": dict(provenance or {}),
         "joints": list(model.joint_names),
         "locked_joints": {name: float(position) for name, position in model.locked.items()},
-        "payload": _payload(model),
-        "elements": _elements(model),
+        # Known, and in none of the parameters.
+        "payload": None if model.payload is None else dataclasses.asdict(model.payload),
+        "elements": [
+            {
+                "law": type(one.element).__name__,
+                **dataclasses.asdict(one.element),
+                "parameters": list(model.elements.names[one.part]),
+            }
+            for one in model.elements.placed
+        ],
         "gravity": [float(x) for x in model.gravity],
         "convention": CONVENTION,
         "method": estimate.method,
@@ -224,26 +232,6 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
         "covariance": "that of the unconstrained parameters: inequalities have none of their own;"
         " what the data do not determine is the nominal's",
     }
-
-
-def _payload(model: RobotModel) -> dict[str, Any] | None:
-    """Return the known payload, whose torque is in none of the parameters."""
-    if model.payload is None:
-        return None
-    own = dataclasses.asdict(model.payload)
-    return {**own, "centre": list(own["centre"]), "inertia": list(own["inertia"])}
-
-
-def _elements(model: RobotModel) -> list[dict[str, Any]]:
-    """Return the springs and balancers, and the parameters that belong to each."""
-    return [
-        {
-            "law": type(one.element).__name__,
-            **dataclasses.asdict(one.element),
-            "parameters": list(model.elements.names[one.part]),
-        }
-        for one in model.elements.placed
-    ]
 
 
 def _parts(

@@ -302,7 +302,9 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
     """
     standard = model.layout.checked(standard)
     inertial = standard[model.layout.links]
-    coefficients = _friction(model, friction)
+    coefficients: dict[str, dict[str, float]] = {}
+    if friction is not None:
+        coefficients = dict(zip(model.joint_names, model.friction.table(friction), strict=False))
     _refuse_impossible(model, standard, inertial, coefficients)
     bodies, removed = without_locked(inertial, locked_bodies(urdf, model))
     source = XmlSource(urdf)
@@ -312,7 +314,11 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
         link = tree.link_of(joint)
         edits += _inertia_edits(source, link, body(parameters))
         for merged in tree.fixed_to(link):
-            edits += _merged_edits(merged, link)
+            if (element := merged.child("inertial")) is not None:
+                # Its mass is counted with the link that it is fixed to.
+                name = comment_text(link.attributes["name"])
+                note = f"<!-- inertia is contained in {name} -->"
+                edits.append(Edit(element.start, element.end, note))
         edits += _friction_edits(source, tree.joints[joint], coefficients.get(joint, {}))
     text = source.edited(edits)
     _compare(text, model, inertial, coefficients)
@@ -380,7 +386,13 @@ def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]
     """Set, or put in, the inertial element of a link."""
     element = link.child("inertial")
     if element is None:
-        lines = ["<inertial>", *(f"  {line}" for line in _inertial_lines(of)), "</inertial>"]
+        parts = {
+            "origin": {"xyz": as_text(of.centre), "rpy": "0 0 0"},
+            "mass": {"value": as_text(of.mass)},
+            "inertia": _tensor_attributes(of.inertia),
+        }
+        tags = [f"  {_tag(name, values)}" for name, values in parts.items()]
+        lines = ["<inertial>", *tags, "</inertial>"]
         yield source.with_first_child(link, lines)
         return
     origin, mass, tensor = (element.child(name) for name in ("origin", "mass", "inertia"))
@@ -400,14 +412,6 @@ def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]
         yield source.with_first_child(element, missing)
 
 
-def _merged_edits(merged: Element, link: Element) -> Iterator[Edit]:
-    """Take out the inertia of a link whose mass is counted with the one it is fixed to."""
-    element = merged.child("inertial")
-    if element is not None:
-        name = comment_text(link.attributes["name"])
-        yield Edit(element.start, element.end, f"<!-- inertia is contained in {name} -->")
-
-
 def _friction_edits(
     source: XmlSource, joint: Element, coefficients: dict[str, float]
 ) -> Iterator[Edit]:
@@ -424,14 +428,6 @@ def _friction_edits(
         yield source.with_first_child(joint, [_tag("dynamics", values)])
     else:
         yield source.with_attributes(element, values)
-
-
-def _inertial_lines(of: Body) -> list[str]:
-    return [
-        _tag("origin", {"xyz": as_text(of.centre), "rpy": "0 0 0"}),
-        _tag("mass", {"value": as_text(of.mass)}),
-        _tag("inertia", _tensor_attributes(of.inertia)),
-    ]
 
 
 def _tag(name: str, values: dict[str, str]) -> str:
@@ -455,13 +451,6 @@ def _rotation(rpy: str) -> Array:
     return np.asarray(pin.rpy.rpyToMatrix(np.array([float(angle) for angle in rpy.split()])))
 
 
-def _friction(model: RobotModel, friction: Array | None) -> dict[str, dict[str, float]]:
-    """Return friction coefficients by joint and symbol, nothing without friction."""
-    if friction is None:
-        return {}
-    return dict(zip(model.joint_names, model.friction.table(friction), strict=False))
-
-
 def _refuse_impossible(
     model: RobotModel,
     standard: Array,
@@ -469,9 +458,12 @@ def _refuse_impossible(
     coefficients: dict[str, dict[str, float]],
 ) -> None:
     """Raise `NotConsistentError` for what no machine can have."""
-    for name, value in zip(model.standard_names, standard, strict=True):
+    joint_values, n = model.layout.width, model.n_joints
+    for place, (name, value) in enumerate(zip(model.standard_names, standard, strict=True)):
         if not math.isfinite(value):
-            joint = _joint_of(model, name)
+            between = place - n * joint_values
+            own = place // joint_values if between < 0 else model.layout.pairs[between][0]
+            joint = model.joint_names[own]
             raise NotConsistentError(
                 f"parameter {name} of joint {joint!r} is no number", joint=joint
             )
@@ -513,7 +505,9 @@ def _compare(
     q, qd, qdd = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, n))
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     expected = plan.torque(inertial.reshape(-1), q, qd, qdd)
-    error = np.abs(_inverse_dynamics(text, model, q, qd, qdd) - expected).max(axis=0)
+    arm = pinocchio_model(text, model.locked)
+    arm.gravity.linear = model.gravity
+    error = np.abs(rnea(arm, q, qd, qdd) - expected).max(axis=0)
     # Links of very different mass share the rounding of the largest.
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
     wrong = np.flatnonzero(~(error <= allowed))
@@ -541,22 +535,6 @@ def _compare(
                 dynamics is None or float(dynamics.attributes[attribute]) != wanted
             ):
                 raise WriteBackError(f"{attribute} of joint {joint!r} was not written")
-
-
-def _joint_of(model: RobotModel, standard: str) -> str:
-    """Return the joint that a standard parameter is numbered after."""
-    place = model.standard_names.index(standard)
-    layout = model.layout
-    if place >= layout.n_joints * layout.width:
-        return model.joint_names[layout.pairs[place - layout.n_joints * layout.width][0]]
-    return model.joint_names[place // layout.width]
-
-
-def _inverse_dynamics(text: str, model: RobotModel, q: Array, qd: Array, qdd: Array) -> Array:
-    """Return the torques (m, n) that pinocchio finds for a description."""
-    arm = pinocchio_model(text, model.locked)
-    arm.gravity.linear = model.gravity
-    return rnea(arm, q, qd, qdd)
 
 
 def rnea(arm: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:

@@ -178,10 +178,18 @@ class Samples:
         if self.whole is not None:
             samples, part = self.whole
             return samples.predicted_torque(model, values)[part]
-        torque = model.torque(values, *self.motion[1:])
-        for joint in range(model.n_joints):
-            torque[:, joint] = self.as_measured(joint, torque[:, joint : joint + 1])[:, 0]
-        return torque
+        return self._through_channel(model.torque(values, *self.motion[1:]))
+
+    def known_torque(self, model: RobotModel) -> Array:
+        """Torque (m, n) of payload and elements that is known, as it would be recorded."""
+        return self._through_channel(model.load_torque(*self.motion[1:4]))
+
+    def _through_channel(self, torque: Array) -> Array:
+        if self.torque_bandwidth is None:
+            return torque
+        return _low_passed(
+            self.motion.time, torque, self.torque_bandwidth, self.segments, self.torque_shape
+        )
 
 
 def smooth(
@@ -271,15 +279,7 @@ def prepare(
         torque_shape=SMOOTHER if options.smooth_torque else options.torque_shape,
         mask=mask,
     ).directed(model)
-    return _unloaded(samples, model) if model.has_load else samples
-
-
-def _unloaded(samples: Samples, model: RobotModel) -> Samples:
-    """These samples without the torque of payload and elements that is known."""
-    load = model.load_torque(*samples.motion[1:4])
-    for joint in range(model.n_joints):
-        load[:, joint] = samples.as_measured(joint, load[:, joint : joint + 1])[:, 0]
-    return replace(samples, torque=samples.torque - load)
+    return replace(samples, torque=samples.torque - samples.known_torque(model))
 
 
 def _motion(

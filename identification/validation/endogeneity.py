@@ -187,7 +187,9 @@ def _wald(
     """
     p = information.shape[1] - k
     solution = solve(NormalEquations(information.sum(axis=0), moments.sum(axis=0), 0.0, 0))
-    information, moments = _merged(information, moments, solution.values)
+    # Merged until the scores of neighbours hardly correlate.
+    length = block_length(moments - information @ solution.values)
+    information, moments = merged(information, length), merged(moments, length)
     moved = spread(information, moments - information @ solution.values, solution.root)[:, p:]
     blocks = len(moments)
     freedom = (k, blocks - k)
@@ -197,12 +199,6 @@ def _wald(
         return np.nan, freedom, gamma, std
     squared = float(gamma @ np.linalg.solve(moved.T @ moved, gamma))
     return squared * freedom[1] / (k * (blocks - 1)), freedom, gamma, std
-
-
-def _merged(information: Array, moments: Array, values: Array) -> tuple[Array, Array]:
-    """Blocks merged until the scores of neighbours hardly correlate."""
-    length = block_length(moments - information @ values)
-    return merged(information, length), merged(moments, length)
 
 
 def _shift(blocks: Array) -> tuple[Array, Array, int]:
