@@ -11,18 +11,12 @@ from numpy.typing import NDArray
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
-from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck, check_consistency
-from tests.identification.test_essential import NOISE, URDF, a_motion, samples_of
+from tests.identification.test_essential import NOISE, a_motion, samples_of
 
 Array = NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
 
 
 def parameters(model: RobotModel, **changes: float) -> Array:

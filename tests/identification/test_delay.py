@@ -34,18 +34,6 @@ URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 STEP = 1e-3
 
 
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-
-
-@pytest.fixture(scope="module")
-def truth(model: RobotModel) -> Array:
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
-
-
 def motion(time: Array, speed: float = 1.0) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng(12)
     a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))

@@ -30,18 +30,6 @@ URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 NOISE = np.array([3.0, 0.2])  # N·m, very different per joint
 
 
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-
-
-@pytest.fixture(scope="module")
-def truth(model: RobotModel) -> Array:
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
-
-
 def a_motion(samples: int = 3000, *, step: float = 2e-3, held_elbow: bool = False) -> Motion:
     time = np.arange(samples) * step
     amplitude, rate = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])

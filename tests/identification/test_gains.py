@@ -9,8 +9,13 @@ from numpy.typing import NDArray
 
 from hil.identify.prepared import current_warnings
 from identification.errors import IdentificationError
-from identification.estimators.current_scale import CurrentScale, scale_from_nominal
-from identification.estimators.gains import GainMethod, Gains, identify_gains
+from identification.estimators.gains import (
+    CurrentScale,
+    GainMethod,
+    Gains,
+    identify_gains,
+    scale_from_nominal,
+)
 from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion

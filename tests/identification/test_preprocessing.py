@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from identification.factor.factor import Factor
-from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.masks import REVERSAL
 from identification.signals.noise import difference_variance, standstill_variance
@@ -24,21 +22,8 @@ from identification.signals.samples import (
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 RESOLUTION = 2e-6  # rad, of the encoders
 TRUE_FRICTION = np.array([4.0, 2.0, 1.5, 0.8])
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
-
-
-@pytest.fixture(scope="module")
-def truth(model: RobotModel) -> Array:
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, TRUE_FRICTION])
 
 
 def motion(time: Array) -> tuple[Array, Array, Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.errors import IdentificationError
-from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -37,16 +35,10 @@ from tests.identification.two_link import as_samples, sine_motion
 Array = NDArray[np.float64]
 Disturbance = Callable[[Motion, int], Array]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 STEP = 4e-3
 GEAR = np.diag([100.0, -80.0])
 NOISE = 0.5
 MEMORY = 0.05  # s, of the coloured noise
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
 
 
 def values_of(model: RobotModel) -> Array:

@@ -1,25 +1,15 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from identification.estimators.torque_channel import possible_low_passes
-from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 
 Array = NDArray[np.float64]
-
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
 
 
 def a_recording(model: RobotModel, *, bandwidth: float | None, noise: float) -> Recording:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from identification.errors import IdentificationError, ShapeError
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
-from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.signals.samples import Samples
@@ -43,14 +41,8 @@ from tests.identification.two_link import (
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 
 torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
 
 
 def samples_with(model: RobotModel, error: Array, *, origin: float = 0.0) -> Samples:
