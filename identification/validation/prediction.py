@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -68,14 +68,8 @@ class PredictionError:
 
     def __add__(self, other: PredictionError) -> PredictionError:
         """Error over both sets of rows."""
-        return PredictionError(
-            self.rows + other.rows,
-            self.absolute + other.absolute,
-            self.signed + other.signed,
-            self.squared + other.squared,
-            self.torque_sum + other.torque_sum,
-            self.torque_squared + other.torque_squared,
-        )
+        names = [field.name for field in fields(self)]
+        return PredictionError(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def mean_absolute(self) -> Array:
@@ -235,10 +229,7 @@ def over_all(runs: Iterable[PredictionError]) -> PredictionError:
     errors = list(runs)
     if not errors:
         raise IdentificationError("there is no run to validate on")
-    total = errors[0]
-    for error in errors[1:]:
-        total = total + error
-    return total
+    return sum(errors[1:], errors[0])
 
 
 def for_figure(time: Array, torque: Array, bandwidth: float = FIGURE_BANDWIDTH) -> Array:
