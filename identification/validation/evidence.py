@@ -197,8 +197,8 @@ def repeatability(
         )
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)
     spread = np.nansum((table - mean) ** 2, axis=0)
-    divisor = np.where(rows > 0, rows, np.nan)
-    freedom = np.where(shared, count - 1.0, 0.0).sum(axis=0) * divisor / divisor
+    divisor = np.where(rows > 0, rows, np.nan)  # of a joint without common rows nothing is known
+    freedom = np.where(rows > 0, np.where(shared, count - 1.0, 0.0).sum(axis=0), np.nan)
     noise = np.where(shared, spread, 0.0).sum(axis=0) / freedom
     # The mean over repetitions still holds its share of the noise.
     common = np.where(shared, mean**2 - noise / np.maximum(count, 1), 0.0).sum(axis=0) / divisor
