@@ -68,7 +68,7 @@ class TestReplay:
     def test_arms_side_by_side_move_as_each_by_itself(self, name: str) -> None:
         arm = an_arm(**OPTIONS[name])
         given = samples_of(arm)
-        short = samples(given.motion.rows(slice(0, 300)), given.torque[:300])
+        short = samples(arm.model, given.motion.rows(slice(0, 300)), given.torque[:300])
         both = together(arm, changed_weight(arm, 1.2))
         back = together(changed_weight(arm, 1.2), arm)
         found, alone, heavy = (replay(one, short) for one in (both, arm, back))
