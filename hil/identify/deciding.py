@@ -64,11 +64,10 @@ def with_noise(sources: Sources) -> tuple[Sources, str]:
     if sources.same_motion and len(recordings) > 1:
         with suppress(IdentificationError):  # no two that could be compared
             noise = repetition_noise(recordings)
-            torque = None if noise.torque is None else noise.torque.white
             return (
-                replace(sources, noise_variance=noise.position.white, torque_variance=torque),
+                replace(sources, noise_variance=noise.position, torque_variance=noise.torque),
                 "no standstill was recorded: the noise of the positions was measured on what "
-                f"differs between {noise.repetitions} repetitions at equal times",
+                f"differs between {len(recordings)} repetitions at equal times",
             )
     return sources, "the noise of the positions was estimated from their own fast part"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -100,45 +99,26 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
 _SHORTEST_RUN: Final = 64  # samples
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelNoise:
-    """Variance of one kind of channel, n joints.
+class RepetitionNoise(NamedTuple):
+    """Variances of what differs from sample to sample between repetitions of one motion.
+
+    Measurement noise, the tolerance of a smoothing spline; not friction that drifts, nor motion
+    that a servo makes from noise.
 
     Attributes:
-        white: of what differs from sample to sample (n,): measurement noise, the tolerance of a
-            smoothing spline.
-        unrepeatable: of all that differs between repetitions (n,): also friction that drifts, and
-            motion that a servo makes from noise.
+        position: (n,) [rad² or m²].
+        torque: (n,) [N²·m² or N²], None where no torque was recorded.
     """
 
-    white: Array
-    unrepeatable: Array
-
-
-@dataclass(frozen=True, eq=False)
-class RepetitionNoise:
-    """Noise from R repetitions of one motion.
-
-    Attributes:
-        position: [rad² or m²].
-        torque: [N²·m² or N²], None where no torque was recorded.
-        motor_current: [A²], None where no current was recorded.
-        rows: instants that all repetitions have in common.
-        repetitions: R.
-    """
-
-    position: ChannelNoise
-    torque: ChannelNoise | None
-    motor_current: ChannelNoise | None
-    rows: int
-    repetitions: int
+    position: Array
+    torque: Array | None
 
 
 def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
     """Variances from repetitions, aligned at the start of their commanded motion.
 
     Times are compared to the nearest sampling interval. What a shift of less than one leaves of
-    the motion is smooth and counts as unrepeatable, not as white.
+    the motion is smooth, and no white noise.
 
     Args:
         recordings: two or more of one motion, checked, with equal joints and sampling rate.
@@ -160,22 +140,19 @@ def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
     rows = [np.searchsorted(index, common) for index in indices]
     time: Array = common.astype(np.float64) * step
 
-    def noise(name: str) -> ChannelNoise | None:
-        channels = [getattr(one, name) for one in recordings]
-        if any(channel is None for channel in channels):
-            return None
-        return _channel_noise(
-            time, [channel[row] for channel, row in zip(channels, rows, strict=True)], runs
-        )
+    def white(channels: Sequence[Array]) -> Array:
+        stacked = np.stack([channel[row] for channel, row in zip(channels, rows, strict=True)])
+        # About the mean of R repetitions a share of 1/R of the variance is lost.
+        lost = np.sqrt(len(channels) / (len(channels) - 1.0))
+        apart = (stacked - stacked.mean(axis=0)) * lost
+        parts = [(a, b, one[a:b]) for a, b in runs for one in apart]
+        total = sum(difference_variance(time[a:b], own) * (b - a) for a, b, own in parts)
+        return np.asarray(total / sum(b - a for a, b, _ in parts))
 
-    position = noise("position")
-    assert position is not None
+    torques = [one.torque for one in recordings if one.torque is not None]
     return RepetitionNoise(
-        position=position,
-        torque=noise("torque"),
-        motor_current=noise("motor_current"),
-        rows=int(sum(stop - start for start, stop in runs)),
-        repetitions=len(recordings),
+        position=white([one.position for one in recordings]),
+        torque=white(torques) if len(torques) == len(recordings) else None,
     )
 
 
@@ -200,21 +177,6 @@ def _common_runs(
             f"the repetitions have no {_SHORTEST_RUN} consecutive samples in common"
         )
     return common, runs
-
-
-def _channel_noise(
-    time: Array, channels: Sequence[Array], runs: Sequence[tuple[int, int]]
-) -> ChannelNoise:
-    stacked = np.stack(channels)
-    # About the mean of R repetitions a share of 1/R of the variance is lost.
-    apart = (stacked - stacked.mean(axis=0)) * np.sqrt(len(channels) / (len(channels) - 1.0))
-    white, total, rows = np.zeros(stacked.shape[2]), np.zeros(stacked.shape[2]), 0
-    for start, stop in runs:
-        for one in apart[:, start:stop]:
-            white += difference_variance(time[start:stop], one) * (stop - start)
-            total += (one**2).sum(axis=0)
-        rows += (stop - start) * len(channels)
-    return ChannelNoise(white / rows, total / rows)
 
 
 _STRETCH: Final = 4.0  # s; lines a quarter of a hertz apart

@@ -34,6 +34,7 @@ from identification.estimators.instrumental import InstrumentalEstimate, solve_c
 from identification.factor.factor import NormalEquations, solve
 from identification.factor.phases import PhaseFactor, merged
 from identification.model.robot import RobotModel
+from identification.validation.finding import joined
 
 Array = NDArray[np.float64]
 
@@ -127,7 +128,7 @@ def endogeneity_test(
         predicted=_share(factor, np.concatenate([np.zeros(len(names)), shift, [0.0]])),
         words="",
     )
-    return replace(test, words=_words(test, result, model.joint_names))
+    return replace(test, words=_words(test, result.weak, model.joint_names))
 
 
 def _noise_columns(
@@ -225,48 +226,36 @@ def _shift(blocks: Array) -> tuple[Array, Array, int]:
     return shift, np.where(known, spread, 0.0), len(moved[0])
 
 
-def _words(test: EndogeneityTest, result: InstrumentalEstimate, joints: Sequence[str]) -> str:
+def _words(test: EndogeneityTest, weak: Sequence[str], joints: Sequence[str]) -> str:
     """Put the answer in words."""
-    if result.weak:
-        weak_names = ", ".join(result.weak[:6])
-        more = f" and {len(result.weak) - 6} more" if len(result.weak) > 6 else ""
-        caution = f" The instruments are too weak for {weak_names}{more}."
-    else:
-        caution = ""
+    caution = f" The instruments are too weak for {joined(weak)}." if weak else ""
     if np.isnan(test.p_value):
         return (
             "There is nothing to test: the instruments are the measured motion itself, or the"
             f" recording is too short.{caution}"
         )
+    answer = "Nothing says that noise in the regressor has biased least squares"
+    if test.biased:
+        answer = (
+            "Least squares is biased by noise in the regressor"
+            if test.matters
+            else "Noise in the regressor biases least squares measurably, but moves no axis's"
+            f" torque by {MATTERS:.1%} or more: too small to matter"
+        )
     worst = int(np.argmax(test.noise))
-    size = f"{test.noise[worst]:.1%} of the torque of {joints[worst]}"
-    figures = (
-        f"F({test.freedom[0]}, {test.freedom[1]}) = {test.statistic:.2f}, p = {test.p_value:.2g}"
-    )
-    if not test.biased:
-        return (
-            f"Nothing says that noise in the regressor has biased least squares ({figures}): what"
-            f" the instruments do not explain of it amounts to {size} and does not act like an"
-            f" error of measurement.{caution}"
-        )
-    moved = float(np.max(test.predicted))
-    answer = (
-        "Least squares is biased by noise in the regressor"
-        if test.matters
-        else "Noise in the regressor biases least squares measurably, but moves no axis's torque by"
-        f" {MATTERS:.1%} or more: too small to matter"
-    )
     text = (
-        f"{answer} ({figures}). What the instruments do not explain amounts to {size};"
-        f" the two estimates differ by up to {moved:.1%} of an axis's torque"
+        f"{answer} (F({test.freedom[0]}, {test.freedom[1]}) = {test.statistic:.2f},"
+        f" p = {test.p_value:.2g}). What the instruments do not explain of it amounts to"
+        f" {test.noise[worst]:.1%} of the torque of {joints[worst]}; the two estimates differ by up"
+        f" to {float(np.max(test.predicted)):.1%} of an axis's torque"
     )
-    if test.shifted:
-        text += f", beyond chance in {', '.join(test.shifted)}"
-    significance = test.coefficient / test.coefficient_std
-    if significance[int(np.nanargmax(np.abs(significance)))] > 0.0:
-        text += (
-            ". It does not act as noise of measurement does: a disturbance or error of the model"
-            " that moves the arm is the likelier cause"
-        )
-    advice = "" if not test.matters else " Use the instrumental variables, or less noisy positions."
+    if test.biased:
+        text += f", beyond chance in {', '.join(test.shifted)}" if test.shifted else ""
+        significance = test.coefficient / test.coefficient_std
+        if significance[int(np.nanargmax(np.abs(significance)))] > 0.0:
+            text += (
+                ". It does not act as noise of measurement does: a disturbance or error of the"
+                " model that moves the arm is the likelier cause"
+            )
+    advice = " Use the instrumental variables, or less noisy positions." if test.matters else ""
     return f"{text}.{advice}{caution}"
