@@ -182,7 +182,8 @@ class Samples:
 
     def known_torque(self, model: RobotModel) -> Array:
         """Torque (m, n) of payload and elements that is known, as it would be recorded."""
-        return self._through_channel(model.load_torque(*self.motion[1:4]))
+        torque = model.load_torque(*self.motion[1:4])
+        return self._through_channel(torque) if model.has_load else torque
 
     def _through_channel(self, torque: Array) -> Array:
         if self.torque_bandwidth is None:
