@@ -280,6 +280,8 @@ def prepare(
         torque_shape=SMOOTHER if options.smooth_torque else options.torque_shape,
         mask=mask,
     ).directed(model)
+    if not model.has_load:
+        return samples
     return replace(samples, torque=samples.torque - samples.known_torque(model))
 
 
