@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hil.errors import ArchiveError
 from hil.progress import Reporter
-from identification.estimators.current_scale import CurrentScale, scale_from_nominal
 from identification.estimators.delay import DelayEstimate
+from identification.estimators.gains import CurrentScale, scale_from_nominal
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples, smooth
