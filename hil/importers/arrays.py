@@ -25,51 +25,59 @@ from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
-from hil.importers.mcap_messages import Topic
 from hil.reading import opened, text_of
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 
-STAMP = "stamp"
-"""Name of the time of a topic's messages [ns]: that of their header, or else the file's."""
-
 MOST_BYTES: Final = 4 << 30
 """Of messages that become arrays, all topics together."""
-
-_BATCH = 10_000  # messages
-
-
-class VaryingError(LayoutError):
-    """Messages of a topic that are not alike."""
 
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
 
+    ``topic/stamp`` is the time of its messages [ns]: that of their header, or else the file's.
+
     Raises:
-        SourceError: the file cannot be read.
-        SourceError: it holds no topic that can be read so; the text says why for each.
+        SourceError: the file cannot be read, or holds no topic that can be read so; the text says
+            why for each.
     """
     known = mcap_messages.topics(path)
-    topics = {name: _Reader(topic) for name, topic in known.items() if topic.is_ros2}
+    refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
+    layouts: dict[str, MessageLayout] = {}
+    found: dict[str, list[tuple[int, bytes]]] = {}
     held_bytes = 0
-    for name, stamp, data in mcap_messages.messages(path, list(topics)):
-        held_bytes += len(data) if topics[name].add(stamp, data) else 0
+    for name, stamp, data in mcap_messages.messages(path, known.keys() - refused.keys()):
+        if name in refused:
+            continue
+        try:
+            if name not in layouts:
+                definition = known[name].definition.decode(errors="replace")
+                layouts[name] = layout_of(known[name].kind, definition, data)
+            size = layouts[name].size
+            # A writer may pad the end of a message to whole words.
+            if len(data) - size not in range(4):
+                raise LayoutError("its messages differ in length")
+        except LayoutError as error:
+            refused[name] = str(error)
+            found.pop(name, None)
+            continue
+        found.setdefault(name, []).append((stamp, data[:size]))
+        held_bytes += size
         if held_bytes > MOST_BYTES:
             raise SourceError(
                 path,
                 f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
                 remedy="cut it, or leave out topics (`mcap filter`)",
             )
-    refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
     arrays: dict[str, NDArray[Any]] = {}
-    for name, reader in topics.items():
+    for name, messages in found.items():
         try:
-            columns = reader.finished()
+            columns = _columns(layouts[name], messages)
         except LayoutError as error:
             refused[name] = str(error)
-            continue
-        arrays |= {f"{name}/{field}": column for field, column in columns.items()}
+        else:
+            arrays |= {f"{name}/{field}": column for field, column in columns.items()}
     if not arrays:
         reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
         raise SourceError(
@@ -80,81 +88,22 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-class _Reader:
-    """Collects the messages of one topic, joined in batches."""
-
-    def __init__(self, topic: Topic) -> None:
-        self._topic = topic
-        self._layout: MessageLayout | None = None
-        self._refusal: LayoutError | None = None
-        self._stamps: list[int] = []
-        self._batch: list[bytes] = []
-        self._parts: list[dict[str, NDArray[Any]]] = []
-
-    def add(self, stamp: int, data: bytes) -> bool:
-        """Add the next message; whether it is used."""
-        if self._refusal is None and self._layout is None:
-            self._begin(data)
-        if self._refusal is not None:
-            return False
-        self._stamps.append(stamp)
-        self._batch.append(data)
-        if len(self._batch) >= _BATCH:
-            self._take_batch()
-        return True
-
-    def finished(self) -> dict[str, NDArray[Any]]:
-        """All columns; none of a topic without messages.
-
-        Raises:
-            LayoutError: they cannot be read as columns.
-        """
-        self._take_batch()
-        if self._refusal is not None:
-            raise self._refusal
-        if not self._parts:
-            return {}
-        columns = {name: np.concatenate([part[name] for part in self._parts]) for name in
-                   self._parts[0]}  # fmt: skip
-        log_times = np.array(self._stamps, np.int64)
-        return {STAMP: _stamps(columns, log_times), **columns}
-
-    def _begin(self, data: bytes) -> None:
-        try:
-            definition = self._topic.definition.decode(errors="replace")
-            self._layout = layout_of(self._topic.kind, definition, data)
-        except LayoutError as error:
-            self._refusal = error
-
-    def _take_batch(self) -> None:
-        batch, self._batch = self._batch, []
-        if not batch or self._refusal is not None:
-            return
-        try:
-            self._parts.append(self._columns(batch))
-        except LayoutError as error:
-            self._refusal, self._parts = error, []
-
-    def _columns(self, batch: list[bytes]) -> dict[str, NDArray[Any]]:
-        assert self._layout is not None
-        size = self._layout.size
-        # A writer may pad the end of a message to whole words.
-        if any(len(message) - size not in range(4) for message in batch):
-            raise VaryingError("its messages differ in length")
-        joined = np.frombuffer(b"".join(message[:size] for message in batch), np.uint8)
-        messages = joined.reshape(len(batch), size)
-        if not self._layout.holds_in(messages):
-            raise VaryingError("its messages differ in names or lengths of arrays")
-        rows = messages.view(self._layout.dtype)[:, 0]
-        return {name: rows[name].copy() for name in self._layout.dtype.names or ()}
-
-
-def _stamps(columns: dict[str, NDArray[Any]], log_times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The times in the headers, unless there are none or all are empty."""
+def _columns(
+    layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
+) -> dict[str, NDArray[Any]]:
+    """The fields of messages of one topic, given with their log times [ns], and their stamps."""
+    joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
+    data = joined.reshape(len(messages), layout.size)
+    if not layout.holds_in(data):
+        raise LayoutError("its messages differ in names or lengths of arrays")
+    rows = data.view(layout.dtype)[:, 0]
+    columns: dict[str, NDArray[Any]] = {
+        name: rows[name].copy() for name in layout.dtype.names or ()
+    }
     seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
     if seconds is None or rest is None or not (seconds.any() or rest.any()):
-        return log_times
-    return np.asarray(seconds.astype(np.int64) * 10**9 + rest)
+        return {"stamp": np.array([stamp for stamp, _ in messages], np.int64), **columns}
+    return {"stamp": np.asarray(seconds.astype(np.int64) * 10**9 + rest), **columns}
 
 
 Array = NDArray[np.float64]
@@ -163,9 +112,6 @@ T = TypeVar("T")
 
 MOST_NUMBERS: Final = 2**28
 """In one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
-
-ALONE = "array"
-"""Name of the only array of a .npy file."""
 
 _NUMBERS: Final = "fiubmM"
 _MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
@@ -182,12 +128,7 @@ _PATIENCE: Final = 120.0  # s
 
 
 class Stored(NamedTuple):
-    """An array that is still in its file.
-
-    Attributes:
-        shape: as the file says.
-        load: reads it.
-    """
+    """An array that is still in its file: its shape as the file says, and what reads it."""
 
     shape: tuple[int, ...]
     load: Callable[[], NDArray[Any]]
@@ -274,43 +215,22 @@ class ArrayFile:
         if not isinstance(column, int) or column >= whole.shape[1]:
             raise SourceError(
                 self.path,
-                f"array {array or self._only()!r} has no column {column!r}",
+                f"array {array or next(iter(self.stored))!r} has no column {column!r}",
                 field=field,
                 remedy=f"it has {whole.shape[1]}, counted from 0",
             )
         return np.asarray(whole[:, column])
 
-    def _only(self) -> str:
-        return next(iter(self.stored))
-
     def _named(self, name: str | None, field: str) -> NDArray[Any]:
         if name is None and len(self.stored) == 1:
-            return self._array(self._only())
-        if name is not None and name in self.stored:
-            return self._array(name)
-        problem, there = self._absent(name)
-        shapes = [f"{key} {self.stored[key].shape}" for key in there]
-        if len(shapes) > _MOST_NAMED:
-            shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
-        remedy = f"its arrays are {', '.join(shapes)}"
-        raise SourceError(self.path, problem, field=field, remedy=remedy)
-
-    def _absent(self, name: str | None) -> tuple[str, list[str]]:
-        """What is wrong with a name, and the arrays that could have been meant."""
-        if name is None:
-            return "which of its arrays is not said", list(self.stored)
-        if inside := self._fields(name):
-            return f"{name!r} is a struct, no array", inside
-        for end in range(len(name) - 1, 0, -1):
-            if name[end] in ".(" and (inside := self._fields(name[:end])):
-                return f"there is no array {name[end:].lstrip('.')!r} in {name[:end]!r}", inside
-        return f"there is no array {name!r}", list(self.stored)
-
-    def _fields(self, name: str) -> list[str]:
-        """The arrays within a struct or a cell array."""
-        return [key for key in self.stored if key.startswith((f"{name}.", f"{name}("))]
-
-    def _array(self, name: str) -> NDArray[Any]:
+            (name,) = self.stored
+        if name is None or name not in self.stored:
+            problem, there = self._absent(name)
+            shapes = [f"{key} {self.stored[key].shape}" for key in there]
+            if len(shapes) > _MOST_NAMED:
+                shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
+            remedy = f"its arrays are {', '.join(shapes)}"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
         if name not in self._loaded:
             stored = self.stored[name]
             if math.prod(stored.shape) > MOST_NUMBERS:
@@ -325,6 +245,19 @@ class ArrayFile:
                 raise SourceError(self.path, f"array {name!r} does not hold real numbers")
             self._loaded[name] = array
         return self._loaded[name]
+
+    def _absent(self, name: str | None) -> tuple[str, list[str]]:
+        """What is wrong with a name, and the arrays that could have been meant."""
+        if name is None:
+            return "which of its arrays is not said", list(self.stored)
+        for end in range(len(name), 0, -1):  # a struct or cell array that is there
+            heads = (f"{name[:end]}.", f"{name[:end]}(")
+            inside = [key for key in self.stored if key.startswith(heads)]
+            if inside and end == len(name):
+                return f"{name!r} is a struct, no array", inside
+            if inside and name[end] in ".(":
+                return f"there is no array {name[end:].lstrip('.')!r} in {name[:end]!r}", inside
+        return f"there is no array {name!r}", list(self.stored)
 
 
 @contextmanager
@@ -362,26 +295,10 @@ def _member(path: Path, name: str) -> NDArray[Any]:
 
 
 def _npy(path: Path) -> dict[str, Stored]:
-    with path.open("rb") as stream:
-        head = _head(stream)
-    if head is None:
-        raise ValueError("its header is of a kind that is not known")
-    shape, dtype = head
-    if math.prod(shape) * dtype.itemsize > path.stat().st_size:
-        raise ValueError("it is shorter than it says")
-    if dtype.names:  # a structured array: one column per field
-        return {
-            name: Stored(shape, partial(_field, path, name))
-            for name in dtype.names
-            if dtype[name].kind in _NUMBERS
-        }
-    return {ALONE: Stored(shape, partial(_field, path, None))} if dtype.kind in _NUMBERS else {}
-
-
-def _field(path: Path, name: str | None) -> NDArray[Any]:
-    with path.open("rb") as stream:
-        whole = npy.read_array(stream, allow_pickle=False)
-    return np.asarray(whole if name is None else whole[name])
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    if array.dtype.names:  # a structured array: one column per field
+        return _in_memory({name: array[name] for name in array.dtype.names})
+    return _in_memory({"array": array})
 
 
 def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from hil.archive import Samples
 from hil.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
-from hil.importers.column_map import TIMES, UNITS, Column, ColumnMap, Quantity
-from hil.importers.output import Use, write_imported
-from hil.importers.robot import NOT_RECORDED, Robot
+from hil.importers.column_map import TIMES, UNITS, ColumnMap, Quantity
+from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.importers.table import Table
 
 Array = NDArray[np.float64]
@@ -60,7 +59,9 @@ def import_log(
     """
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # what is no number is refused by its place
-        values, stamp, origin = _read(log, columns)
+        values = {name: log.read(name) for name in columns.quantities()}
+    stamp, origin = log.stamps(len(values["position"]))
+    log.check_alike({**values, "time": stamp}, "quantities")
     metadata = {"importer": "log", "clock_origin_ns": str(origin)}
     if columns.format.missing == "drop":
         whole = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
@@ -176,45 +177,42 @@ class _Log:
         if quantity.files is not None:
             return self._joint_by_joint(name, quantity, quantity.files)
         file, field = self._file(quantity.file, f"{name}.file"), f"{name}.columns"
-        columns = quantity.columns
-        if columns is None or (
-            isinstance(columns, str) and "{}" not in columns and isinstance(file, ArrayFile)
-        ):
+        columns, arrays = quantity.columns, isinstance(file, ArrayFile)
+        pattern = isinstance(columns, str) and "{}" in columns
+        if columns is None or (isinstance(columns, str) and arrays and not pattern):
             matrix = file.matrix(columns or quantity.array, field)
             return self._upright(matrix, quantity, file.path, name)
         if isinstance(columns, str):
-            if "{}" not in columns:
-                raise SourceError(
-                    self.path,
-                    f"the pattern {columns!r} has no place for the joint's number",
-                    field=field,
-                    remedy='write {} there, as in "q{}"',
-                )
             known = file.names if isinstance(file, Table) else tuple(file.stored)
-            if not known:
+            if not pattern or not known:
                 raise SourceError(
                     file.path,
-                    f"its columns have no names like {columns!r}",
+                    f"its columns have no names like {columns!r}"
+                    if pattern
+                    else f"the pattern {columns!r} has no place for the joint's number",
                     field=field,
-                    remedy="count them from 0: columns = [1, 2, ...]",
+                    remedy="count them from 0: columns = [1, 2, ...]"
+                    if pattern
+                    else 'write {} there, as in "q{}"',
                 )
-            some: list[Column] = [*self._numbered(columns, known, "columns", field)]
-        else:
-            self._check_length(columns, field)
-            some = list(columns)
+            columns = tuple(self._numbered(columns, known, "columns", field))
+        self._check_length(columns, field)
         if quantity.joints_along == "rows" and isinstance(file, ArrayFile):
-            return np.asarray(file.matrix(quantity.array, field)[_indices(some, file, field)].T)
-        return file.numbers(some, field, quantity.array)
+            rows = [column for column in columns if isinstance(column, int)]
+            if len(rows) < len(columns):
+                problem = "rows of a matrix have no names"
+                raise SourceError(file.path, problem, field=field, remedy="count them from 0")
+            return np.asarray(file.matrix(quantity.array, field)[rows].T)
+        return file.numbers(columns, field, quantity.array)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
         """The numbers of a quantity that has a file per joint, (m, k)."""
         files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
         field = f"{name}.columns"
-        if isinstance(columns, tuple) and len(columns) == 1:
-            columns *= len(files)
-        elif isinstance(columns, str):
+        if isinstance(columns, str):
             columns = tuple(columns.replace("{}", str(k)) for k in range(1, len(files) + 1))
         elif columns is not None:
+            columns = columns * len(files) if len(columns) == 1 else columns
             self._check_length(columns, field)
         found = []
         for joint, file in enumerate(files):
@@ -230,15 +228,11 @@ class _Log:
                     remedy="say which one of each file, by name or by index from 0: columns = [1]",
                 )
             found.append(matrix.ravel())
-        lengths = [len(one) for one in found]
-        if len(set(lengths)) > 1:
-            listing = ", ".join(f"{f.path.name} {m}" for f, m in zip(files, lengths, strict=True))
-            raise SourceError(
-                self.path,
-                f"the files differ in length: {listing}",
-                field=f"{name}.files",
-                remedy="cut them alike",
-            )
+        self.check_alike(
+            {file.path.name: column for file, column in zip(files, found, strict=True)},
+            "files",
+            f"{name}.files",
+        )
         return np.column_stack(found)
 
     def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
@@ -344,14 +338,12 @@ class _Log:
         drive, n = self._map.drive, len(self.joints)
         for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
             values = getattr(drive, name)
-            if values is not None:
-                self._check_length(values, f"drive.{name}")
-        for row in drive.motor_from_joint or ():
-            self._check_length(row, "drive.motor_from_joint")
-        if drive.motor_from_joint is not None:
-            matrix = np.array(drive.motor_from_joint, np.float64)
-        else:
-            matrix = np.diag(drive.gear_ratio or np.ones(n)).astype(np.float64)
+            rows = values if name == "motor_from_joint" and values is not None else ()
+            for part in (values, *rows):
+                if part is not None:
+                    self._check_length(part, f"drive.{name}")
+        diagonal = np.diag(drive.gear_ratio or np.ones(n))
+        matrix = np.array(drive.motor_from_joint or diagonal.tolist(), np.float64)
         for motor, joint, ratio in drive.coupling:
             if max(motor, joint) > n:
                 raise SourceError(
@@ -365,6 +357,13 @@ class _Log:
                 self.path, "a joint would not be moved by any motor", field="drive.gear_ratio"
             )
         return matrix
+
+    def check_alike(self, arrays: Mapping[str, NDArray[Any]], what: str, field: str = "") -> None:
+        """Check that arrays have one length."""
+        if len({len(array) for array in arrays.values()}) > 1:
+            listing = ", ".join(f"{name} {len(array)}" for name, array in arrays.items())
+            problem = f"the {what} differ in length: {listing}"
+            raise SourceError(self.path, problem, field=field, remedy="cut them alike")
 
     def _per_joint(self, value: float | Sequence[float], field: str) -> Array:
         values = np.asarray(value, np.float64)
@@ -380,28 +379,6 @@ class _Log:
                 field=field,
                 remedy=f"one for each of the joints {', '.join(self.joints)}",
             )
-
-
-def _read(log: _Log, columns: ColumnMap) -> tuple[dict[str, Array], NDArray[np.int64], int]:
-    """All quantities, their stamps and the origin of these."""
-    values = {name: log.read(name) for name in columns.quantities()}
-    stamp, origin = log.stamps(len(values["position"]))
-    lengths = {name: len(array) for name, array in values.items()} | {"time": len(stamp)}
-    if len(set(lengths.values())) > 1:
-        listing = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise SourceError(
-            log.path, f"the quantities differ in length: {listing}", remedy="cut them alike"
-        )
-    return values, stamp, origin
-
-
-def _indices(columns: Sequence[Column], file: ArrayFile, field: str) -> list[int]:
-    found = [column for column in columns if isinstance(column, int)]
-    if len(found) < len(columns):
-        raise SourceError(
-            file.path, "rows of a matrix have no names", field=field, remedy="count them from 0"
-        )
-    return found
 
 
 def _nanoseconds(times: NDArray[np.generic], decimals: int, path: Path) -> list[int]:

@@ -6,7 +6,6 @@ import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from os import PathLike
@@ -25,8 +24,7 @@ from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import JOINT_STATES, Topic
-from hil.importers.output import Use, write_imported
-from hil.importers.robot import NOT_RECORDED, Robot
+from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.reading import opened
 
 SUFFIXES = (".db3", ".mcap")
@@ -89,7 +87,9 @@ def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
     Raises:
         SourceError: the file cannot be read.
     """
-    found = _of_mcap(file, topic) if file.suffix == ".mcap" else _of_sqlite(file, topic)
+    found: Iterator[tuple[int, bytes]] = _of_sqlite(file, topic)
+    if file.suffix == ".mcap":
+        found = ((stamp, data) for _, stamp, data in mcap_messages.messages(file, [topic]))
     for stamp, data in found:
         yield stamp, _decompressed(data, file) if data.startswith(_ZSTD) else data
 
@@ -141,11 +141,6 @@ def _place(path: Path) -> list[tuple[int, str]]:
     """Sorts ``x_10`` behind ``x_2``."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _of_mcap(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
-    for _, stamp, data in mcap_messages.messages(file, [topic]):
-        yield stamp, data
 
 
 def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
@@ -316,101 +311,90 @@ def _decoded(data: bytes, file: Path, number: int) -> Any:
 def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
     """The topic asked for, or the only one that carries joint states."""
     listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
-    fitting = [name for name, found in topics.items() if _fits(found)]
-    if topic is None:
-        if len(fitting) != 1:
-            raise SourceError(
-                file,
-                f"{len(fitting) or 'no'} topics carry {JOINT_STATE}",
-                field="topic",
-                remedy=f"name one of its topics: {listing}; `hil import log` reads other messages, "
-                "with a column map",
-            )
-        topic = fitting[0]
-    if topic not in topics:
-        raise SourceError(
-            file, f"there is no topic {topic}", field="topic", remedy=f"its topics are: {listing}"
+    fitting = [
+        name for name, found in topics.items() if found.is_ros2 and found.kind in JOINT_STATES
+    ]
+    problem, remedy = "", f"its topics are: {listing}"
+    if topic is None and len(fitting) != 1:
+        problem = f"{len(fitting) or 'no'} topics carry {JOINT_STATE}"
+        remedy = (
+            f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
+            "column map"
         )
-    if not _fits(topics[topic]):
+    elif topic is not None and topic not in topics:
+        problem = f"there is no topic {topic}"
+    elif topic is not None and topic not in fitting:
         found = topics[topic]
-        raise SourceError(
-            file,
-            f"topic {topic} carries {found.kind} in {found.encoding}, not measured joint states",
-            field="topic",
-            remedy=f"name a topic of type {JOINT_STATE}; the bag has: {listing}",
+        problem = (
+            f"topic {topic} carries {found.kind} in {found.encoding}, not measured joint states"
         )
-    return topic
+    if problem:
+        raise SourceError(file, problem, field="topic", remedy=remedy)
+    return topic or fitting[0]
 
 
-def _fits(topic: Topic) -> bool:
-    return topic.is_ros2 and topic.kind in JOINT_STATES
-
-
-@dataclass(eq=False)
 class _States:
     """Collects joint state messages, joints in the order wanted.
 
-    Attributes:
+    Args:
         source: the bag, for errors.
         joints: the joints wanted, by their names in the URDF.
         renamed: name in the URDF by name in the bag.
     """
 
-    source: Path
-    joints: Sequence[str]
-    renamed: Mapping[str, str]
-    header_stamps: list[int] = field(default_factory=list)
-    bag_stamps: list[int] = field(default_factory=list)
-    rows: dict[str, list[Array]] = field(
-        default_factory=lambda: {"position": [], "velocity": [], "effort": []}
-    )
-
-    def __post_init__(self) -> None:
+    def __init__(self, source: Path, joints: Sequence[str], renamed: Mapping[str, str]) -> None:
+        self._source, self._joints, self._renamed = source, joints, renamed
+        self._header_stamps: list[int] = []
+        self._bag_stamps: list[int] = []
+        self._rows: dict[str, list[Array]] = {"position": [], "velocity": [], "effort": []}
         self._orders: dict[tuple[str, ...], list[int]] = {}
-        self._seen: list[str] = []
 
     @property
     def clock(self) -> str:
         """Whose stamps the samples have."""
-        return "header" if any(self.header_stamps) else "bag"
+        return "header" if any(self._header_stamps) else "bag"
 
     def add(self, bag_stamp: int, data: bytes) -> None:
         """Take a message in, unless it has none of the joints."""
-        message = _decoded(data, self.source, len(self.bag_stamps))
-        order = self._order(tuple(message.name))
+        number = len(self._bag_stamps)
+        message = _decoded(data, self._source, number)
+        names = tuple(message.name)
+        if names not in self._orders:
+            self._orders[names] = self._order(names)
+        order = self._orders[names]
         if not order:
             return
         stamp = message.header.stamp
-        self.header_stamps.append(stamp.sec * 10**9 + stamp.nanosec)
-        self.bag_stamps.append(bag_stamp)
-        for name, rows in self.rows.items():
+        self._header_stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+        self._bag_stamps.append(bag_stamp)
+        for name, rows in self._rows.items():
             values = getattr(message, name)
-            if len(values) == len(message.name):
+            if len(values) == len(names):
                 rows.append(values[order])
             elif len(values):
                 raise SourceError(
-                    self.source,
-                    f"message {len(self.bag_stamps) - 1} has {len(values)} values for "
-                    f"{len(message.name)} joints",
+                    self._source,
+                    f"message {number} has {len(values)} values for {len(names)} joints",
                     field=name,
                 )
 
     def samples(self, effort: Effort) -> Samples:
         """Everything that was read."""
-        if not self.bag_stamps:
-            recorded = f"recorded are {', '.join(self._seen)}" if self._seen else "it is empty"
+        if not self._bag_stamps:
+            seen = dict.fromkeys(name for names in self._orders for name in names)
+            recorded = f"recorded are {', '.join(seen)}" if seen else "it is empty"
             raise SourceError(
-                self.source,
-                f"none of the joints {', '.join(self.joints)} was recorded; {recorded}",
+                self._source,
+                f"none of the joints {', '.join(self._joints)} was recorded; {recorded}",
                 field="joints",
                 remedy="give the URDF of this robot, or say which joint is which: --rename "
                 "RECORDED=URDF",
             )
         position = self._column("position")
         if position is None:
-            raise SourceError(self.source, "the messages have no positions", field="position")
+            raise SourceError(self._source, "the messages have no positions", field="position")
         strength = None if effort == "ignore" else self._column("effort")
-        stamps = self.header_stamps if self.clock == "header" else self.bag_stamps
+        stamps = self._header_stamps if self.clock == "header" else self._bag_stamps
         return Samples(
             stamp=np.array(stamps, np.int64),
             position=position,
@@ -424,13 +408,13 @@ class _States:
 
         NaN is what ros2_control publishes for an interface that the hardware does not have.
         """
-        rows = self.rows[name]
-        if not rows or all(np.isnan(row).all() for row in rows):
+        rows = self._rows[name]
+        if all(np.isnan(row).all() for row in rows):
             return None
-        if len(rows) != len(self.bag_stamps):
+        if len(rows) != len(self._bag_stamps):
             raise SourceError(
-                self.source,
-                f"only {len(rows)} of {len(self.bag_stamps)} messages have it",
+                self._source,
+                f"only {len(rows)} of {len(self._bag_stamps)} messages have it",
                 field=name,
                 remedy="record it throughout",
             )
@@ -438,16 +422,13 @@ class _States:
 
     def _order(self, names: tuple[str, ...]) -> list[int]:
         """Where the wanted joints stand in a message; empty when it has none of them."""
-        if names not in self._orders:
-            self._seen += [name for name in names if name not in self._seen]
-            ours = [self.renamed.get(name, name) for name in names]
-            missing = [joint for joint in self.joints if joint not in ours]
-            if missing and len(missing) < len(self.joints):
-                raise SourceError(
-                    self.source,
-                    f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
-                    field="joints",
-                    remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
-                )
-            self._orders[names] = [] if missing else [ours.index(joint) for joint in self.joints]
-        return self._orders[names]
+        ours = [self._renamed.get(name, name) for name in names]
+        missing = [joint for joint in self._joints if joint not in ours]
+        if missing and len(missing) < len(self._joints):
+            raise SourceError(
+                self._source,
+                f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
+                field="joints",
+                remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
+            )
+        return [] if missing else [ours.index(joint) for joint in self._joints]
