@@ -36,7 +36,6 @@ LONG: Final = (
     "docs/test_examples.py",
     "docs/test_typed_pages.py",
     "fuzz",
-    "hil/archive/test_memory.py",
     "hil/test_any_robot.py",
     "hil/test_archive_process.py",
     "hil/test_batch.py",

@@ -1,7 +1,9 @@
-"""Parts of an archive: columns, channels and times, without decoding the rest."""
+"""Parts of an archive: columns, channels and times, without decoding or holding the rest."""
 
 from __future__ import annotations
 
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.archive import Samples, open_archive, write_samples
+from drivers.record import cycle_dtype
+from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive.check import check_archive
+from hil.archive.repair import repair
 from hil.errors import ArchiveError
 
 PERIOD = 0.01
@@ -116,3 +121,49 @@ def test_a_summary_that_fails_its_checksum_is_not_believed(written, tmp_path: Pa
     archive = open_archive(path, start=50.2, stop=50.3)
     assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:30])
     assert not archive.complete
+
+
+CYCLES = 8_000
+CONTENT = CYCLES * 1100  # bytes of messages, about
+WORK = 3_000_000
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rows = np.zeros(CYCLES, cycle_dtype(6))
+    rows["cycle"] = np.arange(CYCLES)
+    rows["position"] = np.random.default_rng(1).normal(size=(CYCLES, 6))
+    file = tmp_path_factory.mktemp("memory") / "move_000_a1.mcap"
+    names = tuple(f"joint_{i}" for i in range(6))
+    with ArchiveWriter(file, joint_names=names, period=0.001, metadata={}, durable=False) as w:
+        for start in range(0, CYCLES, 1000):
+            w.write(rows[start : start + 1000])
+        w.close("completed")
+    return file
+
+
+def peak(action: Callable[[], object]) -> int:
+    """Most bytes that an action had allocated at a time."""
+    tracemalloc.start()
+    kept = action()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    del kept
+    return most
+
+
+def test_reading_one_column_takes_little_more_than_the_column(long):
+    column = CYCLES * 8
+    assert CONTENT > 2.5 * WORK
+    assert peak(lambda: open_archive(long, fields=["cycle"])) < 3 * column + WORK
+
+
+def test_a_range_takes_little_whatever_the_length(long):
+    assert peak(lambda: open_archive(long, start=1.0, stop=1.1)) < WORK
+
+
+def test_checking_and_repairing_hold_a_chunk_at_a_time(long):
+    assert peak(lambda: check_archive(long)) < WORK
+    torn = long.with_name("torn.mcap")
+    torn.write_bytes(long.read_bytes()[:-5000])
+    assert peak(lambda: repair(torn)) < WORK
