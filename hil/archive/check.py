@@ -1,4 +1,4 @@
-"""Says whether a file keeps the archive profile, aspect by aspect.
+"""Says what an archive holds, and whether a file keeps the archive profile, aspect by aspect.
 
 `docs/archive-format.md` is the profile in words; each rule here is one of its sentences. The check
 is of the file alone: whether the motion in it is any good is not asked.
@@ -7,9 +7,10 @@ is of the file alone: whether the motion in it is any good is not asked.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel
@@ -25,11 +26,15 @@ from hil.archive.header import (
     KINDS,
     METADATA,
     REJECTED,
+    WORDS,
     ArchiveHeader,
     ArchiveName,
+    ArchiveOutcome,
     HeaderError,
     is_known,
+    motion_name,
 )
+from hil.archive.reader import open_archive
 from hil.archive.repair import Survey, is_indexed, survey
 from hil.errors import NotAnArchiveError
 
@@ -313,3 +318,124 @@ def _repeats(state: Rows, cycles: Rows, columns: Mapping[str, str]) -> bool:
         if repeated.tobytes() != column.tobytes():
             return False
     return True
+
+
+_MOST_EVENTS = 20
+_SHOWN_ELSEWHERE = frozenset(
+    ("kind", "index", "attempt", "joint_names", "period", "attachments", "outcome", "reason")
+)
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What an archive holds.
+
+    Attributes:
+        path: the file.
+        title: kind, index and attempt.
+        outcome: how it ended, and why.
+        lost: what the link or this PC lost, "" where nothing.
+        samples: how many can be read.
+        duration: from the first to the last [s].
+        period: cycle [s], None where it is not fixed.
+        joint_names: in the order of the columns.
+        size: of the file in bytes.
+        per_minute: bytes for a minute of motion, None without samples.
+        chunks: how many stand.
+        channels: topic, type and number of messages.
+        attachments: bytes by name.
+        metadata: the other entries.
+        events: time [s], kind and text of the first ones.
+        damage: what is wrong with the file, None where nothing.
+    """
+
+    path: Path
+    title: str
+    outcome: str
+    lost: str
+    samples: int
+    duration: float
+    period: float | None
+    joint_names: tuple[str, ...]
+    size: int
+    per_minute: float | None
+    chunks: int
+    channels: tuple[tuple[str, str, int], ...]
+    attachments: Mapping[str, int]
+    metadata: Mapping[str, str]
+    events: tuple[tuple[float, str, str], ...]
+    damage: str | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        entries = asdict(self)
+        return {"file": str(entries.pop("path")), "archive": True, **entries}
+
+
+def overview(path: str | PathLike[str]) -> Overview:
+    """Look into an archive.
+
+    Raises:
+        NotAnArchiveError: another kind of file.
+        ArchiveError: it cannot be read.
+    """
+    archive = open_archive(path, fields=())
+    header, outcome = archive.header, archive.outcome
+    found = survey(path)
+    ended, lost = _ended(outcome)
+    further = {
+        **header.entries,
+        **{f"outcome.{key}": text for key, text in (outcome.entries if outcome else {}).items()},
+    }
+    stamp = archive.columns["stamp"]
+    duration = float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0
+    return Overview(
+        path=archive.path,
+        title=_title(header),
+        outcome=ended,
+        lost=lost,
+        samples=archive.n_samples,
+        duration=duration,
+        period=archive.period,
+        joint_names=archive.joint_names,
+        size=found.size,
+        per_minute=found.size / duration * 60.0 if duration else None,
+        chunks=found.chunks,
+        channels=tuple(
+            (topic, getattr(found.parser.known.schema(topic), "name", ""), count)
+            for topic, count in sorted(found.counts.items())
+        ),
+        attachments={name: len(data) for name, data in archive.attachments.items()},
+        metadata={
+            key: text
+            for key, text in further.items()
+            if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
+        },
+        events=tuple(
+            (event.time, event.name, event.text) for event in archive.events[:_MOST_EVENTS]
+        ),
+        damage=None if archive.damage is None else str(archive.damage),
+    )
+
+
+def _title(header: ArchiveHeader) -> str:
+    if header.index is None:
+        return WORDS.get(header.kind, header.kind)
+    attempt = 1 if header.attempt is None else header.attempt
+    return f"{motion_name(header.kind, header.index)}, attempt {attempt}"
+
+
+def _ended(outcome: ArchiveOutcome | None) -> tuple[str, str]:
+    """How a recording ended, and what was lost, in words."""
+    if outcome is None:
+        return "missing", ""
+    reason = f": {outcome.reason}" if outcome.reason else ""
+    counts = {
+        "lost packets": outcome.lost_packets,
+        "records lost": outcome.records_lost,
+        "events lost": outcome.events_lost,
+        "samples lost": "unknown" if outcome.samples_lost is None else outcome.samples_lost,
+    }
+    lost = [f"{name} {count}" for name, count in counts.items() if count]
+    repaired = ", repaired with loss" if outcome.repaired else ""
+    return f"{outcome.outcome}{reason}{repaired}", "; ".join([*lost, *outcome.losses])

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.archive.check import ASPECTS, Check, check_archive
-from hil.archive.overview import Overview, overview
+from hil.archive.check import ASPECTS, Check, Overview, check_archive, overview
 from hil.archive.repair import repair as repair_archive
 from hil.archive.repair import repaired_name
 from hil.cli import exit_code_of

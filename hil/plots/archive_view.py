@@ -6,6 +6,7 @@ A long archive is read window by window, so that memory does not grow with its l
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from drivers.packets import DRIVE_ON
 from drivers.states import State
 from hil.archive import Archive, open_archive
-from hil.archive.overview import Overview, overview
+from hil.archive.check import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
@@ -37,7 +38,6 @@ _FIELDS: Final = (
     "position", "velocity", "torque", "target_current", "motor_current", "target_position",
     "state", "status", "gap",
 )  # fmt: skip
-_TURN: Final = 2.0 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +148,14 @@ def view_of(
     )
     return ArchiveView(
         facts=overview(path),
-        joint_names=tuple(_row_name(head.joint_names[j], scales.slides[j]) for j in shown),
+        joint_names=tuple(f"{head.joint_names[j]}{' [mm]' * scales.slides[j]}" for j in shown),
         start=begin,
         stop=end,
-        quantities=collected.quantities(scales),
+        quantities=tuple(collected.quantities(scales)),
         states=tuple(collected.states),
         events=events,
         gaps=np.array(collected.gaps),
-        frame=scales.frame,
+        frame=scales.words,
     )
 
 
@@ -181,79 +181,73 @@ def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
     return sorted({known[joint] for joint in joints}) or list(range(len(names)))
 
 
-def _row_name(name: str, slides: bool) -> str:
-    return f"{name} [mm]" if slides else name
-
-
 @dataclass(frozen=True, eq=False)
 class _Scales:
-    """From SI to what is shown, and the limits, as far as the archive's cell tells them."""
+    """From SI to what is shown, and the limits (2, n), as far as the archive's cell tells them."""
 
-    sign: Array
-    offset: Array
+    frame: AngleFrame
     slides: NDArray[np.bool_]
-    frame: str
     motor_from_joint: Array | None
-    limits: Mapping[str, tuple[Array, Array]]
+    limits: Mapping[str, Array]
 
     @classmethod
     def of(cls, archive: Archive) -> _Scales:
         n = len(archive.joint_names)
-        cell = _cell(archive)
-        slides = _slides(archive, n)
+        cell, motors = _cell(archive), None
         frame = AngleFrame("urdf", np.ones(n), np.zeros(n))
-        limits: dict[str, tuple[Array, Array]] = {}
+        both = np.array([[-1.0], [1.0]])
+        limits: dict[str, Array] = {}
         if cell is not None and cell.file.limits is not None:
-            frame = AngleFrame.of(cell)
-            bounds = cell.joint_limits
-            ends = np.sort([frame.shown(bounds.lower), frame.shown(bounds.upper)], axis=0)
-            limits["position"] = (ends[0], ends[1])
-            limits["velocity"] = _both(np.degrees(bounds.velocity))
+            frame, bounds = AngleFrame.of(cell), cell.joint_limits
+            limits["position"] = np.sort([frame.shown(bounds.lower), frame.shown(bounds.upper)], 0)
+            limits["velocity"] = both * np.degrees(bounds.velocity)
             if cell.torque_limit is not None:
-                limits["torque"] = _both(cell.torque_limit)
-        try:
-            table = archive.table("drive_train.json")
-        except ArchiveError:
-            table = {}  # limits that cannot be read are not drawn
-        for name, key in (("current", "current_limit"), ("following", "following_error")):
-            if (limit := _limit_in(table, key, n)) is not None:
-                limits[name] = _both(limit)
-        motors = None
+                limits["torque"] = both * cell.torque_limit
         if cell is not None and cell.file.drive_train is not None:
             motors = cell.drive_train.motor_from_joint
-        return cls(frame.sign, frame.offset, slides, _words(frame), motors, limits)
+        # Limits that cannot be read are not drawn.
+        with suppress(ArchiveError):
+            table = archive.table("drive_train.json")
+            for name, key in (("current", "current_limit"), ("following", "following_error")):
+                if (limit := _limit_in(table, key, n)) is not None:
+                    limits[name] = both * limit
+        return cls(frame, _slides(archive, n), motors, limits)
 
-    def limit(self, name: str, joint: int) -> tuple[float | None, float | None]:
-        if name not in self.limits:
-            return None, None
-        low, high = self.limits[name]
-        return float(low[joint]), float(high[joint])
+    @property
+    def words(self) -> str:
+        """The frame, for a person."""
+        pendant = self.frame.name == "controller"
+        whose = "as on the teach pendant" if pendant else "of the URDF"
+        return f"angles, speeds and torques {whose}"
 
-    def position(self, q: Array) -> Array:
-        shown = np.degrees(q * self.sign + self.offset)
-        return np.where(self.slides, 1e3 * q, shown)
+    def shown(self, columns: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Array]]:
+        """Quantities (m, n) of a window in the units that are shown: mm of a joint that slides.
 
-    def rate(self, rate: Array) -> Array:
-        return np.where(self.slides, 1e3 * rate, np.degrees(rate * self.sign))
+        Torques turn as their joint does, so that torque times speed stays the power. Following
+        errors are in motor revolutions where the drive train is known.
+        """
+        position = columns.get("position")
+        if position is not None:
+            yield "position", np.where(self.slides, 1e3 * position, self.frame.shown(position))
+        if "velocity" in columns:
+            yield "velocity", self._rate(columns["velocity"])
+        current = columns.get("target_current", columns.get("motor_current"))
+        if current is not None:
+            yield "current", current
+        if "torque" in columns:
+            yield "torque", columns["torque"] * np.where(self.slides, 1.0, self.frame.sign)
+        if "target_position" in columns and position is not None:
+            error = columns["target_position"] - position
+            if self.motor_from_joint is None:
+                error = self._rate(error)
+            else:
+                error = error @ self.motor_from_joint.T / (2.0 * np.pi)
+            # Before the drive is on the controller reports no target.
+            driven = columns["status"] == DRIVE_ON
+            yield "following", np.where(driven[:, np.newaxis], error, np.nan)
 
-    def torque(self, torque: Array) -> Array:
-        """As the joint turns, so that torque times speed stays the power."""
-        return np.where(self.slides, torque, torque * self.sign)
-
-    def following(self, error: Array) -> Array:
-        """Motor revolutions where the drive train is known, else as positions."""
-        if self.motor_from_joint is None:
-            return self.rate(error)
-        return np.asarray(error @ self.motor_from_joint.T / _TURN)
-
-
-def _words(frame: AngleFrame) -> str:
-    whose = "as on the teach pendant" if frame.name == "controller" else "of the URDF"
-    return f"angles, speeds and torques {whose}"
-
-
-def _both(limit: Array) -> tuple[Array, Array]:
-    return -limit, limit
+    def _rate(self, rate: Array) -> Array:
+        return np.where(self.slides, 1e3 * rate, self.frame.shown_rate(rate))
 
 
 def _limit_in(table: Any, key: str, n: int) -> Array | None:
@@ -267,22 +261,17 @@ def _limit_in(table: Any, key: str, n: int) -> Array | None:
 
 def _cell(archive: Archive) -> Cell | None:
     """The cell that travels in an archive; None where there is none that can still be used."""
-    attached = archive.attachments
-    if "cell.toml" not in attached or "robot.urdf" not in attached:
-        return None
     try:
-        cell = Cell.from_texts(
-            attached["cell.toml"].decode(), attached["robot.urdf"].decode(), archive.path
-        )
-    except (HilError, UnicodeDecodeError):
+        cell = Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
+    except HilError:
         return None
     return cell if cell.joint_names == archive.joint_names else None
 
 
 def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
     try:
-        chain = chain_from_urdf(archive.attachments["robot.urdf"].decode())
-    except (KeyError, UnicodeDecodeError, ModelError):
+        chain = chain_from_urdf(archive.text("robot.urdf"))
+    except (ArchiveError, ModelError):
         return np.zeros(n, dtype=np.bool_)
     turns = dict(zip(chain.joint_names, chain.revolute, strict=True))
     return np.array([not turns.get(name, True) for name in archive.joint_names])
@@ -297,7 +286,7 @@ class _Collected:
         self._joints = list(joints)
         self._duration = max(duration, 1e-9)
         self._bins = bins
-        self._lines: dict[str, list[tuple[list[Array], list[Array]]]] = {}
+        self._lines: dict[str, list[list[tuple[Array, Array]]]] = {}
 
     def take(self, archive: Archive, scales: _Scales, origin: float) -> None:
         columns = archive.columns
@@ -309,78 +298,54 @@ class _Collected:
         leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
         # What is too large in degrees for any float is missing in the picture.
         with np.errstate(over="ignore", invalid="ignore"):
-            shown = list(_shown(columns, scales))
+            shown = list(scales.shown(columns))
         gaps = np.flatnonzero(np.diff(time) > leap) + 1
         broken = np.insert(time, gaps, time[gaps])
         for name, values in shown:
-            lines = self._lines.setdefault(name, [([], []) for _ in self._joints])
-            for (times, parts), joint in zip(lines, self._joints, strict=True):
+            lines = self._lines.setdefault(name, [[] for _ in self._joints])
+            for line, joint in zip(lines, self._joints, strict=True):
                 for t, v in runs(broken, np.insert(values[:, joint], gaps, np.nan), bins):
-                    if times and t[0] - times[-1][-1] > leap:
-                        times.append(np.array([np.nan]))
-                        parts.append(np.array([np.nan]))
-                    times.append(t)
-                    parts.append(v)
+                    if line and t[0] - line[-1][0][-1] > leap:
+                        line.append((np.array([np.nan]), np.array([np.nan])))
+                    line.append((t, v))
         if "state" in columns:
             self._take_states(time, columns["state"])
             self.gaps += time[columns["gap"] > 0].tolist()
 
-    def quantities(self, scales: _Scales) -> tuple[Quantity, ...]:
+    def quantities(self, scales: _Scales) -> Iterator[Quantity]:
         motor = scales.motor_from_joint is not None
-        titles = {
-            "position": ("position [deg]", style.POSITION),
-            "velocity": ("speed [deg/s]", style.VELOCITY),
-            "current": ("motor current [A]", style.ACCELERATION),
-            "torque": ("torque at the joint [N·m]", "#5b3a8c"),
-            "following": (f"following error [{'motor rev' if motor else 'deg'}]", style.INK),
-        }
-        return tuple(
-            Quantity(
-                title,
-                colour,
-                tuple(
-                    Trace(*_joined(*line), *scales.limit(name, joint))
-                    for line, joint in zip(self._lines[name], self._joints, strict=True)
-                ),
-                limits_shown=name == "current",
-            )
-            for name, (title, colour) in titles.items()
-            if name in self._lines and any(times for times, _ in self._lines[name])
-        )
+        for name, title, colour in (
+            ("position", "position [deg]", style.POSITION),
+            ("velocity", "speed [deg/s]", style.VELOCITY),
+            ("current", "motor current [A]", style.ACCELERATION),
+            ("torque", "torque at the joint [N·m]", "#5b3a8c"),
+            ("following", f"following error [{'motor rev' if motor else 'deg'}]", style.INK),
+        ):
+            lines = self._lines.get(name, [])
+            if any(lines):
+                traces = []
+                for line, joint in zip(lines, self._joints, strict=True):
+                    t, v = zip(*line, strict=True) if line else ((np.zeros(0),), (np.zeros(0),))
+                    limits = scales.limits.get(name)
+                    bounds = () if limits is None else map(float, limits[:, joint])
+                    traces.append(Trace(np.concatenate(t), np.concatenate(v), *bounds))
+                yield Quantity(title, colour, tuple(traces), limits_shown=name == "current")
 
     def _take_states(self, time: Array, state: NDArray[np.uint8]) -> None:
         edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist()]
         ends = [*(time[edge] for edge in edges[1:]), time[-1]]
         for edge, until in zip(edges, ends, strict=True):
             name = _state_name(int(state[edge]))
+            begin = float(time[edge])
             if self.states and self.states[-1][2] == name:
-                self.states[-1] = (self.states[-1][0], float(until), name)
-            else:
-                self.states.append((float(time[edge]), float(until), name))
+                begin = self.states.pop()[0]
+            self.states.append((begin, float(until), name))
 
 
 def _state_name(number: int) -> str:
     """A state of the session; the number itself of one that an untrusted archive made up."""
     known = number in State.__members__.values()
     return State(number).name.lower().replace("_", " ") if known else f"state {number}"
-
-
-def _shown(columns: Mapping[str, NDArray[Any]], scales: _Scales) -> Iterator[tuple[str, Array]]:
-    """Quantities (m, n) of a window in the units that are shown."""
-    if "position" in columns:
-        yield "position", scales.position(columns["position"])
-    if "velocity" in columns:
-        yield "velocity", scales.rate(columns["velocity"])
-    current = columns.get("target_current", columns.get("motor_current"))
-    if current is not None:
-        yield "current", current
-    if "torque" in columns:
-        yield "torque", scales.torque(columns["torque"])
-    if "target_position" in columns and "position" in columns:
-        error = scales.following(columns["target_position"] - columns["position"])
-        # Before the drive is on the controller reports no target.
-        driven = columns["status"] == DRIVE_ON
-        yield "following", np.where(driven[:, np.newaxis], error, np.nan)
 
 
 def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
@@ -395,9 +360,3 @@ def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]
     edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
-
-
-def _joined(times: list[Array], values: list[Array]) -> tuple[Array, Array]:
-    if not times:
-        return np.zeros(0), np.zeros(0)
-    return np.concatenate(times), np.concatenate(values)

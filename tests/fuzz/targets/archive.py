@@ -12,8 +12,7 @@ import numpy as np
 from drivers import InitPacket
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
-from hil.archive.check import check_archive
-from hil.archive.overview import overview
+from hil.archive.check import check_archive, overview
 from hil.archive.repair import repair
 from hil.errors import ArchiveError, ArchiveWriteError, InputError
 from hil.new import cell_of_urdf, from_archive

@@ -23,10 +23,9 @@ from typer.testing import CliRunner
 import hil
 from hil.archive import container, header, open_archive, schema
 from hil.archive.cdr import LayoutError, fixed_layout
-from hil.archive.check import check_archive
+from hil.archive.check import check_archive, overview
 from hil.archive.container import Record
 from hil.archive.header import ArchiveHeader, HeaderError, chunk_list
-from hil.archive.overview import overview
 from hil.archive.repair import repair
 from hil.archive.schema import sample_messages
 from hil.archive.writer import ArchiveFile
