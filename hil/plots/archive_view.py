@@ -148,7 +148,10 @@ def view_of(
     )
     return ArchiveView(
         facts=overview(path),
-        joint_names=tuple(f"{head.joint_names[j]}{' [mm]' * scales.slides[j]}" for j in shown),
+        joint_names=tuple(
+            f"{head.joint_names[j]} [mm]" if scales.slides[j] else head.joint_names[j]
+            for j in shown
+        ),
         start=begin,
         stop=end,
         quantities=tuple(collected.quantities(scales)),
