@@ -38,7 +38,7 @@ _LONGEST = (
     "test_study.py",
     "test_batch.py",
     "test_commands.py",
-    "test_isolation.py",
+    "test_worker.py",
 )
 """Files that take longest: the workers of `make test` begin with them, so that none ends alone."""
 

@@ -81,13 +81,13 @@ LONG: Final = (
     "identification/test_instrumental.py",
     "identification/test_low_passes.py",
     "identification/test_payload_estimate.py",
-    "identification/test_population_scores.py",
+    "identification/test_population.py",
     "identification/test_search.py",
     "identification/test_verdict.py",
     "independent",
-    "planner/test_interpolator_pace.py",
-    "planner/test_isolation.py",
+    "planner/test_interpolator.py",
     "planner/test_player_live.py",
+    "planner/test_worker.py",
 )
 """Files that take too long for every change."""
 
