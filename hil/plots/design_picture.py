@@ -390,6 +390,13 @@ def draw_design(
             figure.text(
                 0.07, at, line.text, fontsize=line.size, color=line.colour, fontweight=line.weight
             )
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        # The solver's last digits differ from one time to the next.
+        for part in (top, bottom, left, right):
+            part.bbox_relative.set_points(np.round(part.bbox_relative.get_points(), 4))
+        for axes in figure.axes:
+            axes.set_position(np.round(axes.get_position(original=True).bounds, 4).tolist())
     return figure
 
 
