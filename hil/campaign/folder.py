@@ -12,7 +12,7 @@ import io
 import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -196,9 +196,12 @@ class CampaignFolder:
         rehearsed: folder of the rehearsal's own campaigns: its archives and reports.
         dry_run: who accepted the slow dry run.
         warmup: how the friction fell while the arm warmed up.
+        digests: of archives by name, so that one look at the folder reads each of them once; None
+            to read them each time.
     """
 
     root: Path
+    digests: dict[str, str] | None = field(default=None, compare=False, repr=False)
 
     archives = _Below("archives")
     cell = _Below("cell.toml")
@@ -384,8 +387,11 @@ class CampaignFolder:
         return None
 
     def _unchanged(self, entry: Entry) -> bool:
+        digests = {} if self.digests is None else self.digests
         try:
-            return file_digest(self.archives / entry.name) == entry.sha256
+            if entry.name not in digests:
+                digests[entry.name] = file_digest(self.archives / entry.name)
+            return digests[entry.name] == entry.sha256
         except OSError as error:
             if is_no_file(error):
                 return False

@@ -93,7 +93,8 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     Raises:
         CampaignFolderError: its manifest cannot be read.
     """
-    folder, again = campaign.folder, "rehearse {} --again"
+    folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
+    campaign = replace(campaign, folder=folder)
     at = shlex.quote(str(folder.root))
     # With what makes the file of a step anew, should it be damaged: nothing makes up for the cell
     # or the plan of recordings, nor for what a person saw.
