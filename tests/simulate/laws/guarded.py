@@ -68,13 +68,14 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
     moved = np.append(False, (stretch.step[:-1] != 0.0).any(axis=1))
     gaps = stretch.talk.records["gap"][stretch.rows].astype(np.intp)
     # Those that were heard and are in the gap, as of a pile, count once; twice if the session saw
-    # them with a corrupted number, which only a set-point that goes on from the target shows.
+    # them with a corrupted number, which only a set-point that goes on from the target shows; one
+    # that is sent again begins there, too.
     twice = _unanswered_before(stretch)
     once = np.maximum(gaps, twice - gaps)
     before = np.concatenate((stretch.sent[:1], stretch.sent[:-1]))
     begun = stretch.sent - stretch.step  # where each step begins, by its own account
     led = np.abs(begun - stretch.received[0]).max(axis=1) < np.abs(begun - before).max(axis=1)
-    missed = np.where((once <= most) & led, twice, once)
+    missed = np.where((once <= most) & led & ~stretch.again, twice, once)
     cuts = np.flatnonzero((missed > most) & moved)
     cuts = cuts[cuts < stretch.leading]
     for first, last in pairwise((0, *cuts.tolist(), len(stretch.sent))):
