@@ -1,4 +1,4 @@
-"""Two hundred and sixteen seeds: eight for every change, the others in pieces that test processes share."""
+"""Simulated campaigns in CI: eight seeds for every change, the others in pieces."""
 
 from __future__ import annotations
 
