@@ -675,24 +675,25 @@ def _lists(results: Results) -> Iterator[tuple[str, Sequence[Any] | None, int]]:
     """Lists per joint and per parameter, by name, and how many there are of those."""
     n, p = len(results.joint_names), len(results.parameters)
     yield "noise_std", results.noise_std, n
-    for one in results.validation:
-        for name in ("mean_abs_error", "rms_error", "mean_error", "relative_error"):
-            yield f"validation.{name}", getattr(one, name), n
-    if results.fitted is not None:
-        yield "fitted.relative_error", results.fitted.relative_error, n
-    if results.calibration is not None:
-        for name in ("joint_inside", "half_width"):
-            yield f"calibration.{name}", getattr(results.calibration, name), n
-    if results.delays is not None:
-        for name in ("found", "interval", "applied"):
-            yield f"delays.{name}", getattr(results.delays, name), n
+    for section, names in _PER_JOINT.items():
+        found = getattr(results, section)
+        for one in found if isinstance(found, list) else filter(None, [found]):
+            for name in names:
+                yield f"{section}.{name}", getattr(one, name), n
     yield "correlation", results.correlation, p
-    for row in results.correlation:
-        yield "correlation", row, p
-    for row in results.repetition_values:
-        yield "repetition_values", row, p
+    for name in ("correlation", "repetition_values"):
+        for row in getattr(results, name):
+            yield name, row, p
     for name in get_args(UncertaintyResult.model_fields["reported"].annotation):
         yield f"uncertainty.{name}", getattr(results.uncertainty, name), p
+
+
+_PER_JOINT: Final = {
+    "validation": ("mean_abs_error", "rms_error", "mean_error", "relative_error"),
+    "fitted": ("relative_error",),
+    "calibration": ("joint_inside", "half_width"),
+    "delays": ("found", "interval", "applied"),
+}
 
 
 def csv_tables(results: Results) -> dict[str, str]:

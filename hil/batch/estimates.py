@@ -340,7 +340,7 @@ def _conditioning(found: Estimate) -> list[str]:
     if found.undetermined or found.condition <= QR_CONDITION:
         return []
     return [
-        f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some "
-        "parameters apart, and sums of squares lose digits there; `hil identify` on these archives "
-        "uses QR"
+        f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some"
+        " parameters apart, and sums of squares lose digits there; `hil identify` on these"
+        " archives uses QR"
     ]

@@ -25,7 +25,7 @@ from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import Weighting, fit_least_squares
-from identification.factor.factor import Estimate, joint_weights
+from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -67,7 +67,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     summary = Summary(
         ref=ref,
         total=phase.merged(max(1, len(phase))),
-        fits=_fits(model, samples, phase) if fitted else {},
+        fits={kind: _fit(model, samples, phase, kind) for kind in WEIGHTINGS} if fitted else {},
         warnings=_warnings(archive, cell, source),
         products=rate_products(model, samples) if fitted and settings.delay_variance else None,
     )
@@ -255,22 +255,15 @@ def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
     return cell.with_friction(**dict(friction)) if friction else cell
 
 
-def _fits(model: RobotModel, samples: Samples, phase: PhaseFactor) -> dict[str, Fit]:
-    fits: dict[str, Fit] = {}
-    for weighting in WEIGHTINGS:
-        one = fit_least_squares(model, [samples], weighting, phase=phase)
-        fits[weighting] = Fit(one, design_effect(one, phase, weighting))
-    return fits
-
-
-def design_effect(estimate: Estimate, phase: PhaseFactor, weighting: Weighting) -> float:
-    """Mean ratio of the estimate's variances to those of white residuals."""
-    total = phase.total
-    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(total)
-    if estimate.undetermined:
-        return block_covariance(phase, weights, estimate.values).design_effect
-    information = total.weighted(weights).A
-    return float(np.einsum("ij,ji->", information, estimate.covariance)) / phase.n_parameters
+def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor, weighting: Weighting) -> Fit:
+    """With the mean ratio of the estimate's variances to those of white residuals."""
+    found = fit_least_squares(model, [samples], weighting, phase=phase)
+    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(phase.total)
+    if found.undetermined:
+        return Fit(found, block_covariance(phase, weights, found.values).design_effect)
+    information = phase.total.weighted(weights).A
+    trace = np.einsum("ij,ji->", information, found.covariance)
+    return Fit(found, float(trace) / phase.n_parameters)
 
 
 def _warnings(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:

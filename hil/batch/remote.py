@@ -57,7 +57,10 @@ def archives_below(url: str) -> list[tuple[str, str]]:
         alone = root.endswith(_SUFFIX)
         infos = {root: store.info(root)} if alone else store.find(root, detail=True)
         return sorted(
-            (str(store.unstrip_protocol(path)), _version(info))
+            (
+                str(store.unstrip_protocol(path)),
+                next((str(info[name]) for name in _VERSIONS if info.get(name)), ""),
+            )
             for path, info in infos.items()
             if path.endswith(_SUFFIX)
         )
@@ -82,10 +85,6 @@ def local_file(location: str) -> Iterator[Path]:
         path = Path(folder) / location.rstrip("/").rsplit("/", 1)[-1]
         _asked(location, lambda store, place: store.get_file(place, str(path)))
         yield path
-
-
-def _version(info: dict[str, Any]) -> str:
-    return next((str(info[name]) for name in _VERSIONS if info.get(name)), "")
 
 
 def _asked(url: str, question: Callable[[Any, str], T]) -> T:

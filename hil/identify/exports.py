@@ -74,7 +74,11 @@ def exports_of(
         IdentificationError: the estimate is not of the cell's model.
     """
     model = cell.model
-    origin = {key: _line(value) for key, value in (provenance or {}).items()}
+    # Each fit for one line of any of the files: names of archives come from anywhere.
+    origin = {
+        key: " ".join("".join(c if c.isprintable() else " " for c in value).split())
+        for key, value in (provenance or {}).items()
+    }
     possible = None if isinstance(consistent, str) else consistent
     contents: dict[str, str | None] = {
         PARAMETERS_JSON: parameters_json(
@@ -151,8 +155,3 @@ def _urdf(
         )
     lines += [f"{key}: {value}" for key, value in origin.items()]
     return write_urdf(with_comment(cell.urdf, lines), model, consistent.standard, friction)
-
-
-def _line(text: str) -> str:
-    """Text fit for one line of any of the files: names of archives come from anywhere."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -17,7 +17,7 @@ from identification.estimators.gains import GainMethod, Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
-from identification.signals.recording import Recording, RecordingError
+from identification.signals.recording import RecordingError
 
 from .options import FIXED
 from .prepared import motor_from_joint
@@ -81,18 +81,18 @@ def find_gains(
             archive = open_archive(path)
             cell = cell_of(archive)
             payload = loaded.get(path, cell.model.payload)
-            source = _source(archive, cell)
-            turns = _turns(cell, source.recording)
+            source, current = _source(archive, cell)
+            turns = motor_from_joint(source.recording)
+            if cell.file.drive_train is not None:
+                turns = np.asarray(cell.drive_train.motor_from_joint)
             if first is None:
                 first = cell, replace(cell.model, payload=None), turns
-            _refuse_other_arm(archive, cell, turns, first)
+            _refuse_other_arm(path, cell, turns, first)
             settings = stated_settings(cell, options)
             try:
                 samples = samples_of(source, cell, settings, first[1])
             except RecordingError as error:
                 raise ArchiveError(path, str(error), remedy="leave it out") from error
-            current = source.recording.motor_current
-            assert current is not None
             factors.append(
                 gain_factor(first[1], samples, current, payload=payload, transmission=turns)
             )
@@ -104,7 +104,7 @@ def find_gains(
     return GainsFound(gains, cell, loads, not np.array_equal(turns, np.eye(len(turns))))
 
 
-def _source(archive: Archive, cell: Cell) -> Source:
+def _source(archive: Archive, cell: Cell) -> tuple[Source, Array]:
     """Motion and currents of an archive, and no torque: one in the log may be of other gains."""
     source = source_of(archive, cell)
     current = source.recording.motor_current
@@ -112,24 +112,18 @@ def _source(archive: Archive, cell: Cell) -> Source:
         raise ArchiveError(
             archive.path, "holds no motor currents", remedy="import them as motor_current"
         )
-    return source.changed(lambda one: replace(one, torque=np.zeros_like(current)))
-
-
-def _turns(cell: Cell, recording: Recording) -> Array:
-    """Motor angles per joint angle (n, n)."""
-    if cell.file.drive_train is not None:
-        return np.asarray(cell.drive_train.motor_from_joint)
-    return motor_from_joint(recording)
+    without = replace(source.recording, torque=np.zeros_like(current))
+    return replace(source, recording=without), current
 
 
 def _refuse_other_arm(
-    archive: Archive, cell: Cell, turns: Array, first: tuple[Cell, RobotModel, Array]
+    path: Path, cell: Cell, turns: Array, first: tuple[Cell, RobotModel, Array]
 ) -> None:
     """One robot with one drive train; only what it carries may differ."""
     same = cell.urdf == first[0].urdf and np.array_equal(turns, first[2])
     if not same or cell.model.parameter_names != first[1].parameter_names:
         raise ArchiveError(
-            archive.path,
+            path,
             f"is of another robot, friction law or drive train than {first[0].path}",
             remedy="identify the gains of each robot by themselves",
         )

@@ -117,7 +117,18 @@ def friction_from(text: str) -> Mapping[str, Any]:
         name, _, figure = term.strip().partition("=")
         kind = known.get(name)
         if name == "presliding" or (kind is not None and kind.speed_symbol):
-            entries[kind.option if kind else name] = _positive(term, figure)
+            try:
+                value = float(figure)
+            except ValueError:
+                value = math.nan
+            if not 0.0 < value < math.inf:
+                raise InputError(
+                    None,
+                    f"{term.strip()!r} has no figure above zero",
+                    field="--friction",
+                    remedy="write for instance presliding=1e-4",
+                )
+            entries[kind.option if kind else name] = value
         elif kind is not None and not figure and entries[kind.option] == absent[kind.option]:
             entries[kind.option] = kind.label if kind.option in ABSENT else True
         else:
@@ -128,21 +139,6 @@ def friction_from(text: str) -> Mapping[str, Any]:
                 remedy=f"use auto, or some of {FRICTION_TERMS}, with commas between them",
             )
     return entries
-
-
-def _positive(term: str, figure: str) -> float:
-    try:
-        value = float(figure)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise InputError(
-            None,
-            f"{term.strip()!r} has no figure above zero",
-            field="--friction",
-            remedy="write for instance presliding=1e-4",
-        )
-    return value
 
 
 FIXED: Final = Options(

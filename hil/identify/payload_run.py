@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +30,7 @@ from identification.model.robot import RobotModel
 from .options import Options
 from .prepared import prepare_sources
 from .settings import samples_of, signals_of
-from .sources import Sources, aligned, gather_sources, refuse_duplicates
+from .sources import aligned, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
 
@@ -265,7 +265,14 @@ def find_payload(
     }
     _refuse_other_arm(found[False].cell, found[True].cell, sides[True][0])
     paths = {path.name: path for path in (*sides[False], *sides[True])}
-    _require_torques(found.values(), paths)
+    for source in (*found[False].training, *found[True].training):
+        if source.recording.torque is None:
+            raise ArchiveError(
+                source.path,
+                "holds no joint torques, and a payload is weighed in their unit",
+                field="torque",
+                remedy="give drive.torque_constant in the column map",
+            )
     cell = found[False].cell.without_payload()
     training = (*found[False].training, *found[True].training)
     if found[False].plan is None and found[True].plan is None:
@@ -285,7 +292,8 @@ def find_payload(
             runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
             task.advance(1, source.name)
     with reporter.task("weighing", 2) as task:
-        _refuse_difference(find_difference(cell.model, runs), paths)
+        if (difference := find_difference(cell.model, runs)) is not None:
+            raise _mixed(difference, paths[difference.run.name])
         task.advance(1)
         estimate = identify_payload(cell.model, runs, box)
         task.advance(1)
@@ -351,33 +359,19 @@ def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
         )
 
 
-def _require_torques(sources: Iterable[Sources], paths: Mapping[str, Path]) -> None:
-    for side in sources:
-        for source in side.training:
-            if source.recording.torque is None:
-                raise ArchiveError(
-                    paths.get(source.name),
-                    "holds no joint torques, and a payload is weighed in their unit",
-                    field="torque",
-                    remedy="give drive.torque_constant in the column map",
-                )
-
-
-def _refuse_difference(found: Difference | None, paths: Mapping[str, Path]) -> None:
-    """All bare recordings carry the same, and all loaded ones do."""
-    if found is None:
-        return
+def _mixed(found: Difference, path: Path) -> InputError:
+    """That not all bare recordings carry the same, or not all loaded ones."""
     run, other = found.run, found.reference
     amount = f"{abs(found.mass):.3g} kg {'more' if found.mass > 0.0 else 'less'} than {other.name}"
     if run.loaded:
-        raise InputError(
-            paths.get(run.name),
+        return InputError(
+            path,
             f"carries another payload: {amount}, though both are named as loaded",
             field="--loaded",
             remedy="weigh each payload by itself",
         )
-    raise InputError(
-        paths.get(run.name),
+    return InputError(
+        path,
         f"was recorded with another tool mounted: it carries {amount}, though both are named as"
         " bare",
         remedy="name it with --loaded, or leave it out",

@@ -38,13 +38,11 @@ CSS_VARIABLES: Final = {
     for k, name in enumerate(
         (
             *("ink", "muted", "grid", "band", "paper", "first", "second", "wide"),
-            *("route-0", "route-1", "route-2", "route-3", "inside", "outside-2", "outside-3"),
+            *("route-0", "route-1", "route-2", "route-3", "outside-3"),
         )
     )
 }
-INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, INSIDE, OUTSIDE_2, OUTSIDE_3 = (
-    CSS_VARIABLES
-)
+INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, OUTSIDE_3 = CSS_VARIABLES
 """`WIDE` is a light, broad line that another one may lie upon."""
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0

@@ -331,77 +331,74 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_each_estimate_has_a_row_per_parameter_with_its_numbers_to_the_bit(folder: Path) -> None:
-    rows = rows_of(folder / "parameters.csv")
-    expected = [
-        (level.level, level.campaign, name, value, std)
-        for level in levels()
-        for name, value, std in zip(level.names, level.values, level.std, strict=True)
-    ]
-    found = [
-        (row["level"], row["campaign"], row["parameter"], float(row["value"]), float(row["std"]))
-        for row in rows
-    ]
-    assert found == expected
+class TestCsv:
+    def test_has_a_row_per_estimate_and_parameter(self, folder: Path) -> None:
+        """Numbers to the bit, with their intervals and where they come from."""
+        rows = rows_of(folder / "parameters.csv")
+        columns = [
+            (level.level, level.campaign, name, value, std)
+            for level in levels()
+            for name, value, std in zip(level.names, level.values, level.std, strict=True)
+        ]
+        for row, expected in zip(rows, columns, strict=True):
+            found = (row["level"], row["campaign"], row["parameter"])
+            assert (*found, float(row["value"]), float(row["std"])) == expected
+        row, undetermined = rows[0], rows[3]
+        half = levels()[0].interval_factor * float(row["std"])
+        assert float(row["low"]) == pytest.approx(float(row["value"]) - half)
+        assert float(row["high"]) == pytest.approx(float(row["value"]) + half)
+        found = (undetermined["determined"], undetermined["std"], undetermined["high"])
+        assert found == ("false", "inf", "inf")
+        assert row["archive"] == 'line "3", spring/?.mcap'
+        assert row["archive_sha256"] == "ab" * 32
+        assert (row["settings"], row["code"], row["estimator"]) == ("settings", "c0de", "wls")
+        assert re.search(r"\bhil \d", row["software"])
+        assert row["warnings"] == "stood still at first; two gaps"
+        assert row["arm"].endswith("-digest")
 
+    def test_has_kinds_of_parameters_and_errors_of_all_joints(self, folder: Path) -> None:
+        rows = rows_of(folder / "parameters.csv")
+        by_name = {row["parameter"]: (row["kind"], row["axis"]) for row in rows}
+        assert by_name["f1_3"] == ("friction", "joint_3")
+        assert by_name["mc2x"] == ("inertial", "")
+        one = result().campaigns[0]
+        weight = one.samples.astype(float)
+        expected = math.sqrt((weight @ one.noise_std**2) / (weight @ one.torque_rms**2))
+        campaign = next(row for row in rows if row["level"] == "campaign")
+        assert float(campaign["relative_error"]) == pytest.approx(expected)
+        assert math.isnan(float(campaign["unseen_relative_error"]))
+        assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
 
-def test_a_row_says_how_sure_it_is_and_where_it_comes_from(folder: Path) -> None:
-    rows = rows_of(folder / "parameters.csv")
-    row, undetermined = rows[0], rows[3]
-    half = levels()[0].interval_factor * float(row["std"])
-    assert float(row["low"]) == pytest.approx(float(row["value"]) - half)
-    assert float(row["high"]) == pytest.approx(float(row["value"]) + half)
-    found = (undetermined["determined"], undetermined["std"], undetermined["high"])
-    assert found == ("false", "inf", "inf")
-    assert row["archive"] == 'line "3", spring/?.mcap'
-    assert row["archive_sha256"] == "ab" * 32
-    assert (row["settings"], row["code"], row["estimator"]) == ("settings", "c0de", "wls")
-    assert re.search(r"\bhil \d", row["software"])
-    assert row["warnings"] == "stood still at first; two gaps"
-    assert row["arm"] == "NS 16-digest" or row["arm"].endswith("-digest")
-
-
-def test_friction_is_of_an_axis_and_inertia_of_none(folder: Path) -> None:
-    rows = {row["parameter"]: row for row in rows_of(folder / "parameters.csv")}
-    assert (rows["f1_3"]["kind"], rows["f1_3"]["axis"]) == ("friction", "joint_3")
-    assert (rows["mc2x"]["kind"], rows["mc2x"]["axis"]) == ("inertial", "")
-
-
-def test_the_relative_error_is_over_all_joints(folder: Path) -> None:
-    rows = rows_of(folder / "parameters.csv")
-    one = result().campaigns[0]
-    weight = one.samples.astype(float)
-    expected = math.sqrt((weight @ one.noise_std**2) / (weight @ one.torque_rms**2))
-    campaign = next(row for row in rows if row["level"] == "campaign")
-    assert float(campaign["relative_error"]) == pytest.approx(expected)
-    assert math.isnan(float(campaign["unseen_relative_error"]))
-    assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
-
-
-def test_each_estimate_has_a_row_per_axis(folder: Path) -> None:
-    rows = rows_of(folder / "axes.csv")
-    assert len(rows) == len(levels()) * model().n_joints
-    assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
-    assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
-
-
-def test_what_was_not_used_is_listed_with_the_reason(folder: Path) -> None:
-    assert rows_of(folder / "not_used.csv") == [
-        {"path": "a/torn.mcap", "kind": "broken", "reason": "its footer is missing"},
-        {"path": "a/slow.mcap", "kind": "skipped", "reason": "holds a validation run"},
-    ]
+    def test_has_axes_and_what_was_not_used(self, folder: Path) -> None:
+        rows = rows_of(folder / "axes.csv")
+        assert len(rows) == len(levels()) * model().n_joints
+        assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
+        assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
+        assert [tuple(row.values()) for row in rows_of(folder / "not_used.csv")] == [
+            ("a/torn.mcap", "broken", "its footer is missing"),
+            ("a/slow.mcap", "skipped", "holds a validation run"),
+        ]
 
 
 def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
+    """And covariances and times, which CSV has not or as text."""
     parquet = pytest.importorskip("pyarrow.parquet")
     for one in TABLES:
         read: Any = parquet.read_table(folder / f"{one.name}.parquet")
         assert read.column_names == list(one.kinds)
-        plain = rows_of(folder / f"{one.name}.csv")
-        typed = read.to_pylist()
-        assert len(plain) == len(typed)
-        for text, row in zip(plain, typed, strict=True):
+        texts, typed = rows_of(folder / f"{one.name}.csv"), read.to_pylist()
+        for text, row in zip(texts, typed, strict=True):
             assert all(same(text[name], row[name]) for name in one.csv_columns), text
+    read = parquet.read_table(folder / "parameters.parquet")
+    rows = [row for row in read.to_pylist() if row["level"] == "campaign"][: model().n_parameters]
+    np.testing.assert_array_equal(
+        [row["covariance"] for row in rows], result().campaigns[0].covariance
+    )
+    assert rows[0]["when"] == datetime(2026, 1, 1, 8, tzinfo=UTC)
+    assert read.column("covariance").to_pylist()[0] is None
+    facts = json.loads(read.schema.metadata[b"hil"])
+    assert facts["schema_version"] == table.SCHEMA_VERSION
+    assert facts["code"] == "c0de"
 
 
 def same(text: str, value: object) -> bool:
@@ -416,20 +413,6 @@ def same(text: str, value: object) -> bool:
             return datetime.fromisoformat(text) == value
         case _:
             return text == str(value)
-
-
-def test_parquet_carries_covariances_and_times(folder: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
-    read: Any = parquet.read_table(folder / "parameters.parquet")
-    rows = [row for row in read.to_pylist() if row["level"] == "campaign"][: model().n_parameters]
-    np.testing.assert_array_equal(
-        [row["covariance"] for row in rows], result().campaigns[0].covariance
-    )
-    assert rows[0]["when"] == datetime(2026, 1, 1, 8, tzinfo=UTC)
-    assert read.column("covariance").to_pylist()[0] is None
-    facts = json.loads(read.schema.metadata[b"hil"])
-    assert facts["schema_version"] == table.SCHEMA_VERSION
-    assert facts["code"] == "c0de"
 
 
 def test_rows_are_written_in_portions(
