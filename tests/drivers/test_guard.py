@@ -16,6 +16,7 @@ from drivers.errors import (
     JerkLimit,
     MotionHeld,
     MotionNotCarriedOn,
+    MotionPaused,
     NotAtStandstill,
     NotFinite,
     PositionLimit,
@@ -264,14 +265,15 @@ class TestRates:
                 assert error.value == pytest.approx(rate, rel=1e-5)
                 assert error.bound == pytest.approx(abs(rate), rel=1e-5)
 
+    @signs
     @pytest.mark.parametrize("name", RATES)
-    def test_what_rounding_of_a_far_angle_makes_is_no_motion_and_little_more_is(self, name):
+    def test_what_rounding_of_a_far_angle_makes_is_no_motion_and_little_more_is(self, name, sign):
         """At a million rad an angle toggles in its last bit, of an arm that must hardly move."""
-        reach = 2.0**20
-        wide = {"lower": np.full(N, -reach), "upper": np.full(N, reach)} | dict.fromkeys(
+        lower, upper = sorted((-sign, sign * 2.0**20))
+        wide = {"lower": np.full(N, lower), "upper": np.full(N, upper)} | dict.fromkeys(
             RATES, np.full(N, 100.0)
         )
-        start = np.full(N, reach - 1.0)
+        start = np.full(N, sign * (2.0**20 - 1.0))
         last_bit = np.spacing(start)
 
         def toggle(bits: float, stated: float = 0.0) -> None:
@@ -315,9 +317,8 @@ class TestRates:
             row = START + at(2, 140.0 * (PERIOD * cycle) ** 3 / 6.0)
             guard.check_set_point(row, REST, "stop", cycle)
         guard.begin(START, REST, REST, np.zeros((2, N)), 9)
-        guard.check_set_point(START, REST, "plan", 10)
         step = START + at(2, 60.0 * PERIOD**3)
-        refused(JerkLimit, guard.check_set_point, step, REST, "plan", 11)
+        refused(JerkLimit, guard.check_set_point, step, REST, "plan", 10)
 
 
 class TestFeedback:
@@ -484,6 +485,28 @@ class TestAfterAGap:
         guard.check_after_gap(REST, stands, REST, step, 3, np.arange(N) != joint)
         lags = np.array([step, at(joint, sign * 5e-4 * 1.001)])
         guard.check_after_gap(REST, lags, REST, step, 3, EVERY)
+
+
+class TestAfterAPause:
+    """What a servo gains in 50 ms at the acceleration allowed."""
+
+    @joints
+    @signs
+    @names
+    def test_the_arm_moves_as_the_set_points_sent_last(self, joint, sign, bounds):
+        guard, speed, q = only(acceleration=8.0), at(joint, sign), START
+        guard.go_on_from(q, speed, 0)
+        for cycle in range(3):
+            q = q + PERIOD * speed
+            guard.check_set_point(q, speed, bounds, cycle)
+        gain = 0.05 * FACTORS[bounds][0] * 8.0
+        for way in (-1.0, 1.0):
+            guard.check_after_pause(speed + at(joint, way * 0.999 * gain), 4, EVERY)
+            other = speed + at(joint, way * 1.001 * gain)
+            error = refused(MotionPaused, guard.check_after_pause, other, 5, EVERY)
+            assert (error.joint, error.cycle) == (joint, 5)
+            assert error.bound == pytest.approx(gain)
+            guard.check_after_pause(other, 5, np.arange(N) != joint)
 
 
 class TestCarriedOn:
