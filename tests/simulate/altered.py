@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.simulate.judging import LAWS
+from tests.simulate.laws.judged import judge_whole
 from tests.simulate.observed import Broken, Observed
 from tests.simulate.playing import NEIGHBOURS, play, twin_of
 from tests.simulate.script import parse_script
@@ -21,7 +22,7 @@ FAULTS = (
     "override@520:100",
     "kill@900",
 )
-ALL = LAWS
+ALL = {**LAWS, "judge": judge_whole}
 
 
 def played(root: Path) -> Observed:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.events import MotionEnded
+from drivers.events import AnswersLost, MotionEnded
 from tests.drivers import oracle
 from tests.simulate.altered import ALL, found, played, with_life
 from tests.simulate.laws.conversation import heard, talks_of
@@ -207,16 +207,20 @@ def with_set_points(
     stretch = max(stretches(talk), key=lambda one: one.leading)
     slots = list(talk.init.slots or ())
     drives, k = observed.cell.drive_train, stretch.leading
-    sent = stretch.sent[:k] + move(np.arange(k))
+    moved = np.zeros_like(stretch.sent[:k]) + move(np.arange(k))
+    steps = stretch.step[:k] + np.diff(moved, axis=0, prepend=moved[:1])
     exchanged, rows = list(life.exchanged), life.records.copy()
     for number, index in enumerate(stretch.at[:k]):
         one = exchanged[index]
+        q = rows["commanded_position"][one.record] + drives.joint_position(moved[number])
+        q -= drives.joint_position(np.zeros_like(q))
+        sent = np.float32([drives.motor_revolutions(q), steps[number]])
         reply = bytearray(one.replies[0])
         for joint, slot in enumerate(slots):
-            reply[16 + 36 * slot : 20 + 36 * slot] = np.float32(sent[number, joint]).tobytes()
+            reply[16 + 36 * slot : 24 + 36 * slot] = sent[:, joint].tobytes()
         exchanged[index] = one._replace(replies=(bytes(reply),))
         if records:
-            rows["commanded_position"][one.record] = drives.joint_position(sent[number])
+            rows["commanded_position"][one.record] = q
     return with_life(observed, 0, exchanged=tuple(exchanged), records=rows)
 
 
@@ -294,6 +298,28 @@ def test_nothing_moves_that_was_not_requested_or_has_ended(observed: Observed) -
     )
     ended = with_life(observed, 0, events=early)
     assert "after the motion had ended" in found(ended, "guard")
+
+
+def test_the_judge_of_single_packets_finds_the_same(observed: Observed) -> None:
+    leapt = with_set_points(observed, bump(0.2, middle(observed)))
+    assert "velocity" in found(leapt, "judge")
+    assert "safe answer" in found(with_answer(observed, at_rest(observed), 17), "judge")
+
+
+def test_bounds_of_a_stop_for_losses_that_were_none_are_found(observed: Observed) -> None:
+    """The session says that answers were lost; only the judge counts them itself."""
+    limits, period = observed.cell.joint_limits, observed.cell.period
+    gears = np.abs(np.diag(observed.cell.drive_train.motor_from_joint)) / (2.0 * np.pi)
+    height = float(np.min(0.6 * limits.jerk * period**3 * gears))
+    wide = with_set_points(observed, bump(height, middle(observed)))
+    assert "jerk" in found(wide, "guard")
+    talk = heard(observed)[0].talks[0]
+    stretch = max(stretches(talk), key=lambda one: one.leading)
+    lost = AnswersLost(3, int(talk.records["cycle"][stretch.rows][0]))
+    events = observed.runs[0].events
+    wide = with_life(wide, 0, events=(*events, (events[-1][0], lost)))
+    assert found(wide, "guard") == ""
+    assert "jerk" in found(wide, "judge")
 
 
 # The arm ------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import pytest
 
 from drivers.exchange.loop import Intake
 from drivers.guard import Guard
+from drivers.reply_policy import ReplyPolicy
 from drivers.session import Sequence
 from drivers.state_machine import Machine
 from hil.archive.recorder import Recorder
@@ -63,10 +64,13 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
 
 
 def goes_on_after_a_gap(patch: pytest.MonkeyPatch) -> None:
-    """The motion is not stopped however many packets were missed."""
-    note_gap = Machine.note_gap
+    """The motion is neither stopped nor compared, however many packets were missed."""
+    note_gap, compare = Machine.note_gap, ReplyPolicy.note_gap
     patch.setattr(
         Machine, "note_gap", lambda self, missed, unanswered, most: note_gap(self, missed, 0, most)
+    )
+    patch.setattr(
+        ReplyPolicy, "note_gap", lambda self, unanswered, *others: compare(self, 0, *others)
     )
 
 

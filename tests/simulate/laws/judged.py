@@ -1,0 +1,96 @@
+"""The judge of the session's own tests, on the whole conversation of some campaigns.
+
+It takes some ten times as long as the laws on arrays, with which it shares nothing but the oracle,
+and believes nothing that the session says of itself but which motions ended: it counts lost
+answers, after which the bounds of a stop apply, from the targets received.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from drivers.events import MotionEnded
+from tests.drivers.judge import Conduct
+from tests.simulate.observed import Broken, Observed
+
+from .conversation import Talk, heard
+
+LAW: Final = "judge"
+EVERY: Final = 64
+"""One seed of so many is judged."""
+
+
+def judge(observed: Observed) -> Iterator[Broken]:
+    """See above."""
+    if observed.seed % EVERY == 0:
+        yield from judge_whole(observed)
+
+
+def judge_whole(observed: Observed) -> Iterator[Broken]:
+    """Every packet of every life."""
+    for number, one in enumerate(heard(observed), 1):
+        entitled = False
+        for talk in one.talks:
+            if talk.safe is None or not talk.init.slots:
+                continue
+            conduct = _conduct(observed, talk, entitled)
+            try:
+                for index in _judged(talk, conduct):
+                    at = index
+            except AssertionError as error:
+                text = str(error).partition("\n")[0]
+                yield Broken(LAW, f"life {number}, after packet {at}: {text}")
+                break
+            entitled = conduct.entitled
+
+
+def _conduct(observed: Observed, talk: Talk, entitled: bool) -> Conduct:
+    limits, settings, init = observed.cell.guard_limits, talk.life.settings, talk.init
+    assert init.arms is not None and init.slots is not None
+    return Conduct(
+        limits,
+        observed.cell.drive_train,
+        int(settings.get("mode", 4)),
+        int(settings.get("arm", 1)),
+        init.slots,
+        init.arms,
+        threshold=np.fmin(limits.following_error, init.threshold),
+        current=np.fmin(limits.current, init.current),
+        period=observed.cell.period,
+        max_gap=int(settings.get("max_gap", 2)),
+        usable=talk.usable,
+        entitled=entitled,
+    )
+
+
+def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
+    """Packet by packet, and what was asked for in between; yields the index of each before it."""
+    ended = [event.cycle for event in talk.events if isinstance(event, MotionEnded)]
+    # What ended with one packet is over before whatever is asked for after it.
+    news = [(talk.at_cycle(cycle) + 1, 0, "ended") for cycle in ended]
+    news += [(act.before, 1, act.name) for act in talk.life.acts if act.before > talk.at]
+    news.sort(key=lambda one: one[:2])
+    last = talk.at
+    for row, index in enumerate(talk.index.tolist()):
+        yield last
+        while news and news[0][0] <= index:
+            _note(conduct, news.pop(0)[2])
+        if talk.silent[row]:
+            conduct.interrupted()
+        record, one = talk.records[row], talk.life.exchanged[index]
+        unanswered = int(record["gap"]) + index - last - 1
+        last = index
+        conduct.judge(one.packet, one.replies[0], record, unanswered > conduct.max_gap)
+
+
+def _note(conduct: Conduct, what: str) -> None:
+    """An act of the person, or the end of a motion."""
+    if what in ("request", "ended"):
+        conduct.entitled, conduct.stopping, conduct.overridden = what == "request", False, False
+    elif what in ("stop", "hold", "resume"):
+        conduct.stopping = conduct.entitled
+    elif what == "override":
+        conduct.overridden = True
