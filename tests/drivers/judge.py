@@ -42,7 +42,7 @@ class Conduct:
         stopping: a stop was asked for (or a long gap was, or too many answers were not taken) in
             this interval.
         overridden: a change of override was accepted in this interval.
-        aged: the targets in the packet were sent in an earlier cycle: answers lost do not show.
+        aged: a target in the packet was sent in an earlier cycle: answers lost do not show.
         tally: how often which law was put to use.
     """
 
@@ -288,6 +288,7 @@ class Conduct:
         """A set-point that the controller has not taken: the motion waits."""
         lag = self._lag(target)
         assert lag > self.lag, "sent again although it was taken"
+        assert not self.aged, "sent again though an older target shows no loss"
         self.lost += 1 if self.repeats else lag - self.lag
         self.repeats += 1
         self.stopping = self.stopping or self.lost > self.max_gap
@@ -303,7 +304,7 @@ class Conduct:
         last = np.abs(self.motors[-1] - self.motors[-2]).max() if len(self.motors) > 1 else 0.0
         slow = last <= 4.0 * self.limits.standstill * (1 + 1e-6)
         if self.aged:
-            self.lag = lag if slow else self.lag
+            self.lag = lag if slow else min(lag, self.lag)
             return
         assert lag <= self.lag or slow or self.stopping, "a leap after lost answers"
         self.lost += max(0, lag - self.lag)

@@ -88,8 +88,9 @@ class Judged:
         record = self.ring.last(1)[0]
         # Packets that got no answer are gaps to the controller.
         long_gap = record["gap"] + self.unanswered > self.max_gap
-        self.conduct.aged = self.ages is not None and bool(self.ages[:, 0].any())
-        self.conduct.judge(packet, reply, record, bool(long_gap))
+        conduct = self.conduct
+        conduct.aged = self.ages is not None and bool(self.ages[list(conduct.slots), 0].any())
+        conduct.judge(packet, reply, record, bool(long_gap))
         self.unanswered = 0
         missed = (number_of(packet) - last) % 0x7FFF - 1
         assert record["gap"] in (missed, 0), "the gap recorded"
