@@ -214,7 +214,7 @@ def with_set_points(
         one = exchanged[index]
         q = rows["commanded_position"][one.record] + drives.joint_position(moved[number])
         q -= drives.joint_position(np.zeros_like(q))
-        sent = np.float32([drives.motor_revolutions(q), steps[number]])
+        sent = np.array([drives.motor_revolutions(q), steps[number]], np.float32)
         reply = bytearray(one.replies[0])
         for joint, slot in enumerate(slots):
             reply[16 + 36 * slot : 24 + 36 * slot] = sent[:, joint].tobytes()
