@@ -319,6 +319,18 @@ class TestCorrections:
         error = assert_refused(rig, answer, VelocityLimit)
         assert (error.joint, error.value) == (2, pytest.approx(2.05, rel=1e-2))
 
+    @pytest.mark.parametrize(("share", "state"), [(0.95, State.OPEN), (1.05, State.FAULTED)])
+    def test_the_speed_of_its_first_cycle_is_not_that_since_it_opened(self, share, state):
+        rig = Rig(mode=7, guard_limits=limits(**WIDE))
+        rig.open()
+        rig.cycle(50)
+        rig.session.request(Correction(np.zeros((20, N))))
+        rig.cycle()
+        step = share * limits().velocity[2] * PERIOD
+        rig.axes["d"][:, [0, 2]] += (rig.train.motor_from_joint[:, [2]] * step) / (2 * np.pi)
+        rig.cycle()
+        assert rig.state is state
+
     @pytest.mark.parametrize("mode", [1, 2, 9])
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_a_current_that_jumps_is_refused(self, mode, sign):

@@ -150,10 +150,11 @@ class TestHowMany:
         assert Sent(share).check(-2.0) == 2
         assert Sent(1.01 * STANDSTILL).check(-1.0) == 1
 
+    @pytest.mark.parametrize("way", [-1.0, 1.0])
     @pytest.mark.parametrize(("step", "lost"), [(0.0, 0), (1.0, 1)], ids=["at rest", "moving on"])
-    def test_an_arm_that_comes_to_rest_behind_is_not_behind_twice(self, step, lost):
+    def test_an_arm_that_comes_to_rest_behind_is_not_behind_twice(self, step, lost, way):
         """At rest a target one behind looks like the last; it is still the same answer lost."""
-        sent = Sent(STEP)
+        sent = Sent(way * STEP)
         assert sent.check(-1.0) == 1
         sent.add(step)
         assert sent.check(0.0) == 0
