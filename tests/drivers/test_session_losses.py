@@ -23,6 +23,8 @@ from drivers import (
 from drivers.events import AnswersLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS
+from drivers.packets import LAST_NUMBER
+from drivers.session import Sequence
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
     PERIOD,
@@ -745,6 +747,36 @@ class TestPauses:
         rig.now += 0.9
         rig.cycle(3)
         assert rig.state is State.OPEN
+
+
+class TestNumbers:
+    HALF = LAST_NUMBER // 2
+
+    @pytest.mark.parametrize(
+        ("window", "ahead"),
+        [(0.0, 1), (0.9, 1), (1.9, 1), (500.0, 500), (HALF, HALF), (HALF + 1, HALF), (1e9, HALF)],
+    )
+    def test_those_within_a_window_ahead_are_new(self, window, ahead):
+        sequence = Sequence()
+        sequence.restart(10, window)
+        assert sequence.is_duplicate(10)
+        for number in (9, 10, 11 + ahead, LAST_NUMBER):
+            assert sequence.is_stale(number)
+        for number in (11, 10 + ahead):
+            assert not sequence.is_stale(number)
+
+    def test_after_a_silence_the_same_number_is_new(self):
+        sequence = Sequence()
+        sequence.restart(10, 500.0)
+        sequence.broken = True
+        assert not sequence.is_duplicate(10)
+        assert not sequence.is_stale(10)
+        assert (sequence.accept(10), sequence.cycle, sequence.broken) == (0, 1, False)
+        assert sequence.is_duplicate(10)
+
+    def test_before_the_init_packet_half_of_them_count_as_missed(self):
+        assert Sequence().accept(self.HALF) == self.HALF - 1
+        assert Sequence().accept(self.HALF + 1) == 0
 
 
 class TestCorruptedNumbers:
