@@ -352,18 +352,7 @@ class ArchiveWriter:
                 f"expected {shape}"
             )
         cycles = records["cycle"]
-        before = int(cycles[0]) - 1 if self._first is None else self._newest
-        falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
-        if falling.size:
-            at = int(falling[0])
-            last = int(cycles[at - 1]) if at else before
-            raise ArchiveWriteError(
-                self.path,
-                f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive "
-                "grow",
-                field="cycle",
-                remedy="begin another archive for another session with the controller",
-            )
+        self._check_growth(cycles)
         if self._first is None:
             self._first = int(cycles[0])
         self._newest = int(cycles[-1])
@@ -372,6 +361,20 @@ class ArchiveWriter:
         oldest = int(self._pending[0][0]["cycle"][0])
         if self._slot(oldest) != self._slot(self._newest + 1):
             self._emit(everything=False)
+
+    def _check_growth(self, cycles: NDArray[np.int64]) -> None:
+        before = int(cycles[0]) - 1 if self._first is None else self._newest
+        falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
+        if not falling.size:
+            return
+        at = int(falling[0])
+        last = int(cycles[at - 1]) if at else before
+        raise ArchiveWriteError(
+            self.path,
+            f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive grow",
+            field="cycle",
+            remedy="begin another archive for another session with the controller",
+        )
 
     def add_packets(self, packets: Rows) -> None:
         """Take raw packets; each is written with the chunk of its cycle.

@@ -70,7 +70,7 @@ faults_of_any_kind = st.one_of(
     st.builds(Delay, cycles, st.floats(1e-5, 0.01), st.just(0.0), directions, counts),
     st.builds(Duplicate, cycles, directions, counts),
     st.builds(Reorder, cycles, directions),
-    st.builds(Corrupt, cycles, st.just(1), st.just(1), directions),
+    st.builds(Corrupt, cycles, directions, offset=st.just(1), mask=st.just(1)),
 )
 
 
