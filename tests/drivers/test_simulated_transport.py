@@ -67,7 +67,7 @@ directions = st.sampled_from(["to_pc", "to_controller"])
 counts = st.integers(1, 3)
 faults_of_any_kind = st.one_of(
     st.builds(Lose, cycles, directions, counts),
-    st.builds(Delay, cycles, st.floats(1e-5, 0.01), st.just(0.0), directions, counts),
+    st.builds(Delay, cycles, directions, counts, seconds=st.floats(1e-5, 0.01)),
     st.builds(Duplicate, cycles, directions, counts),
     st.builds(Reorder, cycles, directions),
     st.builds(Corrupt, cycles, directions, offset=st.just(1), mask=st.just(1)),
