@@ -229,19 +229,24 @@ class TargetNotFinite(NotFinite):
         self.arm = arm
 
 
-class PositionLimit(GuardError, check="position", unit="rad"):
+_BEYOND = (
+    "the motion itself is beyond the limits and would be refused again: rehearse or design anew"
+)
+
+
+class PositionLimit(GuardError, check="position", unit="rad", remedy=_BEYOND):
     """Set-point outside the joint's range."""
 
 
-class VelocityLimit(GuardError, check="velocity", unit="rad/s"):
+class VelocityLimit(GuardError, check="velocity", unit="rad/s", remedy=_BEYOND):
     """Step between two sent set-points, or the stated velocity, too fast."""
 
 
-class AccelerationLimit(GuardError, check="acceleration", unit="rad/s²"):
+class AccelerationLimit(GuardError, check="acceleration", unit="rad/s²", remedy=_BEYOND):
     """Second difference of the sent set-points too large."""
 
 
-class JerkLimit(GuardError, check="jerk", unit="rad/s³"):
+class JerkLimit(GuardError, check="jerk", unit="rad/s³", remedy=_BEYOND):
     """Third difference of the sent set-points too large."""
 
 

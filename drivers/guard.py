@@ -218,9 +218,6 @@ class BoundsInForce:
         return self.rank
 
 
-__all__ = ["FIRST_FRACTION", "RELATIVE_TOLERANCE", "Guard", "GuardLimits"]
-
-
 RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,

@@ -744,7 +744,7 @@ class Screen:
                 self._undrawn = error
 
     def say(self, text: str) -> None:
-        """One line that stays: after the end where there is a screen meanwhile."""
+        """One line that stays: printed at once, or after the screen has closed."""
         if not self._quiet:
             self._said.append(text)
 

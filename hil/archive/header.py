@@ -288,7 +288,8 @@ class ArchiveOutcome(BaseModel):
         samples, events, packets: how many were written.
         first_cycle, last_cycle: of the controller.
         lost_packets, records_lost, events_lost: what the link and this PC lost.
-        late_replies, replies_not_accepted: those that missed their cycle.
+        late_replies: late, or left out for that to a newer packet.
+        replies_not_accepted: those that the controller's target shows it did not accept.
         repaired: whether something was lost and the file repaired.
         samples_lost: by repairs, None where nobody can say.
         losses: by repairs, a sentence each.

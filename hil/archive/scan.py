@@ -1,7 +1,7 @@
 """Goes through an archive record by record, and verifies that each is one that was written.
 
 The one walker of archives: the reader stops at the first damage (`hil.archive.reader`), checks and
-repairs go on behind it (`hil.archive.survey`).
+repairs go on behind it (`hil.archive.repair`).
 
 The checksum of a chunk says that it is whole, not that it is of this recording: a file system may
 put a chunk of another archive in its place. The outcome lists the checksums of all chunks in order,

@@ -151,7 +151,7 @@ class Entry:
         name: of the file.
         outcome: how its motion ended; "rejected" for one that ended well and is of no use.
         sha256: checksum of the file.
-        reason: why it was rejected, in words; "" for every other.
+        reason: why it is not completed, in words; "" for one that is.
 
     Raises:
         ValueError: it names a file elsewhere.

@@ -462,7 +462,7 @@ class Runner:
             run.archives.append(archived)
         if ended.outcome != "completed":
             if archived is not None:
-                run.folder.add(archived, ended.outcome)
+                run.folder.add(archived, ended.outcome, ended.reason)
             refused = self._link.connection.refused if ended.outcome == "refused" else None
             recorder = None if refused is None else refused.flight_recorder
             raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder, archived)

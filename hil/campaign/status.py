@@ -338,7 +338,7 @@ def _whole(recorded: list[RecordedResult], kind: str) -> Step:
     good = [one for one in own if one.outcome == "completed"]
     words = f"{len(good)} whole, {sum(one.seconds for one in good):.0f} s of motion"
     if bad := len(own) - len(good):
-        words += f"; {bad} rejected or ended early, and run again"
+        words += f"; {bad} rejected or ended early"
     return Step("done" if good else "next", words)
 
 

@@ -250,7 +250,7 @@ class Cell:
             return _is_loopback(table.host)
         if table.transport == "can":
             return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
-        return True
+        return table.transport == "simulated"
 
     def session_settings(
         self, *, accept_init: bool = False, only_axis: int | None = None

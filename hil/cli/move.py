@@ -53,7 +53,7 @@ def move(
 
     Exit status 0 when it arrived (or was there), 2 when what was typed cannot be used or the
     planner failed, 3 when the way is refused or nobody confirmed it,
-    4 when the controller or the link failed, 130 when it was stopped.
+    4 when the controller, the link or the guard ended it, 130 when it was stopped.
 
     Options:
         where: A cell file, or a campaign's folder.

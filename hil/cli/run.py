@@ -52,8 +52,8 @@ def run(
     `hil run C --accept-dry-run --json`.
 
     Exit status 0 when the model is good (with --dry-run or --no-identify: when all was run), 3
-    when a gate refuses, 4 when the controller or the link failed, 5 when the model is not good or
-    a motion was of no use again and again, 130 when it was stopped.
+    when a gate refuses, 4 when the controller, the link or the guard ended a motion, 5 when the
+    model is not good or a motion was of no use again and again, 130 when it was stopped.
 
     Options:
         rehearse: Rehearse the plan first, where that was not passed yet.
