@@ -28,15 +28,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 99_300,
-    "product files": 436,
-    "test lines": 94_000,
-    "test files": 476,
+    "product lines": 89_500,
+    "product files": 338,
+    "test lines": 87_800,
+    "test files": 386,
     "import circles": 0,
-    "imports inside functions": 38,
-    "files with one importer": 24,
+    "imports inside functions": 35,
+    "files with one importer": 19,
     "banned names": 0,
-    "functions over 60 lines": 35,
+    "functions over 60 lines": 34,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {
