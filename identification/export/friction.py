@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.friction import FrictionLaw, Kind
+from identification.model.friction import FrictionLaw, Kind, Tanh
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -71,14 +71,16 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     lines = [
         '"""Identified friction of a robot\'s joints. Source: hil."""',
         "",
-        "import math",
-        "",
         f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
         f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
         "# Of the joints, then of these motors:",
         f"LINEAR = {_tuple(linear)}  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
     kinds = friction.kinds
+    if Tanh in kinds:
+        lines[1:1] = ["", "from math import tanh"]
+    if any(" E " in kind.code for kind in kinds):
+        lines.append(f"E = {math.e!r}")
     for kind in kinds:
         values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
         for one in friction.terms:

@@ -160,7 +160,7 @@ class Tanh(FrictionTerm):
 
     symbol, option, label = "f0", "tanh", "tanh"
     words = "Coulomb friction f0 with a smooth sign"
-    basis, code = "tanh(v/vt)", " * math.tanh(v / TANH_SPEED[joint])"
+    basis, code = "tanh(v/vt)", " * tanh(v / TANH_SPEED[joint])"
     speed_symbol = "vt"
     urdf, of_motor, not_negative = "friction", True, True
 
@@ -238,7 +238,7 @@ class Stribeck(FrictionTerm):
 
     symbol, option, label = "fs", "stribeck", "Stribeck"
     words = "additional friction fs at low speed (Stribeck)"
-    basis, code = "sgn(v) exp(-(v/vs)²)", " * sign * math.e ** -((v / STRIBECK_SPEED[joint]) ** 2)"
+    basis, code = "sgn(v) exp(-(v/vs)²)", " * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)"
     speed_symbol = "vs"
     not_negative, pair = True, ("f0", ((1.0, 0.0), (-1.0, 1.0)))
 

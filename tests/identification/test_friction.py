@@ -53,7 +53,7 @@ class TestFrictionTerms:
     def test_source_code_computes_the_column(self, kind: type[FrictionTerm]) -> None:
         term = kind(0.4)
         names = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0}
-        names |= {"math": math}
+        names |= {"E": math.e, "tanh": math.tanh}
         code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **names}) for v in self.SPEED]
         np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
 
