@@ -10,6 +10,7 @@ hold may last, but a source that does not come to rest in it is stopped.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Final, cast
 
 import numpy as np
@@ -36,7 +37,7 @@ _AT_REST: Final = 1e-9
 """rad per cycle and rad/s: what rounding leaves of standstill."""
 
 
-class Execution:
+class Execution(ABC):
     """What motions and corrections have in common.
 
     Args:
@@ -103,8 +104,9 @@ class Execution:
         if self.held and (reason := self.hold(cycle)) is not None:
             raise SourceFailed(f"{reason}, before it began", cycle)
 
+    @abstractmethod
     def _begin_source(self, position: Array) -> None:
-        raise NotImplementedError
+        """Begin the source at this position (n,) [rad]."""
 
     def stop(self, reason: str, cycle: int) -> None:
         """Come to rest on the path. The first reason stays.

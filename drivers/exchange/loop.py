@@ -114,7 +114,7 @@ class Intake:
     """Takes packets from a link that may have queued some while this process was held up.
 
     The answer to any but the newest comes too late, and a motion would run ahead of the arm by a
-    step for each. So of each kind (length, status, modes) only the newest is kept. The others are
+    step for each. So of each kind (length, status, modes) only the newest stays. The others are
     left unanswered as if the link had lost them, and counted as "late". Where axes opened or
     closed meanwhile the session sees it, and packets before an init packet are not mixed with
     those after it.

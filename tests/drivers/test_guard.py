@@ -464,7 +464,7 @@ class TestAfterAGap:
         for way in (-1.0, 1.0):
             found = np.zeros((2, N))
             found[0] = step + at(joint, way * off * 0.999)
-            found[1] = step  # the arm does as it was told
+            found[1] = step  # the arm does as commanded
             guard.check_after_gap(REST, found, REST, step, 1, EVERY)
             found[0] = step + at(joint, way * off * 1.001)
             error = refused(MotionHeld, guard.check_after_gap, REST, found, REST, step, 3, EVERY)

@@ -415,7 +415,7 @@ WIDE = {"jerk": np.full(N, 1e9)}
 
 
 class Overridable(GoesOn):
-    """Takes the bounds it was told to from the first override on."""
+    """Has the bounds that it was given from the first override on."""
 
     def __init__(self, positions, then="override"):
         super().__init__(positions)
@@ -496,12 +496,12 @@ def test_corrections_may_be_overridden_too():
             self.motion = self.motion * fraction
 
     t = PERIOD * np.arange(1, 400)[:, None] * np.ones(N)
-    for told in (False, True):
+    for overridden in (False, True):
         rig = running(Faded(1.6 * 100.0 * t**2 / 2), mode=8)
-        if told:
+        if overridden:
             rig.session.override(1.0)
         answer = rig.cycle(5)
-        if told:
+        if overridden:
             assert rig.state is State.OPEN
         else:
             assert (answer.axes["mode"] == 505).all()

@@ -334,12 +334,12 @@ def arm(n: int) -> DriveTrain:
 def adopted(ours: DriveTrain, **changes) -> InitCheck:
     """The controller's values, accepted."""
     n = ours.n_joints
-    told = {
+    described = {
         "gear_ratio": ours.gear_ratio,
         "calibration": ours.calibration,
         "kinematic_influence": [0.0, 0.0, 0.0, *COUPLING],
     }
-    init = InitPacket.build(n, round(1000 * PERIOD), told | changes)
+    init = InitPacket.build(n, round(1000 * PERIOD), described | changes)
     return compare(ours, PERIOD, init, 1, True)
 
 

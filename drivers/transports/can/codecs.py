@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -273,7 +274,7 @@ class UpSet(NamedTuple):
     counts: Array | None = None
 
 
-class Codec:
+class Codec(ABC):
     """Frames of one profile for 1..6 axes.
 
     Attributes:
@@ -305,21 +306,21 @@ class Codec:
         """Whether a frame down belongs to the answer to that packet."""
         return self.number(frame) == next_number(sent_number) & self._down_mask
 
+    @abstractmethod
     def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
         """Frames of a packet; CanModeError for a mode without a code."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read_up(self, payloads: Sequence[bytes]) -> UpSet:
         """Read the frames of one cycle; PacketError for a mode code without a meaning."""
-        raise NotImplementedError
 
+    @abstractmethod
     def down(self, answer: Answer, sent: Sent) -> list[Frame]:
         """Frames of an answer; CanModeError, CanValueError where they cannot carry it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:
         """Read an answer; PacketError for what has no meaning."""
-        raise NotImplementedError
 
     def _code(self, mode: int, slot: int) -> int:
         code = self._codes.get(mode)

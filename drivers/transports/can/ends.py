@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Sequence
 from typing import ClassVar, Final
@@ -227,7 +228,7 @@ def require_carried(init: InitPacket, rates: BusRates) -> None:
     rates.require_load(init.n_axes, init.period)
 
 
-class End:
+class End(ABC):
     """What both ends have in common.
 
     Attributes:
@@ -303,12 +304,12 @@ class End:
                 self.discarded["malformed"] += 1
         return None
 
-    def _whole(self, packet: bytes) -> None:
+    def _whole(self, packet: bytes) -> None:  # noqa: B027  one end needs it
         """A packet came as segments."""
 
+    @abstractmethod
     def _packet(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
         """The packet of a set that its last frame completes; PacketError for one without sense."""
-        raise NotImplementedError
 
     def _as_segments(self, packet: bytes) -> list[Frame]:
         frame_id = SEGMENT_DOWN if self._upwards else SEGMENT_UP
