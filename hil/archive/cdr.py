@@ -70,9 +70,11 @@ class MessageLayout:
         return np.frombuffer(bytearray(self.template * count), dtype=self.dtype)
 
     def holds_in(self, messages: NDArray[np.uint8]) -> bool:
-        """Whether the constant bytes of messages, shape (k, size), are those of the template."""
+        """Whether messages (k, size) have the size and the constant bytes of the template."""
         expected = np.frombuffer(self.template, np.uint8)
-        return all((messages[:, part] == expected[part]).all() for part in self.constant)
+        return messages.shape[1] == self.size and all(
+            (messages[:, part] == expected[part]).all() for part in self.constant
+        )
 
 
 class LayoutBuilder:

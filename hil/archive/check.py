@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
-from hil.archive.chunk import KnownChannels, Messages
+from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.container import Record
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     CHUNKS,
     FORMAT_VERSION,
     KINDS,
-    METADATA,
     REJECTED,
     WORDS,
     ArchiveHeader,
@@ -100,35 +99,36 @@ def check_archive(path: str | PathLike[str]) -> Check:
     """
     path = Path(path)
     checker = _Checker()
+    faults = checker.faults
     found = survey(path, checker.visit)
-    faults: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
-    for fault in found.faults:
-        faults[fault.aspect].append(fault.text)
+    outcome = found.outcome
     if not found.faults and found.header is not None and not is_indexed(found):
-        faults["index"] = ["the message indexes or the index at the end do not fit what is there"]
+        text = "the message indexes or the index at the end do not fit what is there"
+        faults["index"].append(text)
     if found.metadata is None:
-        if not any(repr(METADATA) in text for text in faults["metadata"]):
+        if not any(fault.aspect == "metadata" for fault in found.faults):
             raise _another_kind(found)
         described = ["without the record hil the rest cannot be checked"]
     else:
         described = _description_faults(path, found.metadata)
-    faults["metadata"] += described
-    if found.outcome is not None:
-        if found.outcome.outcome not in OUTCOMES:
-            text = f"outcome is {found.outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
-            faults["outcome"].append(text)
-        elif CHUNKS in found.outcome.record and found.outcome.chunks is None:
-            faults["outcome"].append(f"{CHUNKS} is no list of checksums")
-    if not described and found.pieces:
+    if outcome is not None and outcome.outcome not in OUTCOMES:
+        text = f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
+        faults["outcome"].append(text)
+    if outcome is not None and CHUNKS in outcome.record and outcome.chunks is None:
+        faults["outcome"].append(f"{CHUNKS} is no list of checksums")
+    if found.header is not None and found.pieces:
         checker.finish(found)
-        for aspect, texts in checker.faults.items():
-            faults[aspect] += texts
+    texts = {
+        aspect: [fault.text for fault in found.faults if fault.aspect == aspect] + own
+        for aspect, own in faults.items()
+    }
+    texts["metadata"] += described
     return Check(
         path=path,
         version=(found.metadata or {}).get("format_version", "unknown"),
-        faults={aspect: _shortened(texts) for aspect, texts in faults.items() if texts},
+        faults={aspect: _shortened(found) for aspect, found in texts.items() if found},
         samples=found.samples,
-        repaired=found.outcome is not None and found.outcome.repaired,
+        repaired=outcome is not None and outcome.repaired,
     )
 
 
@@ -173,19 +173,16 @@ def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
 
 
 class _Checker:
-    """Checks chunks that stand, one after the other; then the rest.
+    """Checks sound chunks, one after the other; then the rest.
 
     Attributes:
         faults: what is wrong, by aspect of the profile.
     """
 
     def __init__(self) -> None:
-        self.faults: dict[str, list[str]] = {}
+        self.faults: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
         self._layouts: dict[str, MessageLayout | None] = {}
         self._gaps = 0
-
-    def _fault(self, aspect: str, text: str) -> None:
-        self.faults.setdefault(aspect, []).append(text)
 
     def visit(self, found: Survey, record: Record, messages: Mapping[str, Messages]) -> None:
         """Check the next chunk."""
@@ -195,85 +192,77 @@ class _Checker:
         compression = container.chunk(record).compression
         if compression != "zstd":
             text = f"{place} is compressed with {compression or 'nothing'}, not zstd"
-            self._fault("chunks", text)
+            self.faults["chunks"].append(text)
         rows: dict[str, Rows] = {}
-        for topic in messages.keys() - schema.ONCE:
-            times = [messages[topic].of_heads(name) for name in ("log_time", "publish_time")]
-            if not all(np.array_equal(time, messages[topic].stamps) for time in times):
-                self._fault(
-                    "times", f"{place} has messages logged at another time than their stamp"
-                )
-            if topic == schema.EVENTS:
-                self._check_events(messages[topic], place)
-            elif (laid_out := self._rows(found, topic, messages[topic])) is not None:
-                rows[topic] = laid_out
-            else:
-                self._fault("sizes", f"{place} has messages of {topic} unlike its others")
+        for topic, of_topic in messages.items():
+            if topic in schema.ONCE:
+                continue
+            times = of_topic.of_heads("log_time"), of_topic.of_heads("publish_time")
+            if not all(np.array_equal(time, of_topic.stamps) for time in times):
+                text = f"{place} has messages logged at another time than their stamp"
+                self.faults["times"].append(text)
+            try:
+                if topic == schema.EVENTS:
+                    for message in of_topic.all():
+                        ArchivedEvent.decode(message)
+                else:
+                    rows[topic] = self._rows(found, topic, of_topic)
+            except LayoutError as error:
+                self.faults["sizes"].append(f"{place} has messages of {topic}: {error}")
         if schema.CYCLE in rows and set(rows[schema.CYCLE].dtype.names or ()) >= _CYCLE_FIELDS:
-            self._check_cycles(found.header, messages, rows, place)
+            self._check_cycles(found.header.period, messages, rows, place)
 
     def finish(self, found: Survey) -> None:
         """Check channels and outcome."""
-        header, outcome, known = found.header, found.outcome, found.parser.known
+        header, outcome, parser = found.header, found.outcome, found.parser
         assert header is not None
         imported = header.kind == "imported"
-        if known.channels:
-            channels = {channel.topic: channel for channel in known.channels.values()}
+        if parser.channels:
             cycles = () if imported else (schema.CYCLE, schema.COMMANDED)
-            for topic in sorted({schema.MEASURED, schema.EVENTS, *cycles} - channels.keys()):
-                self._fault("channels", f"there is no {topic}")
-            for channel in channels.values():
-                self._check_channel(channel, known, len(header.joint_names))
+            for topic in sorted({schema.MEASURED, schema.EVENTS, *cycles} - parser.topics):
+                self.faults["channels"].append(f"there is no {topic}")
+            for channel in parser.channels.values():
+                self._check_channel(channel, parser, len(header.joint_names))
         if imported or outcome is None or outcome.repaired or found.losses:
             return
         if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
             stated = outcome.record["lost_packets"]
-            self._fault("outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}")
+            text = f"lost_packets is {stated}, the cycles lack {self._gaps}"
+            self.faults["outcome"].append(text)
 
-    def _check_channel(self, channel: Channel, known: KnownChannels, n_joints: int) -> None:
+    def _check_channel(self, channel: Channel, parser: ChunkParser, n_joints: int) -> None:
         topic = channel.topic
-        expected = schema.profile(n_joints).get(topic)
-        if expected is None:
+        profile = schema.profile(n_joints).get(topic)
+        if profile is None:
             return  # a later version may add channels
-        if (encoding := channel.message_encoding) != "cdr":
-            self._fault("channels", f"{topic} is encoded as {encoding!r}, not 'cdr'")
-        found = known.schemas.get(channel.schema_id)
-        if found is None:
-            self._fault("schemas", f"{topic} has none")
-            return
-        if found.name != expected.schema:
-            self._fault("channels", f"{topic} is of type {found.name}, not {expected.schema}")
-        if found.encoding != "ros2msg":
-            self._fault("schemas", f"that of {topic} is {found.encoding!r}, not 'ros2msg'")
+        found = parser.schemas.get(channel.schema_id) or Schema(0, b"", "", "")
+        for aspect, what, is_now, must_be in (
+            ("channels", "message encoding", channel.message_encoding, "cdr"),
+            ("channels", "type", found.name, profile.schema),
+            ("schemas", "encoding of the schema", found.encoding, "ros2msg"),
+        ):
+            if is_now != must_be:
+                self.faults[aspect].append(f"{topic}: {what} is {is_now!r}, not {must_be!r}")
         text = found.data.decode(errors="replace")
-        if not _extends(text, expected.definition, fixed=topic != schema.CYCLE):
-            self._fault("schemas", f"that of {topic} is not the text of the profile")
+        if not _extends(text, profile.definition, fixed=topic != schema.CYCLE):
+            self.faults["schemas"].append(f"that of {topic} is not the text of the profile")
 
-    def _check_events(self, messages: Messages, place: str) -> None:
-        try:
-            for message in messages.all():
-                ArchivedEvent.decode(message)
-        except LayoutError as error:
-            self._fault("sizes", f"{place} has an event that cannot be read: {error}")
-
-    def _rows(self, found: Survey, topic: str, messages: Messages) -> Rows | None:
-        """The messages as a structured array; None where one has another layout."""
-        if topic not in self._layouts and found.header is not None:
-            record, first = found.parser.known.schema(topic), bytes(messages.data[0][0])
-            try:
-                layout = schema.message_layout(topic, found.header.joint_names, record, first)
-            except LayoutError:
-                layout = None
-            self._layouts[topic] = layout
+    def _rows(self, found: Survey, topic: str, messages: Messages) -> Rows:
+        """The messages as a structured array; a `LayoutError` where one has another layout."""
+        assert found.header is not None
+        if topic not in self._layouts:
+            self._layouts[topic] = None
+            record, first = found.parser.schema(topic), bytes(messages.data[0][0])
+            names = found.header.joint_names
+            self._layouts[topic] = schema.message_layout(topic, names, record, first)
         layout = self._layouts[topic]
-        data = messages.matrix(layout.size) if layout else None
-        if layout is None or data is None or not layout.holds_in(data):
-            return None
-        return np.ascontiguousarray(data).view(layout.dtype)[:, 0]
+        if layout is None or not all(map(layout.holds_in, messages.data)):
+            raise LayoutError("they are unlike its others")
+        return np.concatenate(messages.data).view(layout.dtype)[:, 0]
 
     def _check_cycles(
         self,
-        header: ArchiveHeader,
+        period: float | None,
         found: Mapping[str, Messages],
         rows: Mapping[str, Rows],
         place: str,
@@ -281,17 +270,19 @@ class _Checker:
         """Check the cycles of a chunk, and the channels that repeat them."""
         cycles = rows[schema.CYCLE]
         number, stamp = cycles["cycle"], found[schema.CYCLE].stamps
-        if header.period is not None:
-            period_ns = header.period * 1e9
+        if period is not None:
+            period_ns = period * 1e9
             if not np.array_equal(stamp, np.rint(number * period_ns)):
-                self._fault("times", f"{place} has cycles whose stamp is not cycle times period")
+                text = f"{place} has cycles whose stamp is not cycle times period"
+                self.faults["times"].append(text)
             if (int(number[-1]) - int(number[0])) * period_ns >= max(_CHUNK_NS, period_ns):
-                self._fault("chunks", f"{place} spans more than 100 ms")
+                self.faults["chunks"].append(f"{place} spans more than 100 ms")
         self._gaps += int(cycles["gap"].sum())
         for topic in _STATES.keys() & rows.keys():
             same = np.array_equal(found[topic].stamps, stamp)
             if not (same and _repeats(rows[topic], cycles, _STATES[topic])):
-                self._fault("joint_states", f"{place} has messages of {topic} unlike its cycles")
+                text = f"{place} has messages of {topic} unlike its cycles"
+                self.faults["joint_states"].append(text)
 
 
 def _extends(text: str, profile: str, *, fixed: bool) -> bool:
@@ -379,19 +370,22 @@ def overview(path: str | PathLike[str]) -> Overview:
         NotAnArchiveError: another kind of file.
         ArchiveError: it cannot be read.
     """
-    archive = open_archive(path, fields=())
-    header, outcome = archive.header, archive.outcome
-    found = survey(path)
+    archive, found = open_archive(path, fields=()), survey(path)
+    header, outcome, stamp = archive.header, archive.outcome, archive.columns["stamp"]
     ended, lost = _ended(outcome)
     further = {
         **header.entries,
         **{f"outcome.{key}": text for key, text in (outcome.entries if outcome else {}).items()},
     }
-    stamp = archive.columns["stamp"]
-    duration = float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0
+    title, duration = WORDS.get(header.kind, header.kind), 0.0
+    if header.index is not None:
+        attempt = 1 if header.attempt is None else header.attempt
+        title = f"{motion_name(header.kind, header.index)}, attempt {attempt}"
+    if len(stamp):
+        duration = float(stamp[-1] - stamp[0]) * 1e-9
     return Overview(
         path=archive.path,
-        title=_title(header),
+        title=title,
         outcome=ended,
         lost=lost,
         samples=archive.n_samples,
@@ -402,7 +396,7 @@ def overview(path: str | PathLike[str]) -> Overview:
         per_minute=found.size / duration * 60.0 if duration else None,
         chunks=found.chunks,
         channels=tuple(
-            (topic, getattr(found.parser.known.schema(topic), "name", ""), count)
+            (topic, getattr(found.parser.schema(topic), "name", ""), count)
             for topic, count in sorted(found.counts.items())
         ),
         attachments={name: len(data) for name, data in archive.attachments.items()},
@@ -411,18 +405,9 @@ def overview(path: str | PathLike[str]) -> Overview:
             for key, text in further.items()
             if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
         },
-        events=tuple(
-            (event.time, event.name, event.text) for event in archive.events[:_MOST_EVENTS]
-        ),
+        events=tuple((one.time, one.name, one.text) for one in archive.events[:_MOST_EVENTS]),
         damage=None if archive.damage is None else str(archive.damage),
     )
-
-
-def _title(header: ArchiveHeader) -> str:
-    if header.index is None:
-        return WORDS.get(header.kind, header.kind)
-    attempt = 1 if header.attempt is None else header.attempt
-    return f"{motion_name(header.kind, header.index)}, attempt {attempt}"
 
 
 def _ended(outcome: ArchiveOutcome | None) -> tuple[str, str]:

@@ -1,19 +1,18 @@
-"""The messages of a decompressed chunk, found all at once.
+"""The messages of decompressed chunks, found all at once.
 
 A recording repeats itself: each cycle adds the same few messages of the same lengths. Once that
-pattern is known, what follows is read as a matrix with a pattern per row, and that is *verified*:
-opcode, length and channel at each place where a message should begin. That is the whole walk, done
-in a few array operations. Anything else in between is walked record by record.
+pattern is known, what follows is read as a matrix with a pattern per row, and *verified*: opcode,
+length and channel where each message should begin. Anything else is walked record by record.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -36,10 +35,8 @@ HEAD = np.dtype(
 )
 """What precedes the data of a message."""
 _FIXED = struct.Struct("<BQH")  # the part of it that repeats with the pattern
-_WORD = np.dtype("<u8")
-_WORDS_AT = (0, _FIXED.size - _WORD.itemsize)  # two words that overlap cover the fixed part
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
-_STAMP_AT = slice(4, 4 + _STAMP.itemsize)  # in the data of a message, behind its encapsulation
+_STAMP_AT = slice(HEAD.itemsize + 4, HEAD.itemsize + 4 + _STAMP.itemsize)  # after the encapsulation
 _LONGEST_PATTERN = 16  # messages
 
 
@@ -61,7 +58,7 @@ class Messages:
     def of_heads(self, name: str) -> NDArray[Any]:
         """A field of `HEAD`, of all messages."""
         heads = [part[:, : HEAD.itemsize].view(HEAD)[:, 0][name] for part in self.parts]
-        return np.concatenate(heads)
+        return heads[0] if len(heads) == 1 else np.concatenate(heads)
 
     @property
     def data(self) -> list[Bytes]:
@@ -71,34 +68,33 @@ class Messages:
     @cached_property
     def stamps(self) -> NDArray[np.int64]:
         """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
-        if any(data.shape[1] < _STAMP_AT.stop for data in self.data):
+        if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
             return np.zeros(0, np.int64)
-        stamps = [data[:, _STAMP_AT].view(_STAMP)[:, 0] for data in self.data]
-        stamp = np.concatenate(stamps)
+        stamp = np.concatenate([part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts])
         return np.asarray(stamp["sec"] * np.int64(10**9) + stamp["nanosec"])
 
     def all(self) -> list[bytes]:
         """The data of each message."""
         return [bytes(message) for data in self.data for message in data]
 
-    def matrix(self, size: int) -> Bytes | None:
-        """The data as bytes (k, size); None when there is a message of another size."""
-        data = self.data
-        if any(part.shape[1] != size for part in data):
-            return None
-        return data[0] if len(data) == 1 else np.concatenate(data)
 
+class ChunkParser:
+    """Finds messages, chunk after chunk, and takes the schemas and channels among them.
 
-class KnownChannels:
-    """Schemas and channels by their numbers; what is known once stays what it is.
+    What a number or a topic means stays what it is: were it to change in mid-file, samples of one
+    channel would be mistaken for those of another.
 
-    Were a number or a topic to change its meaning in mid-file, samples of one channel would be
-    mistaken for those of another.
+    Attributes:
+        schemas, channels: those known so far, by their numbers.
     """
 
-    def __init__(self, known: KnownChannels | None = None) -> None:
-        self.schemas: dict[int, Schema] = dict(known.schemas) if known else {}
-        self.channels: dict[int, Channel] = dict(known.channels) if known else {}
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._round: list[tuple[int, slice]] = []  # channel and record of the pattern's messages
+        self._begin = b""
+        self._fixed = np.zeros(0, np.intp)  # places of the bytes that repeat with it
+        self._expected = np.zeros(0, np.uint8)
 
     @property
     def topics(self) -> set[str]:
@@ -107,7 +103,7 @@ class KnownChannels:
 
     @property
     def definitions(self) -> list[Schema | Channel]:
-        """All of them."""
+        """All schemas and channels."""
         return [*self.schemas.values(), *self.channels.values()]
 
     def schema(self, topic: str) -> Schema | None:
@@ -115,7 +111,7 @@ class KnownChannels:
         identity = next(one.schema_id for one in self.channels.values() if one.topic == topic)
         return self.schemas.get(identity)
 
-    def take(self, record: Record) -> None:
+    def define(self, record: Record) -> None:
         """Take a schema or channel; other records are passed over.
 
         Raises:
@@ -126,10 +122,10 @@ class KnownChannels:
         item, again = container.item(record), ""
         if isinstance(item, Schema):
             if not item.id:
-                raise Damage(record.offset, "(schema) has the number 0, which stands for none")
+                raise Damage(record.offset, "(schema) has the number 0, which means none")
             if self.schemas.setdefault(item.id, item) != item:
                 again = f"schema {item.id}"
-        elif isinstance(item, Channel):
+        else:
             known = self.channels.values()
             same = [one for one in known if one.id == item.id or one.topic == item.topic]
             if same not in ([], [item]):
@@ -137,22 +133,6 @@ class KnownChannels:
             self.channels.setdefault(item.id, item)
         if again:
             raise Damage(record.offset, f"announces {again} a second time, as another")
-
-
-class _Place(NamedTuple):
-    """Where in the pattern a message stands, and the head it must have as two words."""
-
-    channel: int
-    words: tuple[tuple[slice, int], ...]
-    record: slice
-
-
-class ChunkParser:
-    """Finds messages, chunk after chunk, and takes the schemas and channels among them."""
-
-    def __init__(self) -> None:
-        self.known = KnownChannels()
-        self._pattern: list[_Place] = []
 
     def messages(self, chunk: bytes, offset: int) -> dict[int, Messages]:
         """The messages of a chunk by channel; of several chunks that follow each other likewise.
@@ -168,13 +148,13 @@ class ChunkParser:
         recent: deque[bytes] = deque(maxlen=_LONGEST_PATTERN)
         at = 0
         while at < len(chunk):
-            rows = self._run(chunk, at)
+            rows = self._repeated(chunk, at)
             if len(rows):
                 first = at + rows.shape[1] * np.arange(len(rows))
-                for place in self._pattern:
-                    messages = found.setdefault(place.channel, Messages())
-                    messages.parts.append(rows[:, place.record])
-                    messages.places.append(first + place.record.start)
+                for channel, place in self._round:
+                    messages = found.setdefault(channel, Messages())
+                    messages.parts.append(rows[:, place])
+                    messages.places.append(first + place.start)
                 at += rows.size
                 continue
             opcode, end = container.bounds(chunk, at, offset)
@@ -182,7 +162,7 @@ class ChunkParser:
                 if end - at < HEAD.itemsize:
                     raise Damage(offset, "(chunk) ends within a record")
                 head = chunk[at : at + _FIXED.size]
-                if head in recent and self._learn(list(recent)[recent.index(head) :]):
+                if head in recent and self._learn([*recent][recent.index(head) :]):
                     recent.clear()
                     continue
                 recent.append(head)
@@ -190,49 +170,29 @@ class ChunkParser:
                 messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
                 messages.places.append(np.array([at]))
             else:
-                self.known.take(Record(offset, opcode, chunk[at + container.RECORD.size : end]))
+                self.define(Record(offset, opcode, chunk[at + container.RECORD.size : end]))
             at = end
         return found
 
-    def by_topic(self, found: Mapping[int, Messages], offset: int) -> dict[str, Messages]:
-        """The same by topic.
-
-        Raises:
-            Damage: a channel is not known.
-        """
-        unknown = found.keys() - self.known.channels.keys()
-        if unknown:
-            raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
-        return {self.known.channels[number].topic: messages for number, messages in found.items()}
-
-    def _run(self, chunk: bytes, at: int) -> Bytes:
+    def _repeated(self, chunk: bytes, at: int) -> Bytes:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
-        size = self._pattern[-1].record.stop if self._pattern else len(chunk) + 1
+        if not self._round or not chunk.startswith(self._begin, at):
+            return np.zeros((0, 0), np.uint8)
+        size = self._round[-1][1].stop
         count = (len(chunk) - at) // size
         rows = np.frombuffer(chunk, np.uint8, count * size, at).reshape(count, size)
-        matching = np.ones(count, np.bool_)
-        for place in self._pattern:
-            for where, word in place.words:
-                matching &= rows[:, where].view(_WORD)[:, 0] == word
-        return rows if matching.all() else rows[: int(matching.argmin())]
+        same = (rows[:, self._fixed] == self._expected).all(axis=1)
+        return rows if same.all() else rows[: int(same.argmin())]
 
     def _learn(self, heads: Sequence[bytes]) -> bool:
-        """Take one round of heads for the pattern, if no channel comes twice in it."""
-        places, start = [], 0
-        for head in heads:
-            _, length, channel = _FIXED.unpack(head)
-            words = tuple(
-                (
-                    slice(start + at, start + at + _WORD.itemsize),
-                    int.from_bytes(head[at : at + _WORD.itemsize], "little"),
-                )
-                for at in _WORDS_AT
-            )
-            end = start + container.RECORD.size + length
-            places.append(_Place(channel, words, slice(start, end)))
-            start = end
-        changed = len({place.channel for place in places}) == len(places)
-        changed &= places != self._pattern
-        if changed:
-            self._pattern = places
-        return changed
+        """Take one round of heads for the pattern, if it is new and no channel comes twice."""
+        _, lengths, channels = zip(*map(_FIXED.unpack, heads), strict=True)
+        ends = np.cumsum([container.RECORD.size + length for length in lengths]).tolist()
+        begins = [0, *ends[:-1]]
+        new = [*zip(channels, map(slice, begins, ends), strict=True)]
+        if len(set(channels)) < len(channels) or new == self._round:
+            return False
+        self._round, self._begin = new, heads[0]
+        self._fixed = np.add.outer(begins, np.arange(_FIXED.size)).ravel()
+        self._expected = np.frombuffer(b"".join(heads), np.uint8)
+        return True

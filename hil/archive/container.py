@@ -1,10 +1,9 @@
 """The MCAP container as far as an archive needs it: records in file order, each verified.
 
-The `mcap` library reads and writes single records. Files are walked here: the library's walk alone
-takes twice as long as all our reading, message indexes and all, and what is torn or forged must
-surface as `Damage` with its place. Only the data section is believed. It is self-delimiting and its
-chunks and attachments carry checksums, so a file cut off anywhere can be read up to its last whole
-chunk; the index at the end is for other programs.
+The `mcap` library reads and writes single records; files are walked here, twice as fast, and what
+is torn or forged becomes `Damage` with its place. Only the data section is believed: it is
+self-delimiting and its chunks and attachments carry checksums, so a file cut off anywhere can be
+read up to its last whole chunk.
 
 Layout: https://mcap.dev/spec
 """
@@ -14,7 +13,8 @@ from __future__ import annotations
 import os
 import struct
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple, TypeVar
@@ -41,12 +41,13 @@ MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
 MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
 LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
-FARTHEST = 1 << 62  # bytes, less than the end of any file
+_FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
 SUMMARY_OFFSET, DATA_END = 14, 15
 EVERY_OPCODE = frozenset(range(256))
+BUT_INDEXES = EVERY_OPCODE - {MESSAGE_INDEX}
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
@@ -54,6 +55,7 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the co
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _NO_CRC = 0
+_UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, behind those of its checksum
 _KINDS: dict[int, type[McapRecord]] = {
     SCHEMA: Schema,
     CHANNEL: Channel,
@@ -70,7 +72,7 @@ class Damage(Exception):  # noqa: N818 - handed on as a finding, too
 
     Attributes:
         offset: where in the file the damaged record begins.
-        reason: what is wrong, to stand after "the record at byte ...".
+        reason: what is wrong, to follow "the record at byte ...".
     """
 
     def __init__(self, offset: int, reason: str) -> None:
@@ -98,7 +100,7 @@ class Record(NamedTuple):
 
     @property
     def data(self) -> bytes:
-        """Its bytes as they stand in the file."""
+        """Its bytes as in the file."""
         return RECORD.pack(self.opcode, len(self.body)) + self.body
 
 
@@ -138,7 +140,7 @@ def encoded(record: McapRecord) -> bytes:
 
 
 def bounds(data: bytes, at: int, offset: int) -> tuple[int, int]:
-    """Opcode and end of the record at `at`, in a chunk or summary that stands at `offset`.
+    """Opcode and end of the record at `at`, in a chunk or summary at `offset` of the file.
 
     Raises:
         Damage: it is cut off.
@@ -170,7 +172,7 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
     Raises:
         Damage: it is not there.
     """
-    if RECORD.size <= length <= LARGEST_RECORD and offset <= FARTHEST:
+    if RECORD.size <= length <= LARGEST_RECORD and offset <= _FARTHEST:
         stream.seek(offset)
         data = stream.read(length)
         if len(data) < length:
@@ -182,14 +184,18 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
 
 
 def records(
-    stream: BinaryIO, size: int, *, skip: Collection[int] = (), check_end: bool = True
+    stream: BinaryIO,
+    size: int,
+    *,
+    only: Collection[int] = EVERY_OPCODE,
+    check_end: bool = True,
 ) -> Iterator[Record]:
     """Walk the records of the data section, DataEnd included; then check the end of the file.
 
     Args:
         stream: the file, at its beginning.
         size: its length.
-        skip: opcodes of records that are passed over.
+        only: opcodes of the records that are read; others are passed over.
         check_end: whether to check summary and footer.
 
     Raises:
@@ -210,7 +216,7 @@ def records(
             raise Damage(offset, "is zeros, where one must begin")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
-        if opcode in skip:
+        if opcode not in only:
             seek(length, os.SEEK_CUR)
         elif length > LARGEST_RECORD:
             raise Damage(offset, f"claims {length} bytes of content")
@@ -218,22 +224,23 @@ def records(
             yield Record(offset, opcode, read(length))
         offset += RECORD.size + length
     if check_end:
-        _check_end(read(min(size - offset, LARGEST_RECORD)), offset)
+        tail = read(min(size - offset, LARGEST_RECORD))
+        footer = _footer(tail)
+        if footer is None or footer.summary_crc not in (_NO_CRC, crc32(tail[:-_UNCOVERED])):
+            raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
 
 
-def _check_end(tail: bytes, offset: int) -> None:
-    """Check summary and footer, which follow DataEnd."""
-    if len(tail) < FOOTER_SIZE + len(MAGIC) or not tail.endswith(MAGIC):
-        raise Damage(offset, "(index and footer) is cut off")
-    footer = tail[-FOOTER_SIZE - len(MAGIC) : -len(MAGIC)]
-    covered, (crc,) = tail[: -len(MAGIC) - _CRC.size], _CRC.unpack(footer[-_CRC.size :])
-    is_footer = RECORD.unpack_from(footer) == (FOOTER, FOOTER_SIZE - RECORD.size)
-    if not is_footer or (crc != _NO_CRC and crc32(covered) != crc):
-        raise Damage(offset, "(index and footer) fails its checksum")
+def _footer(tail: bytes) -> Footer | None:
+    """The footer at the end of these bytes; None where they do not end a file."""
+    start = len(tail) - FOOTER_SIZE - len(MAGIC)
+    head = (FOOTER, FOOTER_SIZE - RECORD.size)
+    if start < 0 or not tail.endswith(MAGIC) or RECORD.unpack_from(tail, start) != head:
+        return None
+    return parsed(Footer, Record(0, FOOTER, tail[start + RECORD.size : -len(MAGIC)]))
 
 
-def item(record: Record) -> McapRecord:
-    """A schema, channel, metadata record or attachment.
+def item(record: Record) -> Any:
+    """A schema, channel, metadata record, attachment or entry of an index.
 
     Raises:
         Damage: it is none of these, or damaged.
@@ -276,7 +283,7 @@ def chunk(record: Record) -> Chunk:
 
 
 def chunk_data(chunk: Chunk, offset: int) -> bytes:
-    """The records of a chunk that stands at `offset`, decompressed, their checksum verified."""
+    """The records of a chunk at `offset`, decompressed, their checksum verified."""
     data = decompressed(chunk, offset)
     if crc32(data) != chunk.uncompressed_crc:
         missing = chunk.uncompressed_crc == _NO_CRC
@@ -285,7 +292,7 @@ def chunk_data(chunk: Chunk, offset: int) -> bytes:
 
 
 def decompressed(chunk: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
-    """The records of a chunk that stands at `offset`; their checksum is not looked at.
+    """The records of a chunk at `offset`, their checksum not verified.
 
     At most one byte more than declared is decompressed: a corrupt frame fills no memory.
 
@@ -305,9 +312,8 @@ def decompressed(chunk: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> 
         elif chunk.compression == "lz4":
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif chunk.compression:
-            raise Damage(
-                offset, f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4"
-            )
+            problem = f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4"
+            raise Damage(offset, problem)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
     if len(data) != size:
@@ -320,15 +326,11 @@ def _decompressor(thread: int) -> zstandard.ZstdDecompressor:  # noqa: ARG001 - 
     return zstandard.ZstdDecompressor()
 
 
+@dataclass(frozen=True)
 class Summary:
-    """The summary of a file, its records parsed when they are asked for.
+    """The records of a file's summary, which are parsed when they are asked for."""
 
-    Args:
-        data: its records.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        self._records = [*split(data, 0)]
+    records: Sequence[Record]
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
@@ -337,55 +339,45 @@ class Summary:
         Args:
             stream: the file.
             size: its length.
-            start: where the data section ends, of a file in which records may have moved; what
-                the summary lists may then be elsewhere.
+            start: where the data section ends, of a file in which records may have moved; the
+                places in the summary may then be wrong.
         """
         last = size - FOOTER_SIZE - len(MAGIC)
         if last < 0:
             return None
         stream.seek(last)
-        tail = stream.read(size - last)
-        if not tail.endswith(MAGIC) or RECORD.unpack_from(tail) != (FOOTER, 20):
+        footer = _footer(stream.read(size - last))
+        if footer is None or footer.summary_crc == _NO_CRC:
             return None
-        footer = parsed(Footer, Record(last, FOOTER, tail[RECORD.size : FOOTER_SIZE]))
         start = footer.summary_start if start is None else start
-        if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD or not footer.summary_crc:
+        if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD:
             return None
         stream.seek(start)
-        data = stream.read(last + FOOTER_SIZE - _CRC.size - start)
-        if crc32(data) != footer.summary_crc:
+        data = stream.read(size - start)
+        if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
             return None
         try:
-            return cls(data[: last - start])
+            return cls([*split(data[: last - start], 0)])
         except Damage:
             return None
 
     @property
     def definitions(self) -> list[Record]:
         """Schema and channel records."""
-        return [record for record in self._records if record.opcode in (SCHEMA, CHANNEL)]
+        return [record for record in self.records if record.opcode in (SCHEMA, CHANNEL)]
 
-    def _entries(self, opcode: int) -> list[Any]:
-        return [item(record) for record in self._records if record.opcode == opcode]
-
-    @property
-    def metadata(self) -> list[tuple[int, int]]:
-        """Offset and length of the metadata records."""
-        return [(one.offset, one.length) for one in self._entries(METADATA_INDEX)]
+    def entries(self, opcode: int) -> list[Any]:
+        """The entries of one kind of index."""
+        return [item(record) for record in self.records if record.opcode == opcode]
 
     @property
     def others(self) -> list[tuple[int, int]]:
-        """Offset and length of metadata and attachments."""
-        attachments = self._entries(ATTACHMENT_INDEX)
-        return sorted([*self.metadata, *((one.offset, one.length) for one in attachments)])
-
-    @property
-    def chunks(self) -> list[ChunkIndex]:
-        """In the order of the file."""
-        return sorted(self._entries(CHUNK_INDEX), key=lambda entry: entry.chunk_start_offset)
+        """Offset and length of metadata and attachments, in the order of the file."""
+        found = [*self.entries(METADATA_INDEX), *self.entries(ATTACHMENT_INDEX)]
+        return sorted((entry.offset, entry.length) for entry in found)
 
     @property
     def places(self) -> list[tuple[int, int]]:
-        """Offset and length of all records that it lists."""
-        chunks = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in self.chunks]
-        return sorted([*chunks, *self.others])
+        """The same of all records in an index."""
+        chunks = self.entries(CHUNK_INDEX)
+        return sorted([*self.others, *((c.chunk_start_offset, c.chunk_length) for c in chunks)])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.record import cycle_dtype
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
-from hil.archive.chunk import Bytes, Messages
+from hil.archive.chunk import Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome, is_known
@@ -25,12 +25,9 @@ from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
 
-_ALWAYS: Final = 1 << 63  # ns, beyond every stamp
-_BATCH: Final = (
-    1 << 20
-)  # bytes of chunks decoded at once: few calls per chunk, and all in the cache
+_ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and beyond every stamp
+_BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _COLUMN_OF: Final = {"effort": "torque"}  # where a message has another word for it than we
-_UNREAD: Final = frozenset((container.MESSAGE_INDEX,))
 _REMEDIES: Final = {
     errno.ENOENT: "see whether it was moved or removed",
     errno.EACCES: "make it readable for yourself",
@@ -44,26 +41,16 @@ class ArchiveDamage:
 
     Attributes:
         offset: byte in the file from which nothing was read.
-        reason: what is wrong there.
         bytes_dropped: bytes from there to the end of the file.
-        samples: samples that could be read; None where no column was asked for.
-        duration: time from the first of them to the last [s].
-        outcome_missing: whether the outcome is among the losses.
+        text: what is wrong there, and how much could be read.
     """
 
     offset: int
-    reason: str
     bytes_dropped: int
-    samples: int | None = 0
-    duration: float = 0.0
-    outcome_missing: bool = True
+    text: str
 
     def __str__(self) -> str:
-        read = f"; {self.samples} samples ({self.duration:.6g} s) could be read"
-        lost = f"the record at byte {self.offset} {self.reason}"
-        lost += f" ({self.bytes_dropped} bytes from there on are unused)"
-        outcome = "; the outcome is missing" if self.outcome_missing else ""
-        return f"{lost}{'' if self.samples is None else read}{outcome}"
+        return self.text
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,109 +168,103 @@ class Archive:
         Raises:
             ArchiveError: the archive was opened without all fields, or holds no cycles.
         """
-        dtype = cycle_dtype(len(self.joint_names))
-        names = dtype.names or ()
-        absent = [name for name in names if name not in self.columns and name not in LATER_FIELDS]
-        if absent:
-            raise ArchiveError(self.path, f"has no column {absent[0]}", field=CYCLE)
-        rows = np.zeros(self.n_samples, dtype)
-        for name in names:
+        rows = np.zeros(self.n_samples, cycle_dtype(len(self.joint_names)))
+        for name in rows.dtype.names or ():
             if name in self.columns:
                 rows[name] = self.columns[name]
+            elif name not in LATER_FIELDS:
+                raise ArchiveError(self.path, f"has no column {name}", field=CYCLE)
         return rows
 
 
-@dataclass(frozen=True)
-class _Selection:
-    """Columns, channels and times wanted; see `open_archive`."""
-
-    fields: Collection[str] | None
-    topics: Collection[str] | None
-    start: float | None
-    stop: float | None
-
-    @property
-    def times(self) -> tuple[int, int] | None:
-        """First instant and end [ns]; None where all times are wanted."""
-        if self.start is None and self.stop is None:
-            return None
-        start = -_ALWAYS if self.start is None else round(self.start * 1e9)
-        return start, _ALWAYS if self.stop is None else round(self.stop * 1e9)
-
-    def numbers(self, recorded: Collection[str]) -> tuple[str, ...]:
-        """The channels that give columns, of an archive that has the channels `recorded`."""
-        if self.topics is not None:
-            return tuple(topic for topic in self.topics if topic != EVENTS)
-        return (CYCLE,) if CYCLE in recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
-
-    def all(self, recorded: Collection[str]) -> tuple[str, ...]:
-        """The same and, where they are wanted, the events."""
-        events = self.topics is None or EVENTS in self.topics
-        return (*self.numbers(recorded), *([EVENTS] if events else []))
-
-
 class _Columns:
-    """The fields wanted of the messages of a channel, joined at the end."""
+    """The fields wanted of the messages of a channel, appended batch by batch.
 
-    def __init__(self, layout: MessageLayout, selection: _Selection) -> None:
+    Args:
+        layout: of the messages.
+        fields: columns wanted, None for all.
+        room: samples that are expected.
+    """
+
+    def __init__(self, layout: MessageLayout, fields: Collection[str] | None, room: int) -> None:
         self._layout = layout
-        self._times = selection.times
-        self._stamps = [np.zeros(0, np.int64)]
-        self._parts: dict[str, list[Rows]] = {}
+        self._count = 0
+        self._stamps = np.empty(room, np.int64)
+        self._raw: dict[str, Rows] = {}  # copied as bytes, which is faster
         for name in layout.dtype.names or ():
-            wanted = selection.fields is None or _COLUMN_OF.get(name, name) in selection.fields
+            wanted = fields is None or _COLUMN_OF.get(name, name) in fields
             if wanted and name not in ("sec", "nanosec"):
-                self._parts[name] = []
+                self._raw[name] = np.empty(room, f"V{layout.dtype[name].itemsize}")
 
-    def verified(self, messages: Messages, offset: int) -> Bytes:
-        """The messages as bytes (k, size), which must be like those before."""
-        data = messages.matrix(self._layout.size)
-        if data is None or not self._layout.holds_in(data):
+    def check(self, messages: Messages, offset: int) -> None:
+        """Check that messages are like those before."""
+        if not all(map(self._layout.holds_in, messages.data)):
             raise Damage(offset, "(chunk) has messages that differ from those before")
-        return data
 
-    def append(self, messages: Bytes, stamp: NDArray[np.int64]) -> None:
-        """Append messages, shape (k, size), and their stamps (k,) [ns]."""
-        if self._times is not None:
-            wanted = (stamp >= self._times[0]) & (stamp < self._times[1])
-            messages, stamp = messages[wanted], stamp[wanted]
-        self._stamps.append(stamp)
-        for name, parts in self._parts.items():
-            dtype, start, *_ = self._layout.dtype.fields[name]  # type: ignore[index]
-            raw = np.dtype((np.void, dtype.itemsize))  # copied as bytes, which is faster
-            parts.append(messages[:, start : start + dtype.itemsize].view(raw)[:, 0].copy())
+    def append(self, messages: Messages, times: tuple[int, int]) -> None:
+        """Append those of a range of times [ns]."""
+        stamps = messages.stamps
+        chosen = None if times == _ALWAYS else (stamps >= times[0]) & (stamps < times[1])
+        begin = 0
+        for data in messages.data:
+            part = slice(begin, begin + len(data))
+            begin, stamp = part.stop, stamps[part]
+            if chosen is not None:
+                data, stamp = data[chosen[part]], stamp[chosen[part]]
+            now = slice(self._count, self._count + len(stamp))
+            if now.stop > len(self._stamps):
+                self._resize(2 * now.stop)
+            self._stamps[now] = stamp
+            for name, raw in self._raw.items():
+                _, start, *_ = self._layout.dtype.fields[name]  # type: ignore[index]
+                raw[now] = data[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
+            self._count = now.stop
 
     def finished(self) -> dict[str, NDArray[Any]]:
         """The columns by our names, contiguous and read-only."""
-        columns: dict[str, NDArray[Any]] = {"stamp": np.concatenate(self._stamps)}
-        while self._parts:
-            name, parts = self._parts.popitem()
-            dtype = self._layout.dtype[name]
-            base, shape = dtype.subdtype or (dtype, ())
-            joined = np.concatenate([np.zeros(0, f"V{dtype.itemsize}"), *parts])
-            columns[_COLUMN_OF.get(name, name)] = joined.view(base).reshape(-1, *shape)
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for name, raw in self._raw.items():
+            base, shape = (dtype := self._layout.dtype[name]).subdtype or (dtype, ())
+            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
         for column in columns.values():
             column.flags.writeable = False
         return columns
 
+    def _resize(self, room: int) -> None:
+        self._stamps = np.resize(self._stamps, room)
+        self._raw = {name: np.resize(raw, room) for name, raw in self._raw.items()}
+
 
 class _Content(Scan):
-    """What is selected of a file, up to its first damage.
+    """What is selected of a file, up to its first damage; see `open_archive` for the arguments.
 
     Attributes:
         events: what happened, in the order of writing.
     """
 
-    def __init__(self, selection: _Selection, expected: Expected, *, gapless: bool) -> None:
+    def __init__(
+        self,
+        fields: Collection[str] | None,
+        topics: Collection[str] | None,
+        times: tuple[int, int],
+        expected: Expected,
+        *,
+        gapless: bool,
+    ) -> None:
         super().__init__(expected, gapless=gapless, batch=_BATCH)
         self.events: list[ArchivedEvent] = []
-        self._selection = selection
+        self._fields = fields
+        self._topics = topics
+        self._times = times
         self._columns: dict[str, _Columns] = {}
 
     @property
     def topics(self) -> Collection[str]:
         """The channels wanted."""
-        return self._selection.all(self.parser.known.topics)
+        if self._topics is not None:
+            return self._topics
+        own = CYCLE in self.parser.topics
+        return (CYCLE, EVENTS) if own else (schema.MEASURED, schema.MOTOR_CURRENT, EVENTS)
 
     def collect(self, records: Iterable[Record], size: int) -> Damage | None:
         """Take records up to their end or the first damage, which is returned.
@@ -309,6 +290,27 @@ class _Content(Scan):
             damage = found
         return damage
 
+    def by_index(self, stream: BinaryIO, summary: Summary) -> bool:
+        """Take what is selected from where the summary says; False where that is damaged."""
+        try:
+            for definition in summary.definitions:
+                self.parser.define(definition)
+            others, chunks = summary.others, summary.entries(container.CHUNK_INDEX)
+        except Damage:
+            return False
+        # A chunk that has other samples than those wanted is to be seen, too.
+        topics = {*self.topics, *(NUMBERS if self._topics is None else ())}
+        wanted = {one.id for one in self.parser.channels.values() if one.topic in topics}
+        chunks = [chunk for chunk in chunks if chunk.message_index_offsets.keys() & wanted]
+        start, stop = self._times
+        within = [
+            one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
+        ]
+        # Where nothing falls into the range, one chunk still tells what columns there are.
+        places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
+        records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
+        return self.collect(records, 0) is None and self.metadata is not None
+
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns read, all of the same length."""
         joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
@@ -327,40 +329,37 @@ class _Content(Scan):
             raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
 
     def visit(self, found: Mapping[str, Messages], offset: int) -> None:
-        """Decode messages."""
-        recorded = self.parser.known.topics
-        wanted = [topic for topic in self._selection.numbers(recorded) if topic in found]
-        elsewhere = self._selection.topics is None and not found.keys().isdisjoint(NUMBERS)
-        if elsewhere and not wanted:
+        """Decode messages; nothing of them is held before all are verified."""
+        wanted = [topic for topic in self.topics if topic in found and topic != EVENTS]
+        if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
         columns = {topic: self._columns_of(topic, found[topic], offset) for topic in wanted}
-        data = {topic: columns[topic].verified(found[topic], offset) for topic in wanted}
+        for topic in wanted:
+            columns[topic].check(found[topic], offset)
         if EVENTS in self.topics and EVENTS in found:
-            self.events += self._events(found[EVENTS], offset)
+            try:
+                events = [ArchivedEvent.decode(message) for message in found[EVENTS].all()]
+            except LayoutError as error:
+                problem = f"(chunk) has an event that cannot be read: {error}"
+                raise Damage(offset, problem) from error
+            start, stop = self._times
+            self.events += [event for event in events if start <= event.stamp < stop]
         self._columns |= columns
         for topic in wanted:
-            columns[topic].append(data[topic], found[topic].stamps)
+            columns[topic].append(found[topic], self._times)
 
     def _columns_of(self, topic: str, messages: Messages, offset: int) -> _Columns:
         """The columns of a topic, begun by its schema or by its first message."""
         if topic in self._columns:
             return self._columns[topic]
         assert self.header is not None
-        record, first = self.parser.known.schema(topic), bytes(messages.data[0][0])
+        record, first = self.parser.schema(topic), bytes(messages.data[0][0])
         try:
             layout = schema.message_layout(topic, self.header.joint_names, record, first)
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-        return _Columns(layout, self._selection)
-
-    def _events(self, messages: Messages, offset: int) -> list[ArchivedEvent]:
-        """The events of the time that is wanted."""
-        try:
-            events = [ArchivedEvent.decode(message) for message in messages.all()]
-        except LayoutError as error:
-            raise Damage(offset, f"(chunk) has an event that cannot be read: {error}") from error
-        start, stop = self._selection.times or (-_ALWAYS, _ALWAYS)
-        return [event for event in events if start <= event.stamp < stop]
+        room = self.expected.samples if self._times == _ALWAYS else 0
+        return _Columns(layout, self._fields, room)
 
 
 def open_archive(
@@ -396,18 +395,22 @@ def open_archive(
     if len(alike) > 1:
         names = ", ".join(sorted(alike))
         raise ValueError(f"columns of {names} have the same names: open one at a time")
-    selection = _Selection(fields, topics, start, stop)
+    times = (
+        _ALWAYS[0] if start is None else round(start * 1e9),
+        _ALWAYS[1] if stop is None else round(stop * 1e9),
+    )
     try:
         with opened(path) as stream:
-            size = os.fstat(stream.fileno()).st_size
-            summary, damage, content = Summary.read(stream, size), None, None
+            size, damage = os.fstat(stream.fileno()).st_size, None
+            summary = Summary.read(stream, size)
             expected = Expected.read(stream, size, summary)
-            if summary is not None and (selection.times is not None or topics is not None):
-                content = _by_index(stream, selection, expected, summary)
-            if content is None:
+            content = _Content(fields, topics, times, expected, gapless=False)
+            partial = topics is not None or times != _ALWAYS
+            if not partial or summary is None or not content.by_index(stream, summary):
                 stream.seek(0)
-                content = _Content(selection, expected, gapless=True)
-                damage = content.collect(container.records(stream, size, skip=_UNREAD), size)
+                content = _Content(fields, topics, times, expected, gapless=True)
+                walk = container.records(stream, size, only=container.BUT_INDEXES)
+                damage = content.collect(walk, size)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -417,26 +420,21 @@ def open_archive(
         ) from error
     if content.header is None:
         raise _unreadable(path, size, content, damage)
-    recorded = sorted(content.parser.known.topics)
+    recorded = sorted(content.parser.topics)
     unknown = [topic for topic in topics or () if topic not in recorded]
     if damage is None and recorded and unknown:
         remedy = f"it has {', '.join(recorded)}"
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
-    columns = content.columns()
-    stamp = columns["stamp"]
-    with_columns = fields is None or bool(fields)
-    lost = (
-        None
-        if damage is None
-        else ArchiveDamage(
-            offset=damage.offset,
-            reason=damage.reason,
-            bytes_dropped=size - damage.offset,
-            samples=len(stamp) if with_columns else None,
-            duration=1e-9 * float(stamp[-1] - stamp[0]) if with_columns and len(stamp) else 0.0,
-            outcome_missing=content.outcome is None,
-        )
-    )
+    columns, lost = content.columns(), None
+    if damage is not None:
+        dropped, stamp = size - damage.offset, columns["stamp"]
+        text = f"the record at byte {damage.offset} {damage.reason}"
+        text += f" ({dropped} bytes from there on are unused)"
+        if fields is None or fields:  # else nobody counts them
+            duration = 1e-9 * float(stamp[-1] - stamp[0]) if len(stamp) else 0.0
+            text += f"; {len(stamp)} samples ({duration:.6g} s) could be read"
+        text += "; the outcome is missing" if content.outcome is None else ""
+        lost = ArchiveDamage(damage.offset, dropped, text)
     return Archive(
         path=path,
         header=content.header,
@@ -446,33 +444,6 @@ def open_archive(
         events=tuple(content.events),
         damage=lost,
     )
-
-
-def _by_index(
-    stream: BinaryIO, selection: _Selection, expected: Expected, summary: Summary
-) -> _Content | None:
-    """What is selected, found through the summary; None where that or what it names is damaged."""
-    content = _Content(selection, expected, gapless=False)
-    known = content.parser.known
-    try:
-        for record in summary.definitions:
-            known.take(record)
-        indexed, others = summary.chunks, summary.others
-    except Damage:
-        return None
-    # A chunk that has other samples than those wanted is to be seen, too.
-    topics = {*selection.all(known.topics), *(NUMBERS if selection.topics is None else ())}
-    wanted = {channel.id for channel in known.channels.values() if channel.topic in topics}
-    start, stop = selection.times or (-_ALWAYS, _ALWAYS)
-    chunks = [chunk for chunk in indexed if chunk.message_index_offsets.keys() & wanted]
-    within = [
-        one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
-    ]
-    # Where nothing falls into the range, one chunk still tells what columns there are.
-    places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
-    records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
-    damage = content.collect(records, 0)
-    return content if damage is None and content.metadata is not None else None
 
 
 def _unreadable(path: Path, size: int, content: _Content, damage: Damage | None) -> ArchiveError:

@@ -1,7 +1,7 @@
-"""Says what of a torn or damaged archive stands, and makes of it one that every reader accepts.
+"""Says what of a torn or damaged archive can be believed, and makes of it one for every reader.
 
-The reader stops at the first damage; a survey goes on, so that what follows can be saved. What
-stands has passed the same checks (`hil.archive.scan`) and is copied record by record; message
+The reader stops at the first damage; a survey goes on, so that what follows can be saved. What is
+believed has passed the same checks (`hil.archive.scan`) and is copied record by record; message
 indexes and summary are made anew, and the outcome says what is lost. Nothing is invented: what
 cannot be verified is left out.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -30,13 +30,12 @@ from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.files import replacing, sync_folder
 from hil.reading import opened
 
-Write = Callable[[bytes], object]
 _ASPECTS = {
     container.METADATA: "metadata",
     container.ATTACHMENT: "attachments",
     container.CHUNK: "chunks",
 }
-_BUT_END = container.EVERY_OPCODE - {container.DATA_END}
+_CONTENT = (*_ASPECTS, container.SCHEMA, container.CHANNEL)
 
 
 class Fault(NamedTuple):
@@ -57,24 +56,23 @@ Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
 
 
 class Survey(Scan):
-    """What stands of a file, and what does not; message indexes and summary are not looked at.
+    """What can be believed of a file; message indexes and summary are not looked at.
 
     Args:
         path: the file.
         stream: the same, open.
-        visit: called with each chunk that stands.
+        visit: called with each sound chunk.
 
     Attributes:
         path: the file.
         size: its length.
         written_by: profile and library, None where the record is damaged.
-        pieces: records that stand, but for header and outcome, in the order of the file: opcode,
-            offset and length with the head.
-        definitions: schemas and channels in the summary.
+        pieces: sound records, but for header and outcome, in the order of the file: opcode, offset
+            and length with the head.
         faults: what is wrong.
     """
 
-    def __init__(self, path: Path, stream: BinaryIO, visit: Visit | None = None) -> None:
+    def __init__(self, path: Path, stream: BinaryIO, visit: Visit | None) -> None:
         self.path = path
         self.size = os.fstat(stream.fileno()).st_size
         self.written_by: tuple[str, str] | None = None
@@ -83,17 +81,19 @@ class Survey(Scan):
         self._visit = visit
         self._record = Record(0, 0, b"")  # the one that is examined
         self._lost_since = False
-        self._ended = False
         # Found from head to head, since a chunk of another length may have come before it.
-        walk = container.records(stream, self.size, skip=_BUT_END, check_end=False)
+        walk = container.records(stream, self.size, only=(container.DATA_END,), check_end=False)
         try:
             end: int | None = next(walk).end
         except Damage:
             end = None
-        self._summary = Summary.read(stream, self.size, start=end)
-        self.definitions = self._summary.definitions if self._summary else []
-        super().__init__(Expected.read(stream, self.size, self._summary), gapless=False)
-        self._run(stream)
+        summary = Summary.read(stream, self.size, start=end)
+        super().__init__(
+            Expected.read(stream, self.size, summary),
+            gapless=False,
+            definitions=summary.definitions if summary else (),
+        )
+        self._run(stream, summary)
 
     @property
     def losses(self) -> list[str]:
@@ -109,39 +109,39 @@ class Survey(Scan):
 
     @property
     def samples(self) -> int:
-        """Samples that stand."""
+        """Samples that are sound."""
         return max(self.counts.get(topic, 0) for topic in NUMBERS)
 
     @property
     def samples_lost(self) -> int | None:
-        """Samples that do not, None where nobody can say."""
-        stated = None if self.outcome is None else self.outcome.samples
+        """Samples that are not, None where nobody can say."""
         if not self.losses:
             return 0
+        stated = self.outcome.samples if self.outcome else None
         return None if stated is None else max(0, stated - self.samples)
 
-    def _run(self, stream: BinaryIO) -> None:
+    def _run(self, stream: BinaryIO, summary: Summary | None) -> None:
         seen: set[int] = set()
         stream.seek(0)
-        walk = container.records(
-            stream, self.size, skip=(container.MESSAGE_INDEX,), check_end=False
-        )
+        only = container.BUT_INDEXES
         try:
-            for record in walk:
+            for record in container.records(stream, self.size, only=only, check_end=False):
                 seen.add(record.offset)
                 self._examine(record)
         except Damage as damage:
             self._lost_since = True  # and what is lost, counts and outcome will tell
             self._fault("container", damage, loss=False)
-        for place in self._index_places():
+        try:
+            places = summary.places if summary else []
+        except Damage:
+            places = []
+        for place in places:
             if place[0] not in seen:  # the walk did not get there
                 seen.add(place[0])
                 try:
-                    record = container.record_at(stream, *place)
+                    self._examine(container.record_at(stream, *place))
                 except Damage as damage:
                     self._fault("container", damage, loss=True)
-                else:
-                    self._examine(record)
         if self.metadata is not None:
             if self.written_by != (schema.PROFILE, schema.LIBRARY):
                 self._fault("container", "the header is not that of the profile", loss=False)
@@ -149,12 +149,6 @@ class Survey(Scan):
                 self._fault("outcome", "the outcome is that of another recording", loss=True)
             for aspect, text in self.shortfalls():
                 self._fault(aspect, text, loss=True)
-
-    def _index_places(self) -> list[tuple[int, int]]:
-        try:
-            return self._summary.places if self._summary else []
-        except Damage:
-            return []
 
     def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
         self._lost_since |= loss
@@ -175,9 +169,8 @@ class Survey(Scan):
             aspect = _ASPECTS.get(record.opcode, "container")
             self._fault(aspect, damage, loss=record.opcode != container.HEADER)
             return
-        content = (*_ASPECTS, container.SCHEMA, container.CHANNEL)
         is_ours = ours != (self.metadata, self.outcome)
-        if record.opcode in content and not is_ours and self.metadata is not None:
+        if record.opcode in _CONTENT and not is_ours and self.metadata is not None:
             self.pieces.append((record.opcode, record.offset, record.size))
 
     def visit(self, found: Mapping[str, Messages], offset: int) -> None:  # noqa: ARG002
@@ -186,33 +179,13 @@ class Survey(Scan):
         if self._visit is not None:
             self._visit(self, self._record, found)
 
-    def numbered(self, data: bytes, offset: int) -> dict[int, Messages]:
-        """The messages of a chunk; channels that no record before announces are in the summary."""
-        if self._ended:
-            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
-        return numbered(self.parser, data, offset, self.definitions)[0]
-
-    def missing(self, gaps: Mapping[str, int], offset: int) -> None:
+    def missing(self, topics: Collection[str], offset: int) -> None:
         """Note that messages are missing; a gap in samples must show in the samples behind it."""
-        unseen = any(gap and topic in NUMBERS for topic, gap in gaps.items())
-        if unseen and schema.CYCLE not in self.parser.known.topics:
-            self._ended = True
+        if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
             raise Damage(offset, "(chunk) comes after a gap that nothing would show")
         if not self._lost_since and not self.expected.repaired:
             damage = Damage(offset, "(chunk) does not continue the one before")
             self._fault("sequence", damage, loss=True)
-
-
-def numbered(
-    parser: ChunkParser, data: bytes, offset: int, definitions: Sequence[Record]
-) -> tuple[dict[int, Messages], Sequence[Record]]:
-    """The messages of a chunk by channel, and the definitions that no record before announces."""
-    found = parser.messages(data, offset)
-    if found.keys() <= parser.known.channels.keys():
-        return found, ()
-    for item in definitions:
-        parser.known.take(item)
-    return found, definitions
 
 
 def survey(path: str | PathLike[str], visit: Visit | None = None) -> Survey:
@@ -220,7 +193,7 @@ def survey(path: str | PathLike[str], visit: Visit | None = None) -> Survey:
 
     Args:
         path: the file.
-        visit: called with each chunk that stands, with its messages by topic.
+        visit: called with each sound chunk, with its messages by topic.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -378,24 +351,28 @@ def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = No
 
 
 def _copy(
-    found: Survey, stream: BinaryIO, write: Write, outcome: Mapping[str, str] | None = None
+    found: Survey,
+    stream: BinaryIO,
+    write: Callable[[bytes], object],
+    outcome: Mapping[str, str] | None = None,
 ) -> None:
-    """Write what stands of an archive as a new one."""
+    """Write what is sound of an archive as a new one."""
     writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
     described = _description(found)
     writer.add_metadata(METADATA, header.sealed(described))
     for opcode, *place in found.pieces:
         record = container.record_at(stream, *place)
         if opcode != container.CHUNK:
-            parser.known.take(record)
+            parser.define(record)
             writer.put(record.data)
             continue
         head = container.chunk(record)
-        data = container.chunk_data(head, record.offset)
-        messages, definitions = numbered(parser, data, record.offset, found.definitions)
-        for definition in definitions:
-            writer.put(definition.data)
-        for known in parser.known.definitions:
+        messages = parser.messages(container.chunk_data(head, record.offset), record.offset)
+        if not messages.keys() <= parser.channels.keys():
+            for definition in found.definitions:
+                parser.define(definition)
+                writer.put(definition.data)
+        for known in parser.definitions:
             writer.note(known)
         entries = entries_of(messages)
         first, last = span(entries)

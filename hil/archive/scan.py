@@ -1,10 +1,10 @@
 """Goes through an archive record by record, and verifies that each is one that was written.
 
-The one walker of archives: the reader stops at the first damage (`hil.archive.reader`), checks and
-repairs go on behind it (`hil.archive.repair`).
+The reader stops at the first damage (`hil.archive.reader`), checks and repairs go on behind it
+(`hil.archive.repair`).
 
 The checksum of a chunk says that it is whole, not that it is of this recording: a file system may
-put a chunk of another archive in its place. The outcome lists the checksums of all chunks in order,
+put a chunk of another archive in its place. The outcome has the checksums of all chunks in order,
 so that each is known by its own. Archives of earlier versions have no such list, torn ones no
 outcome: there the cycles must do, which grow from the first to the last that the outcome names.
 """
@@ -12,7 +12,7 @@ outcome: there the cycles must do, which grow from the first to the last that th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -21,7 +21,7 @@ from mcap.records import Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
-from hil.archive.chunk import ChunkParser, KnownChannels, Messages
+from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import (
     METADATA,
@@ -36,8 +36,8 @@ from hil.archive.header import (
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
 """Channels that have one message of each sample."""
 
-_SEQUENCES = 1 << 32  # message numbers are counted modulo this
-_BUT_METADATA = container.EVERY_OPCODE - {container.METADATA}
+_SEQUENCES = 1 << 32  # message numbers are modulo this
+_LEAST = 8  # bytes of a file for one sample, of an arm at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,21 +49,26 @@ class Expected:
         ends: stamps of the first and the last cycle [ns].
         mixed: whether that end is of another recording than the beginning.
         repaired: whether messages were lost before the file was written as it is.
+        samples: how many were written, but no more than fit into the file.
     """
 
     chunks: NDArray[np.uint32] | None = None
     ends: tuple[int, int] | None = None
     mixed: bool = False
     repaired: bool = False
+    samples: int = 0
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Expected:
         """Find it, where the summary says or from head to head; the stream is left anywhere."""
-        found = _records_of_ours(_indexed(stream, summary)) if summary else {}
+        found = {}
+        if summary is not None:
+            entries = summary.entries(container.METADATA_INDEX)
+            found = _ours(container.record_at(stream, one.offset, one.length) for one in entries)
         if found.keys() != {METADATA, OUTCOME}:
             stream.seek(0)
-            walk = container.records(stream, size, skip=_BUT_METADATA, check_end=False)
-            found = _records_of_ours(walk)
+            only = (container.METADATA,)
+            found = _ours(container.records(stream, size, only=only, check_end=False))
         try:
             header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
         except (HeaderError, KeyError):
@@ -71,14 +76,40 @@ class Expected:
         if not outcome.belongs_to(header):
             return cls(mixed=True)
         # Another program that copies a file may cut its chunks anew, and then names itself.
-        has_list = outcome.chunks is not None and _is_ours(stream, size)
+        has_list = outcome.chunks is not None and _library(stream, size) == schema.LIBRARY
         chunks = np.array(outcome.chunks, np.uint32) if has_list else None
         first, last, ends = outcome.first_cycle, outcome.last_cycle, None
         # What was repaired may lack either end; earlier versions took two sessions.
         step = (header.period or 0.0) * 1e9
         if step and first is not None and last is not None and not outcome.repaired:
             ends = (round(first * step), round(last * step)) if first <= last else None
-        return cls(chunks, ends, repaired=outcome.repaired)
+        samples = min(outcome.samples or 0, size // _LEAST)
+        return cls(chunks, ends, repaired=outcome.repaired, samples=samples)
+
+
+def _library(stream: BinaryIO, size: int) -> str | None:
+    """The program that the header of a file names."""
+    stream.seek(0)
+    try:
+        record = next(container.records(stream, size, check_end=False))
+        found = container.parsed(Header, record).library
+    except Damage:
+        return None
+    return found if record.opcode == container.HEADER else None
+
+
+def _ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
+    """The first of each of our two metadata records that passes its checksum."""
+    found: dict[str, dict[str, str]] = {}
+    try:
+        for record in records:
+            name, entries = container.metadata(record)
+            claimed = entries.pop("checksum", None)
+            if name in (METADATA, OUTCOME) and claimed == checksum(entries):
+                found.setdefault(name, entries)
+    except Damage:
+        pass  # what comes behind it cannot be found this way
+    return found
 
 
 class Scan(ABC):
@@ -88,6 +119,7 @@ class Scan(ABC):
         expected: what must come.
         gapless: whether every chunk comes; otherwise some are left out.
         batch: bytes of chunks that are decoded at once; 0 to decode each by itself.
+        definitions: schemas and channels for chunks with messages of unknown channels.
 
     Attributes:
         metadata: entries of the ``hil`` record, None before it came.
@@ -100,8 +132,16 @@ class Scan(ABC):
         chunks: how many chunks were taken.
     """
 
-    def __init__(self, expected: Expected, *, gapless: bool, batch: int = 0) -> None:
+    def __init__(
+        self,
+        expected: Expected,
+        *,
+        gapless: bool,
+        batch: int = 0,
+        definitions: Sequence[Record] = (),
+    ) -> None:
         self.expected = expected
+        self.definitions = definitions
         self.metadata: dict[str, str] | None = None
         self.header: ArchiveHeader | None = None
         self.unusable: HeaderError | None = None
@@ -116,7 +156,7 @@ class Scan(ABC):
         self._size = 0  # of their content [bytes]
         self._place = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
-        self._numbers: frozenset[str] = frozenset()
+        self._numbers: set[str] = set()
         self._newest = -1  # stamp of a cycle [ns]
 
     @property
@@ -132,31 +172,41 @@ class Scan(ABC):
             Damage: they cannot be used; then nothing of them counts.
         """
 
+    def missing(self, topics: Collection[str], offset: int) -> None:  # noqa: ARG002
+        """Messages of these topics are missing before those of the chunk at `offset`.
+
+        Raises:
+            Damage: that is the end.
+        """
+        if self._gapless and not self.expected.repaired:
+            reason = "(chunk) does not continue the one before it: a chunk is missing"
+            raise Damage(offset, reason)
+
     def take(self, record: Record) -> None:
         """Verify the next record, and take what it holds.
 
         Raises:
             Damage: it is not one that was written, or not the next.
         """
+        offset = record.offset
         if record.opcode == container.CHUNK:
             if self.metadata is not None:  # else some other MCAP file
                 head = container.chunk(record)
-                data = container.chunk_data(head, record.offset)
-                self._check_order(head.uncompressed_crc, record.offset)
-                self._waiting.append((record.offset, data))
+                data = container.chunk_data(head, offset)
+                self._check_order(head.uncompressed_crc, offset)
+                self._waiting.append((offset, data))
                 self._size += len(data)
                 if self._size >= self._batch:
                     self.flush()
         elif record.opcode == container.ATTACHMENT:
             attachment = container.attachment(record)
-            name = attachment.name
-            if name in self.attachments:
-                raise Damage(record.offset, f"(attachment {name!r}) is there a second time")
-            self.attachments[name] = attachment.data
+            if attachment.name in self.attachments:
+                raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
+            self.attachments[attachment.name] = attachment.data
         elif record.opcode == container.METADATA:
             self._take_metadata(record)
         else:
-            self.parser.known.take(record)
+            self.parser.define(record)
 
     def flush(self) -> None:
         """Decode the chunks that wait: all at once, or one by one where that fails.
@@ -185,32 +235,18 @@ class Scan(ABC):
         if outcome is None:
             yield "outcome", "the outcome is missing"
             return
-        counts = {"samples": NUMBERS, "events": (schema.EVENTS,)}
-        if "packets" in outcome.record:
-            counts["packets"] = (schema.PACKETS,)
+        found: dict[str, tuple[int | None, int]] = {}
+        counts = {"samples": NUMBERS, "events": (schema.EVENTS,), "packets": (schema.PACKETS,)}
         for key, topics in counts.items():
-            if self.topics is None or not set(topics).isdisjoint(self.topics):
-                stated = getattr(outcome, key)
+            known = key != "packets" or key in outcome.record
+            if known and (self.topics is None or not set(topics).isdisjoint(self.topics)):
                 count = max(self.counts.get(topic, 0) for topic in topics)
-                if stated != count:
-                    yield "outcome", f"{stated} {key} were written, {count} are there"
-        chunks = self.expected.chunks
-        if chunks is not None and len(chunks) != self.chunks:
-            yield "outcome", f"{len(chunks)} chunks were written, {self.chunks} are there"
-
-    def missing(self, gaps: Mapping[str, int], offset: int) -> None:  # noqa: ARG002
-        """So many messages are missing before those of the chunk at `offset`, by topic.
-
-        Raises:
-            Damage: that is the end.
-        """
-        if self._gapless and not self.expected.repaired:
-            reason = "(chunk) does not continue the one before it: a chunk is missing"
-            raise Damage(offset, reason)
-
-    def numbered(self, data: bytes, offset: int) -> dict[int, Messages]:
-        """The messages of a chunk by channel; a scan may know more channels than those so far."""
-        return self.parser.messages(data, offset)
+                found[key] = getattr(outcome, key), count
+        if self.expected.chunks is not None:
+            found["chunks"] = len(self.expected.chunks), self.chunks
+        for key, (stated, count) in found.items():
+            if stated != count:
+                yield "outcome", f"{stated} {key} were written, {count} are there"
 
     def _take_metadata(self, record: Record) -> None:
         """Take header or outcome; another record's name is passed over."""
@@ -243,7 +279,7 @@ class Scan(ABC):
             return
         places = np.flatnonzero(chunks == crc)
         if not len(places) or places[-1] < self._place:
-            why = "stands behind one that followed it" if len(places) else "is of another recording"
+            why = "comes after one that followed it" if len(places) else "is of another recording"
             raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
         if self._gapless:
             raise Damage(offset, "(chunk) does not continue the one before")
@@ -251,35 +287,38 @@ class Scan(ABC):
 
     def _decode(self, data: bytes, offset: int) -> None:
         """Take messages that must be the next of their channels; else nothing of them counts."""
-        known = KnownChannels(self.parser.known)
+        parser = self.parser
+        before = dict(parser.schemas), dict(parser.channels)
         try:
-            found = self.parser.by_topic(self.numbered(data, offset), offset)
-            verified = {
-                topic: messages
-                for topic, messages in found.items()
-                if self.topics is None or topic in self.topics
-            }
-            numbers = frozenset(topic for topic in found if topic in NUMBERS)
-            if numbers and self._numbers not in (frozenset(), numbers):
+            by_number = parser.messages(data, offset)
+            if not by_number.keys() <= parser.channels.keys():
+                for definition in self.definitions:
+                    parser.define(definition)
+            if unknown := by_number.keys() - parser.channels.keys():
+                raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
+            found = {parser.channels[number].topic: one for number, one in by_number.items()}
+            wanted = found.keys() if self.topics is None else self.topics
+            numbers = found.keys() & set(NUMBERS)
+            if numbers and self._numbers not in (set(), numbers):
                 reason = "(chunk) has samples in other channels than those before"
                 raise Damage(offset, reason)
-            gaps = self._check_sequences(verified, offset)
+            verified = {topic: one for topic, one in found.items() if topic in wanted}
+            missing = self._check_sequences(verified, offset)
             newest = self._check_times(verified, offset)
-            if any(gaps.values()):
-                self.missing(gaps, offset)
+            if missing:
+                self.missing(missing, offset)
             self.visit(found, offset)
         except Damage:
-            self.parser.known = known  # what it says goes with it
+            parser.schemas, parser.channels = before  # what it says goes with it
             raise
-        self._newest = self._newest if newest is None else newest
+        self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
         for topic, messages in verified.items():
-            ahead = self._next.get(topic, 0) + gaps[topic] + len(messages)
-            self._next[topic] = ahead % _SEQUENCES
+            self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
 
-    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> dict[str, int]:
-        """Check that messages continue those before; how many are missing between, by topic."""
+    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> list[str]:
+        """Check that messages do not repeat those before; topics of which some are missing."""
         gaps = {}
         for topic, messages in found.items():
             sequence = messages.of_heads("sequence")
@@ -288,29 +327,28 @@ class Scan(ABC):
             gaps[topic] = (int(sequence[0]) - self._next.get(topic, 0)) % _SEQUENCES
             if gaps[topic] > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages that were before")
-        samples = {(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}
-        if len(samples) > 1:
+        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
-        return gaps
+        return [topic for topic, gap in gaps.items() if gap]
 
-    def _check_times(self, found: Mapping[str, Messages], offset: int) -> int | None:
+    def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles follow those before and are of this recording.
 
         Where there are no cycles, all channels must have the same times. Returns the newest stamp
-        [ns], None without cycles.
+        [ns], -1 without cycles.
         """
         samples = [topic for topic in found if topic in NUMBERS]
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples
         if not timed:
-            return None
+            return -1
         stamps = [found[topic].stamps for topic in timed]
+        stamp = stamps[0]
         if not all(map(len, stamps)):
             raise Damage(offset, "(chunk) has messages without a stamp")
-        stamp = stamps[0]
         if not all(np.array_equal(one, stamp) for one in stamps):
             raise Damage(offset, "(chunk) has channels of different times")
-        if timed[0] not in schema.PER_CYCLE or schema.CYCLE not in self.parser.known.topics:
-            return None
+        if timed[0] not in schema.PER_CYCLE or schema.CYCLE not in self.parser.topics:
+            return -1
         if (np.diff(stamp) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not grow")
         first, last = self.expected.ends or (int(stamp[0]), int(stamp[-1]))
@@ -321,36 +359,3 @@ class Scan(ABC):
         if stamp[0] <= self._newest:
             raise Damage(offset, "(chunk) has cycles that do not follow those before")
         return int(stamp[-1])
-
-
-def _is_ours(stream: BinaryIO, size: int) -> bool:
-    """Whether the header says that the file was written by us."""
-    stream.seek(0)
-    try:
-        header = next(container.records(stream, size, check_end=False))
-        is_header = header.opcode == container.HEADER
-        return is_header and container.parsed(Header, header).library == schema.LIBRARY
-    except Damage:
-        return False
-
-
-def _records_of_ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
-    """The first of each of our two metadata records that passes its checksum."""
-    found: dict[str, dict[str, str]] = {}
-    try:
-        for record in records:
-            name, entries = container.metadata(record)
-            claimed = entries.pop("checksum", None)
-            if name in (METADATA, OUTCOME) and claimed == checksum(entries):
-                found.setdefault(name, entries)
-    except Damage:
-        pass  # what comes behind it cannot be found this way
-    return found
-
-
-def _indexed(stream: BinaryIO, summary: Summary) -> Iterator[Record]:
-    """Metadata records where the summary says that they are."""
-    for place in summary.metadata:
-        record = container.record_at(stream, *place)
-        if record.opcode == container.METADATA:
-            yield record

@@ -18,7 +18,6 @@ from hil.reading import opened
 
 LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usual are one to sixteen million."""
-_BUT_CHUNKS: Final = container.EVERY_OPCODE - {container.CHUNK}
 
 
 def check_sizes(stream: BinaryIO) -> None:
@@ -32,7 +31,7 @@ def check_sizes(stream: BinaryIO) -> None:
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     begun = set()
-    for record in container.records(stream, size, skip=_BUT_CHUNKS, check_end=False):
+    for record in container.records(stream, size, only=(container.CHUNK,), check_end=False):
         head = container.chunk(record)
         container.decompressed(head, record.offset, largest=LARGEST_CHUNK)
         begun.add(record.offset)

@@ -98,7 +98,7 @@ class Indexed:
             return
         head, parser = container.chunk(item), ChunkParser()
         found = parser.messages(container.chunk_data(head, item.offset), item.offset)
-        for definition in parser.known.definitions:
+        for definition in parser.definitions:
             self._writer.note(definition)
         self._writer.add_chunk(head, entries_of(found))
 
