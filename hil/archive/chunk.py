@@ -22,6 +22,7 @@ from hil.archive import container
 from hil.archive.container import Damage, Record
 
 Bytes = NDArray[np.uint8]
+Content = bytes | memoryview
 
 HEAD = np.dtype(
     [
@@ -70,8 +71,9 @@ class Messages:
         """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
         if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
             return np.zeros(0, np.int64)
-        stamp = np.concatenate([part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts])
-        return np.asarray(stamp["sec"] * np.int64(10**9) + stamp["nanosec"])
+        found = [part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts]
+        stamps = [stamp["sec"] * np.int64(10**9) + stamp["nanosec"] for stamp in found]
+        return stamps[0] if len(stamps) == 1 else np.concatenate(stamps)
 
     def all(self) -> list[bytes]:
         """The data of each message."""
@@ -134,7 +136,7 @@ class ChunkParser:
         if again:
             raise Damage(record.offset, f"announces {again} a second time, as another")
 
-    def messages(self, chunk: bytes, offset: int) -> dict[int, Messages]:
+    def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
         """The messages of a chunk by channel; of several chunks that follow each other likewise.
 
         Args:
@@ -145,7 +147,7 @@ class ChunkParser:
             Damage: the chunk does not hold whole records, or definitions that fit one another.
         """
         found: dict[int, Messages] = {}
-        recent: deque[bytes] = deque(maxlen=_LONGEST_PATTERN)
+        recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)
         at = 0
         while at < len(chunk):
             rows = self._repeated(chunk, at)
@@ -170,13 +172,14 @@ class ChunkParser:
                 messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
                 messages.places.append(np.array([at]))
             else:
-                self.define(Record(offset, opcode, chunk[at + container.RECORD.size : end]))
+                body = bytes(chunk[at + container.RECORD.size : end])
+                self.define(Record(offset, opcode, body))
             at = end
         return found
 
-    def _repeated(self, chunk: bytes, at: int) -> Bytes:
+    def _repeated(self, chunk: Content, at: int) -> Bytes:
         """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
-        if not self._round or not chunk.startswith(self._begin, at):
+        if not self._round or chunk[at : at + _FIXED.size] != self._begin:
             return np.zeros((0, 0), np.uint8)
         size = self._round[-1][1].stop
         count = (len(chunk) - at) // size
@@ -184,7 +187,7 @@ class ChunkParser:
         same = (rows[:, self._fixed] == self._expected).all(axis=1)
         return rows if same.all() else rows[: int(same.argmin())]
 
-    def _learn(self, heads: Sequence[bytes]) -> bool:
+    def _learn(self, heads: Sequence[Content]) -> bool:
         """Take one round of heads for the pattern, if it is new and no channel comes twice."""
         _, lengths, channels = zip(*map(_FIXED.unpack, heads), strict=True)
         ends = np.cumsum([container.RECORD.size + length for length in lengths]).tolist()
@@ -192,7 +195,7 @@ class ChunkParser:
         new = [*zip(channels, map(slice, begins, ends), strict=True)]
         if len(set(channels)) < len(channels) or new == self._round:
             return False
-        self._round, self._begin = new, heads[0]
+        self._round, self._begin = new, bytes(heads[0])
         self._fixed = np.add.outer(begins, np.arange(_FIXED.size)).ravel()
         self._expected = np.frombuffer(b"".join(heads), np.uint8)
         return True

@@ -139,7 +139,7 @@ def encoded(record: McapRecord) -> bytes:
     return bytes(builder.end())
 
 
-def bounds(data: bytes, at: int, offset: int) -> tuple[int, int]:
+def bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, int]:
     """Opcode and end of the record at `at`, in a chunk or summary at `offset` of the file.
 
     Raises:

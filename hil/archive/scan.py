@@ -21,7 +21,7 @@ from mcap.records import Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
-from hil.archive.chunk import ChunkParser, Messages
+from hil.archive.chunk import ChunkParser, Content, Messages
 from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import (
     METADATA,
@@ -151,9 +151,8 @@ class Scan(ABC):
         self.counts: dict[str, int] = {}
         self.chunks = 0
         self._gapless = gapless
-        self._batch = batch
-        self._waiting: list[tuple[int, bytes]] = []  # offset and content of chunks
-        self._size = 0  # of their content [bytes]
+        self._buffer = memoryview(bytearray(batch))  # content of the chunks that wait
+        self._waiting: list[tuple[int, slice]] = []  # offset of each, and its place in the buffer
         self._place = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
@@ -194,10 +193,7 @@ class Scan(ABC):
                 head = container.chunk(record)
                 data = container.chunk_data(head, offset)
                 self._check_order(head.uncompressed_crc, offset)
-                self._waiting.append((offset, data))
-                self._size += len(data)
-                if self._size >= self._batch:
-                    self.flush()
+                self._take_chunk(data, offset)
         elif record.opcode == container.ATTACHMENT:
             attachment = container.attachment(record)
             if attachment.name in self.attachments:
@@ -214,17 +210,30 @@ class Scan(ABC):
         Raises:
             Damage: one of them does not follow those before.
         """
-        waiting, self._waiting, self._size = self._waiting, [], 0
+        waiting, self._waiting = self._waiting, []
         if len(waiting) > 1:
             try:
-                self._decode(b"".join(data for _, data in waiting), waiting[0][0])
+                self._decode(self._buffer[: waiting[-1][1].stop], waiting[0][0])
                 self.chunks += len(waiting)
                 return
             except Damage:
                 pass  # in one of them
-        for offset, data in waiting:
+        for offset, place in waiting:
+            self._decode(self._buffer[place], offset)
+            self.chunks += 1
+
+    def _take_chunk(self, data: bytes, offset: int) -> None:
+        """Decode the content of a chunk, or have it wait for others."""
+        begin = self._waiting[-1][1].stop if self._waiting else 0
+        if begin + len(data) > len(self._buffer):
+            self.flush()
+            begin = 0
+        if len(data) > len(self._buffer):
             self._decode(data, offset)
             self.chunks += 1
+        else:
+            self._waiting.append((offset, slice(begin, begin + len(data))))
+            self._buffer[begin : begin + len(data)] = data
 
     def shortfalls(self) -> Iterator[tuple[str, str]]:
         """What the file says that it holds and does not: aspect of the profile, and sentence."""
@@ -285,7 +294,7 @@ class Scan(ABC):
             raise Damage(offset, "(chunk) does not continue the one before")
         self._place = int(places[-1]) + 1
 
-    def _decode(self, data: bytes, offset: int) -> None:
+    def _decode(self, data: Content, offset: int) -> None:
         """Take messages that must be the next of their channels; else nothing of them counts."""
         parser = self.parser
         before = dict(parser.schemas), dict(parser.channels)
