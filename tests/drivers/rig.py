@@ -277,8 +277,10 @@ class Rig:
             self.packet()
             self.now += self.period
 
-    def cycle(self, count: int = 1) -> CyclicPacket | None:
-        """Whole cycles; the answer to the last of them."""
+    def cycle(self, count: int = 1, *, mode=None, status=None) -> CyclicPacket | None:
+        """Whole cycles, in this mode and with this status from now on; the last answer."""
+        self.modes = self.modes if mode is None else mode
+        self.status = self.status if status is None else status
         answer = None
         for _ in range(count):
             reply = self.send(self.packet())
@@ -303,24 +305,26 @@ class Rig:
         """To closed axes, drive on."""
         if self.number < 10:
             self.start()
-        self.modes = Mode.CLOSED
-        return self.cycle()
+        return self.cycle(mode=Mode.CLOSED)
 
     def open(self) -> CyclicPacket | None:
         """Through closed into open mode, all axes at once."""
         self.close()
-        self.modes = self.mode
-        return self.cycle()
+        return self.cycle(mode=self.mode)
 
     def run(self, cycles: int = 2000) -> None:
         """Obey until the session asks for the end of open mode, then leave it."""
         for _ in range(cycles):
             self.cycle()
             if self.exits_asked:
-                self.modes = Mode.CLOSED
-                self.cycle()
+                self.cycle(mode=Mode.CLOSED)
                 return
         raise AssertionError(f"no end of open mode asked for in {cycles} cycles")
+
+    def run_to(self, outcome: str) -> None:
+        """To the end of open mode, and that outcome of the motion."""
+        self.run()
+        assert self.ended.outcome == outcome
 
     def seen(self, kind):
         return [event for event in self.events if isinstance(event, kind)]
@@ -345,12 +349,40 @@ class Rig:
         return self.ring.last(self.ring.capacity)
 
 
-def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
+def started(**options) -> Rig:
+    """After the hand-shake."""
     rig = Rig(**options)
-    source = Cruise()
+    rig.start()
+    return rig
+
+
+def closed(**options) -> Rig:
+    """With closed axes and the drive on."""
+    rig = Rig(**options)
+    rig.close()
+    return rig
+
+
+def opened(cycles: int = 0, **options) -> Rig:
+    """In open mode without a motion, for so many cycles more."""
+    rig = Rig(**options)
+    rig.open()
+    rig.cycle(cycles)
+    return rig
+
+
+def running(source, cycles: int = 0, **options) -> Rig:
+    """In open mode, so many cycles after the first set-point of a motion."""
+    rig = Rig(**options)
     rig.session.request(source)
     rig.open()
     rig.cycle(cycles)
+    return rig
+
+
+def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
+    source = Cruise()
+    rig = running(source, cycles, **options)
     assert rig.state is State.OPEN
     return rig, source
 

@@ -146,16 +146,6 @@ def test_one_lost_frame_costs_one_cycle_and_is_counted(profile, data):
     assert wire.near.discarded == {"torn": 1}
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_frames_that_come_twice_change_nothing(profile):
-    wire, packets, frames = sent_cycles(profile, 2, 11, 10)
-    out = []
-    for time, frame in frames:
-        out += [wire.near.receive(frame, time), wire.near.receive(frame, time)]
-    assert len([packet for packet in out if packet is not None]) == len(packets)
-    assert not wire.near.discarded
-
-
 def test_a_counter_that_has_come_round_is_not_taken_for_the_same_cycle():
     """Classic frames carry four bits of the number: sixteen cycles later they are the same."""
     wire, _, frames = sent_cycles("classic", 3, 11, 17)

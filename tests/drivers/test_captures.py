@@ -18,12 +18,10 @@ from drivers import (
     CycleRing,
     CyclicPacket,
     DriveTrain,
-    FollowingError,
     Guard,
     GuardLimits,
     InitPacket,
     MotionEnded,
-    MotionNotCarriedOn,
     NotAtStandstill,
     Refused,
     Session,
@@ -31,11 +29,6 @@ from drivers import (
     VelocityLimit,
 )
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, echo, is_init
-from drivers.record import PacketRing
-from drivers.transports.simulated import SimulatedTransport
-from drivers.transports.tapped import TappedTransport
-from hil.archive import ArchiveWriter, open_archive
-from hil.archive.schema import PACKETS
 from tests.drivers import oracle
 from tests.drivers.captures import CAPTURES, capture_path, conversation, read_datagrams
 from tests.drivers.rig import Table
@@ -467,170 +460,3 @@ def test_sync_and_init_answers_of_the_foreign_program_are_echoes(shared_data: Pa
             assert echo(packet) == reply == oracle.echo(packet)
         elif reply is not None:
             assert struct.unpack_from("<i", reply)[0] == oracle.answer_number(number)
-
-
-class Replayed:
-    """A controller that sends what was captured and hears what was answered."""
-
-    period = 0.001
-
-    def __init__(self, packets: list[bytes]) -> None:
-        self._packets = iter(packets)
-
-    def next_packet(self) -> bytes | None:
-        return next(self._packets, None)
-
-    def accept(self, reply: bytes | None) -> None:
-        pass
-
-
-def archived(path: Path, pairs: list[tuple[bytes, bytes | None]]) -> list[tuple[bool, bytes]]:
-    """The packets of a conversation after a while in an archive: whether sent, and bytes."""
-    ring, cycle = PacketRing(2 * len(pairs)), 0
-    link = TappedTransport(SimulatedTransport(Replayed([p for p, _ in pairs])), ring, lambda: cycle)
-    for _, answer in pairs:
-        link.receive(1.0)
-        if answer is not None:
-            link.send(answer)
-        link.settle()
-        cycle += 1
-    with ArchiveWriter(
-        path, joint_names=["a"], period=0.001, metadata={}, durable=False, packets=True
-    ) as archive:
-        archive.add_packets(ring.drain())
-        archive.flush()
-        archive.close("completed")
-    columns = open_archive(path, topics=[PACKETS]).columns
-    return [
-        (bool(sent), data[:length].tobytes())
-        for sent, data, length in zip(
-            *(columns[name] for name in ("sent", "data", "length")), strict=True
-        )
-    ]
-
-
-@pytest.mark.parametrize("name", CAPTURES)
-def test_bytes_and_values_are_those_of_the_capture(
-    tmp_path: Path, shared_data: Path, name: str
-) -> None:
-    pairs = conversation(shared_data, name)
-    packets = archived(tmp_path / "excitation_000_a1.mcap", pairs)
-    expected = [
-        (sent, data) for pair in pairs for sent, data in enumerate(pair) if data is not None
-    ]
-    assert packets == expected
-    n = 7 if name == SEVEN_AXES else InitPacket.decode(_init(pairs)).n_axes
-    for _, data in packets:
-        if len(data) == INIT_LENGTH:
-            continue
-        packet, theirs = CyclicPacket.decode(data, n), oracle.parse(data, n)
-        assert packet.number == theirs.number
-        for axis, their in zip(packet.axes, theirs.axes, strict=True):
-            assert axis["mode"] == their.mode
-            values = np.concatenate([axis["d"], axis["extra"]])
-            assert values.tobytes() == b"".join(their.d)
-
-
-def _init(pairs: list[tuple[bytes, bytes | None]]) -> bytes:
-    return next(packet for packet, _ in pairs if len(packet) == INIT_LENGTH)
-
-
-FOLLOWING_ERROR = 0.05
-"""Motor revolutions, in the cell: narrower than what these controllers announce."""
-
-
-class Holding:
-    """The documented answers of a PC that holds the target received when the last axis opened."""
-
-    def __init__(self) -> None:
-        self.held: np.ndarray | None = None
-        self.offending: int | None = None
-        self.let_go = False
-
-    def expected(self, received: oracle.Packet) -> oracle.Packet:
-        answer = oracle.safe_answer(received, (1,) * len(received.axes))
-        is_open = [axis.mode in oracle.OPEN for axis in received.axes]
-        if received.status[0] != oracle.DRIVE_ON or not any(is_open):
-            self.held = self.offending = None
-            self.let_go = False
-            return answer
-        if not all(is_open):
-            return answer
-        d = np.array([axis.floats for axis in received.axes])
-        if self.held is None:
-            self.held = d[:, 0]
-        away = np.abs(d[:, 2] - self.held) > FOLLOWING_ERROR
-        away |= np.abs(d[:, 2] - d[:, 0]) > FOLLOWING_ERROR
-        if self.offending is None and not self.let_go and away.any():
-            self.offending = int(np.argmax(away))
-        elsewhere = np.abs(d[:, 0] - self.held) > 0.1 * FOLLOWING_ERROR
-        self.let_go = self.let_go or (self.offending is None and bool(elsewhere.any()))
-        axes = list(answer.axes)
-        if self.let_go:
-            axes = [replace_mode(axis, oracle.DRIVE_OFF_REQUEST) for axis in axes]
-        elif self.offending is not None:
-            axes[self.offending] = replace_mode(axes[self.offending], oracle.FOLLOWING_ERROR)
-        else:
-            axes = [
-                oracle.Axis(axis.mode, (struct.pack("<f", held), *(oracle.ZERO,) * 7))
-                for axis, held in zip(axes, self.held, strict=True)
-            ]
-        return answer._replace(axes=tuple(axes))
-
-
-def idle_replay(shared_data: Path, name: str) -> Replay:
-    replay = replay_of(shared_data, name, following_error=FOLLOWING_ERROR)
-    replay.requested = True  # as far as the replay knows, so that it asks for nothing
-    return replay
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_without_a_motion_the_first_target_is_held_until_the_arm_has_left_it_too_far(
-    shared_data: Path, name: str
-):
-    replay, holding = idle_replay(shared_data, name), Holding()
-    for packet, _ in replay.pairs:
-        ours = replay.feed(packet)
-        if len(packet) == INIT_LENGTH or replay.session.state in (State.SYNC, State.INIT):
-            assert ours == oracle.echo(packet)
-            continue
-        expected = holding.expected(oracle.parse(packet, 6))
-        assert oracle.differences(oracle.parse(ours, 6), expected) == [], expected.number
-    refused = replay.seen(Refused)
-    assert all(isinstance(e.error, FollowingError | MotionNotCarriedOn) for e in refused)
-    # Their target leaves the one held at once; the arm follows later.
-    assert refused
-
-
-@pytest.mark.parametrize("name", [name for name in CAPTURES if not name.startswith("s_")])
-def test_every_foreign_packet_gets_exactly_one_answer_of_the_right_shape(
-    shared_data: Path, name: str
-):
-    replay = Replay(conversation(shared_data, name), 5 if name == "b_ufmg_literal" else 6)
-    replay.requested = True
-    session = replay.session
-    for index, (packet, _) in enumerate(replay.pairs):
-        assert session.state is not State.ENDED, index
-        reply = replay.feed(packet)
-        assert reply is not None
-        number = struct.unpack_from("<i", packet)[0]
-        assert struct.unpack_from("<i", reply)[0] == oracle.answer_number(number)
-        started = session.init is not None and session.state is not State.INIT
-        assert len(reply) == (oracle.length(session.init.n_axes) if started else len(packet))
-    assert session.state is State.ENDED
-    again = oracle.parse(replay.pairs[-1][0], replay.n)
-    assert replay.feed(oracle.build(again._replace(number=again.number + 1))) is None
-    assert session.counters.malformed == session.counters.stale == 0
-    assert session.counters.ended == 1
-
-
-def test_the_answers_compared_here_are_not_all_alike(shared_data: Path):
-    """The reference itself tells held from let go: its answers to one capture differ in kind."""
-    holding, kinds = Holding(), set()
-    for packet, _ in conversation(shared_data, "a_mode4"):
-        if len(packet) == oracle.length(6):
-            received = oracle.parse(packet, 6)
-            expected = holding.expected(received)
-            same = fields(oracle.differences(expected, received)) - {"number"}
-            kinds.add((expected.axes[0].mode, *sorted(same)))
-    assert len(kinds) >= 4, kinds

@@ -135,23 +135,6 @@ def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_
         assert exchange.wait(30.0) == 0
 
 
-def test_one_process_runs_one_motion_after_the_other():
-    with running() as (exchange, controller):
-        ended = []
-        for _ in range(3):
-            start = controller.train.joint_position(controller.axes["d"][:, 0].astype(float))
-            exchange.submit(smooth_move(MOVE / 10, 150, start))
-            controller.open = True
-            controller.until(lambda: not controller.open)
-            controller.cycle(2)
-            ended += [event for event in exchange.events() if isinstance(event, MotionEnded)]
-        assert [(event.outcome, event.interval) for event in ended] == [
-            ("completed", 0),
-            ("completed", 1),
-            ("completed", 2),
-        ]
-
-
 def test_a_program_of_many_megabytes_is_handed_over_between_packets():
     with running() as (exchange, controller):
         controller.cycle(5)
@@ -411,15 +394,6 @@ class TestHold:
             exchange.stop()
             controller.until(lambda: not controller.open)
             controller.assert_stopped_on_its_path(PERIOD)
-
-    def test_a_motion_that_cannot_rest_is_stopped(self):
-        with running() as (exchange, controller):
-            set_going(exchange, controller)
-            exchange.hold()
-            controller.until(lambda: not controller.open)
-            controller.cycle(3)
-            controller.assert_stopped_on_its_path(PERIOD)
-            assert the(MotionEnded, exchange.events()).outcome == "stopped"
 
 
 class TestStops:

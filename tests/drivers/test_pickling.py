@@ -27,7 +27,7 @@ from drivers.errors import (
 from drivers.packets import InitPacket
 from drivers.record import cycle_dtype
 from drivers.states import State
-from tests.drivers.rig import Cruise, Rig, init_packet, moving, still
+from tests.drivers.rig import Cruise, Rig, init_packet, moving, running, still
 
 EXAMPLES = {
     DriverError: DriverError("anything"),
@@ -165,9 +165,7 @@ def test_the_cause_of_a_failed_source_is_in_its_message():
 
         advance = stop = begin
 
-    rig = Rig()
-    rig.session.request(Broken())
-    rig.open()
+    rig = running(Broken())
     assert "StopIteration" in str(through_pickle(rig.refusal))
 
 

@@ -27,8 +27,11 @@ from tests.drivers.rig import (
     Rig,
     all_drive_off,
     assert_refused,
+    closed,
     limits,
     moving,
+    opened,
+    running,
     smooth_move,
 )
 
@@ -45,9 +48,7 @@ def player(start=START) -> TrajectoryPlayer:
 
 
 def playing(cycles: int = 60) -> Rig:
-    rig = Rig()
-    rig.session.request(player())
-    rig.open()
+    rig = running(player())
     rig.cycle(cycles)
     assert rig.state is State.OPEN
     return rig
@@ -58,14 +59,16 @@ def nothing(self):
 
 
 def held_before_it_began() -> Rig:
-    rig = Rig()
-    rig.close()
+    rig = closed()
     rig.session.request(player())
     rig.session.hold()
     rig.cycle()
     rig.open()
     rig.cycle(10)
     return rig
+
+
+FAR = limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0))
 
 
 class IgnoresHold(Cruise):
@@ -90,8 +93,7 @@ class TestHold:
         rig.session.resume()
         rig.cycle(20)
         assert not at_rest(rig)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
         end = rig.train.joint_position(rig.axes["d"][:, 0])
         np.testing.assert_allclose(end, START + WAY, atol=1e-6)
 
@@ -101,8 +103,7 @@ class TestHold:
         rig.session.hold()
         rig.cycle(cycles)
         rig.session.stop()
-        rig.run()
-        assert rig.ended.outcome == "stopped"
+        rig.run_to("stopped")
 
     def test_a_hold_may_be_changed_of_ones_mind_about(self):
         rig = playing()
@@ -111,8 +112,7 @@ class TestHold:
             rig.cycle(cycles)
             rig.session.resume()
             rig.cycle(cycles)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     def test_an_override_after_a_hold_does_not_take_its_bounds_back(self):
         rig = playing()
@@ -120,8 +120,7 @@ class TestHold:
         rig.cycle(10)
         rig.session.override(0.5)
         rig.session.resume()
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     def test_one_that_cannot_hold_is_stopped_on_its_path(self):
         rig, source = moving()
@@ -135,11 +134,8 @@ class TestHold:
         def fails(self):
             raise SystemExit("no")
 
-        rig = Rig()
         source = type("Odd", (Cruise,), {"hold": fails, "resume": fails})()
-        rig.session.request(source)
-        rig.open()
-        rig.cycle(300)
+        rig = running(source, 300)
         with pytest.raises(RequestError, match="SystemExit: no"):
             rig.session.resume()
         rig.session.hold()
@@ -156,21 +152,18 @@ class TestHold:
         assert rig.state is State.OPEN
         assert rig.ended is None
         rig.session.resume()
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
         end = rig.train.joint_position(rig.axes["d"][:, 0])
         np.testing.assert_allclose(end, START + WAY, atol=1e-6)
 
     def test_a_stop_ends_one_that_was_held_before_it_began(self):
         rig = held_before_it_began()
         rig.session.stop()
-        rig.run()
-        assert rig.ended.outcome == "stopped"
+        rig.run_to("stopped")
         assert not np.nan_to_num(rig.records["commanded_velocity"]).any()
 
     def test_one_that_was_held_and_released_before_it_began_does_not_rest(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.session.request(player())
         rig.session.hold()
         rig.session.resume()
@@ -179,8 +172,7 @@ class TestHold:
         assert not at_rest(rig)
 
     def test_one_that_cannot_hold_and_has_not_begun_is_dropped(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.session.request(Cruise())
         rig.session.hold()
         rig.cycle()
@@ -212,8 +204,7 @@ class TestHold:
         assert rig.seen(HoldChanged) == [HoldChanged(True, cycle - 20), HoldChanged(False, cycle)]
 
     def test_needs_a_motion_and_keeps_nothing_for_one_to_come(self):
-        rig = Rig()
-        rig.open()
+        rig = opened()
         with pytest.raises(RequestError, match="no hold can be requested in state 'open'"):
             rig.session.hold()
         rig.session.request(player())
@@ -222,11 +213,10 @@ class TestHold:
         assert not at_rest(rig)
 
     def test_a_source_that_does_nothing_is_stopped(self):
-        rig = Rig(guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0)))
         source = IgnoresHold()
-        rig.session.request(source)
-        rig.open()
-        rig.cycle(300)
+        rig = running(
+            source, 300, guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0))
+        )
         rig.session.hold()
         rig.cycle(2000)
         rig.session.hold()
@@ -234,31 +224,16 @@ class TestHold:
         assert source.stops == 0
         rig.cycle()
         assert source.stops == 1
-        rig.run()
-        assert rig.ended.outcome == "stopped"
+        rig.run_to("stopped")
         assert rig.ended.reason == "it did not come to rest in 5000 cycles of a hold"
-
-    def test_one_that_was_resumed_in_time_is_not(self):
-        rig = Rig(guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0)))
-        source = IgnoresHold()
-        rig.session.request(source)
-        rig.open()
-        rig.cycle(300)
-        rig.session.hold()
-        rig.cycle(4000)
-        rig.session.resume()
-        rig.cycle(2000)
-        assert source.stops == 0
 
 
 class TestHoldOfCorrections:
     """Nobody names their bounds: those of a stop are granted from hold until rest."""
 
     def corrected(self, rows, hold_at: int):
-        rig = Rig(mode=Mode.VELOCITY)
         source = type("Held", (Correction,), {"hold": nothing, "resume": nothing})(rows)
-        rig.session.request(source)
-        rig.open()
+        rig = running(source, mode=Mode.VELOCITY)
         rig.cycle(hold_at)
         assert rig.state is State.OPEN
         rig.session.hold()
@@ -342,10 +317,7 @@ class TestSourcesThatRaiseAnything:
 
         for name in ("override", "hold", "resume"):
             parts = {"hold": nothing, "resume": nothing, name: property(fails)}
-            rig = Rig()
-            rig.session.request(source := type("Odd", (Cruise,), parts)())
-            rig.open()
-            rig.cycle(50)
+            rig = running(source := type("Odd", (Cruise,), parts)(), 50)
             if name == "hold":
                 rig.session.hold()
                 rig.cycle()
@@ -362,10 +334,7 @@ class TestSourcesThatRaiseAnything:
         def fails(self, fraction):
             raise Unspeakable
 
-        rig = Rig()
-        rig.session.request(type("Odd", (Cruise,), {"override": fails})())
-        rig.open()
-        rig.cycle(5)
+        rig = running(type("Odd", (Cruise,), {"override": fails})(), 5)
         with pytest.raises(RequestError, match="Unspeakable, whose message"):
             rig.session.override(0.5)
         rig.cycle(5)
@@ -387,8 +356,7 @@ def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):
 
 class TestRequestAfterAStop:
     def test_none_is_taken_before_open_mode_was_left(self):
-        rig = Rig()
-        rig.open()
+        rig = opened()
         rig.session.stop()
         with pytest.raises(RequestError, match="being left"):
             rig.session.request(smooth_move(WAY, 300))
@@ -398,12 +366,10 @@ class TestRequestAfterAStop:
         rig.exits_asked = 0
         rig.session.request(smooth_move(WAY, 300))
         rig.open()
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     def test_none_is_taken_while_axes_open(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.axes["mode"][: N - 1] = 4
         rig.cycle()
         rig.session.stop()
@@ -430,13 +396,6 @@ class Overridable(GoesOn):
 def accelerating(acceleration: float, cycles: int = 40) -> np.ndarray:
     t = np.arange(cycles)[:, None] * PERIOD
     return START + 0.5 * acceleration * t**2 * np.array([0, 1, 0, 0, 0, 0])
-
-
-def running(source, **options) -> Rig:
-    rig = Rig(**options)
-    rig.session.request(source)
-    rig.open()
-    return rig
 
 
 def test_the_source_is_told():
@@ -543,5 +502,4 @@ class TestRefused:
         rig = running(Stubborn(np.tile(START, (20, 1))))
         with pytest.raises(RequestError, match="ZeroDivisionError: not now"):
             rig.session.override(0.5)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")

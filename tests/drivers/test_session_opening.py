@@ -20,6 +20,7 @@ from tests.drivers.rig import (
     Cruise,
     N,
     Rig,
+    closed,
     init_packet,
     limits,
     smooth_move,
@@ -102,11 +103,9 @@ class TestFirstSetPoint:
         assert error.value == pytest.approx(2.01, abs=1e-5)
 
     def test_the_rule_holds_without_a_motion_too(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.axes["d"][0, 2] += 1.0
-        rig.modes = Mode.POSITION
-        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert (rig.cycle(mode=Mode.POSITION).axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
 
     def test_a_source_that_wants_to_begin_elsewhere_is_refused(self):
         class Elsewhere(Cruise):
@@ -135,14 +134,12 @@ class TestStaggeredOpening:
                 np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
                 assert not answer.axes["d"][:, 1:].any()
         assert source.begun_at is None
-        rig.modes = Mode.POSITION
-        rig.cycle()
+        rig.cycle(mode=Mode.POSITION)
         assert rig.state is State.OPEN
         assert source.begun_at is not None
 
     def test_records_say_which_axes_had_a_set_point(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.axes["mode"][[1, 4]] = Mode.POSITION
         rig.cycle()
         record = rig.records[-1]
@@ -153,8 +150,7 @@ class TestStaggeredOpening:
         assert record["interval"] == -1
 
     def test_an_open_axis_that_is_not_where_its_target_is_gets_508(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.axes["mode"][[1, 4]] = Mode.POSITION
         rig.axes["d"][4, 2] += 2.1
         answer = rig.cycle()
@@ -166,8 +162,7 @@ class TestStaggeredOpening:
         rig.close()
         rig.axes["mode"][0] = Mode.POSITION
         rig.cycle()
-        rig.modes = Mode.CLOSED
-        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
         assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
         rig.open()
         rig.cycle(20)
@@ -184,14 +179,11 @@ class TestStaggeredOpening:
         assert "mode 5" in rig.ended.reason
 
     def test_without_a_motion_another_open_mode_is_answered_by_holding(self):
-        rig = Rig()
-        rig.close()
-        rig.modes = Mode.POSITION_RELATIVE
-        answer = rig.cycle()
+        rig = closed()
+        answer = rig.cycle(mode=Mode.POSITION_RELATIVE)
         assert rig.state is State.OPENING
         np.testing.assert_array_equal(answer.axes["d"][:, 0], rig.axes["d"][:, 0])
-        rig.modes = Mode.DELTA_POSITION
-        answer = rig.cycle()
+        answer = rig.cycle(mode=Mode.DELTA_POSITION)
         np.testing.assert_array_equal(answer.axes["mode"], Mode.DELTA_POSITION)
         assert not answer.axes["d"].any()
 

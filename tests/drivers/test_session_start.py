@@ -10,7 +10,7 @@ import pytest
 from drivers import CyclicPacket, InitReceived, LinkLost, Mode, MotionEnded, PacketRejected, State
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.replies import D1, Reader, safe_answer
-from tests.drivers.rig import START, N, Rig, all_drive_off, still
+from tests.drivers.rig import START, N, Rig, all_drive_off, closed, opened, started, still
 
 WORDS = 9
 
@@ -34,8 +34,7 @@ class TestHandShake:
         assert len(Rig().sync(1, length)) == length
 
     def test_init_is_answered_by_itself_with_number_11(self):
-        rig = Rig()
-        rig.start()
+        rig = started()
         packet, reply = rig.transcript[0]
         assert len(reply) == INIT_LENGTH
         assert reply == struct.pack("<i", 11) + packet[4:]
@@ -43,25 +42,21 @@ class TestHandShake:
         assert rig.session.period == 0.002
 
     def test_a_warm_start_begins_with_init_and_goes_straight_to_cyclic_packets(self):
-        rig = Rig()
-        rig.start()
-        rig.status = 0
-        rig.cycle()
+        rig = started()
+        rig.cycle(status=0)
         assert rig.number == 11
         assert rig.path == [State.INIT, State.DRIVE_OFF]
 
     def test_cyclic_packets_follow_the_cold_start_at_13(self):
         rig = Rig()
         rig.start(cold=True)
-        rig.status = 0
-        rig.cycle()
+        rig.cycle(status=0)
         assert rig.number == 13
         assert rig.state is State.DRIVE_OFF
         assert rig.records["cycle"].tolist() == [3]
 
     def test_a_second_copy_of_init_gets_the_same_bytes_and_starts_nothing(self):
-        rig = Rig()
-        rig.start()
+        rig = started()
         again = rig.send(rig.init.encode())
         assert again == rig.transcript[0][1]
         assert len(rig.seen(InitReceived)) == 1
@@ -80,8 +75,7 @@ class TestSafeAnswers:
     """What is answered where nothing moves: field by field."""
 
     def filled(self, mode, status=DRIVE_ON) -> tuple[Rig, CyclicPacket, CyclicPacket]:
-        rig = Rig()
-        rig.start()
+        rig = started()
         rig.modes = mode
         rig.status = status
         rng = np.random.default_rng(3)
@@ -116,8 +110,7 @@ class TestSafeAnswers:
         assert rig.state is State.ENDED
 
     def test_a_longer_packet_gets_an_answer_of_the_documented_length(self):
-        rig = Rig()
-        rig.start()
+        rig = started()
         packet = rig.packet()
         reply = rig.send(packet + b"\xa5" * (732 - len(packet)))
         assert len(reply) == 228
@@ -126,8 +119,7 @@ class TestSafeAnswers:
 
 class TestWhoGetsAnAnswer:
     def test_a_duplicate_gets_the_same_bytes_and_no_record(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         packet, reply = rig.transcript[-1]
         records = len(rig.records)
         for _ in range(3):
@@ -136,8 +128,7 @@ class TestWhoGetsAnAnswer:
         assert len(rig.records) == records
 
     def test_a_stale_packet_gets_none_and_is_counted(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         old = rig.transcript[-1][0]
         rig.cycle(3)
         assert rig.send(old) is None
@@ -145,8 +136,7 @@ class TestWhoGetsAnAnswer:
         assert rig.seen(PacketRejected) == [PacketRejected("stale", 1)]
 
     def test_a_number_further_ahead_than_silence_allows_is_stale(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         answered = rig.number
         rig.number = answered + 500
         assert rig.cycle() is None, "1 s is 500 cycles; this one is 501 ahead"
@@ -159,15 +149,13 @@ class TestWhoGetsAnAnswer:
         [b"", b"\x0b", struct.pack("<i", 11), struct.pack("<i", 11) + bytes(223), bytes(228)],
     )
     def test_malformed_packets_get_none_and_change_nothing(self, packet):
-        rig = Rig()
-        rig.start()
+        rig = started()
         assert rig.send(packet) is None
         assert rig.state is State.INIT
         assert rig.session.counters.malformed == 1
 
     def test_a_cyclic_packet_with_number_10_is_no_init(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.cycle(0x7FFF - rig.number + 10)
         assert rig.number == 10
         assert len(rig.seen(InitReceived)) == 1
@@ -184,16 +172,14 @@ class TestSilence:
         assert rig.session.deadline == pytest.approx(rig.now + 1.0)
 
     def test_duplicates_and_rejected_packets_do_not_move_the_deadline(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         deadline = rig.session.deadline
         rig.send(rig.transcript[-1][0])
         rig.send(b"nonsense")
         assert rig.session.deadline == deadline
 
     def test_silence_is_a_fault_reported_once(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.session.tick(rig.now + 0.999)
         assert rig.state is State.CLOSED
         rig.session.tick(rig.now + 1.0)
@@ -203,15 +189,13 @@ class TestSilence:
         assert rig.seen(LinkLost) == [LinkLost(pytest.approx(1.0), State.CLOSED)]
 
     def test_nobody_has_to_tick_for_silence_to_be_noticed(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.now += 5.0
         rig.cycle()
         assert rig.path[-2:] == [State.FAULTED, State.CLOSED]
 
     def test_after_silence_a_controller_that_goes_on_is_answered_whatever_its_number(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.now += 5.0
         rig.number += 9000
         assert rig.cycle() is not None
@@ -221,8 +205,7 @@ class TestSilence:
         assert np.diff(rig.records["cycle"][-2:]) == 1
 
     def test_after_silence_a_cold_start_is_followed(self):
-        rig = Rig()
-        rig.close()
+        rig = closed()
         rig.now += 60.0
         rig.start(cold=True)
         rig.cycle()
@@ -262,12 +245,10 @@ class TestPcThatStartsInMidSession:
             rig.sync(number)
         rig.send(rig.init.encode())
         rig.number = 10
-        rig.modes = mode
-        assert (rig.cycle().axes["mode"] == answered).all()
+        assert (rig.cycle(mode=mode).axes["mode"] == answered).all()
 
     def test_open_axes_after_a_silence_are_asked_to_switch_off(self):
-        rig = Rig()
-        rig.open()
+        rig = opened()
         rig.now += 60.0
         rig.number = 2
         rig.modes = Mode.DELTA_POSITION
@@ -367,8 +348,7 @@ def test_sessions_do_not_share_their_counts():
 
 
 def test_it_is_told_together_with_what_the_session_rejected():
-    rig = Rig()
-    rig.close()
+    rig = closed()
     rig.session.events()
     rig.send(b"short")
     rig.send(rig.transcript[0][0][:100])
@@ -412,8 +392,7 @@ class TestReasons:
 
 
 def test_the_same_packet_after_a_silence_is_answered_anew():
-    rig = Rig()
-    rig.close()
+    rig = closed()
     packet = rig.packet()
     before = rig.send(packet)
     rig.now += 2.0
@@ -424,8 +403,7 @@ def test_the_same_packet_after_a_silence_is_answered_anew():
 
 
 def test_a_number_before_that_of_the_init_packet_is_no_answer_s():
-    rig = Rig()
-    rig.start()
+    rig = started()
     rig.number = 8
     assert rig.cycle() is None
     assert rig.session.counters.stale == 1
@@ -453,8 +431,7 @@ class TestDrives:
 
 
 def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
-    rig = Rig()
-    rig.open()
+    rig = opened()
     rig.axes["d"][2, :] = np.nan
     rig.axes["d"][4, 2] = np.inf
     answer = rig.cycle()

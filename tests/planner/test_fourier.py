@@ -293,26 +293,6 @@ def test_sines_too_fast_to_be_bounded_are_refused_and_absent_ones_do_not_matter(
             check_limits(FourierSeries(middle, amplitude, frequency, 9.0, ramp), six_axis_limits)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.37, 0.97])
-def test_a_stop_stays_on_its_path_and_within_the_bounds_of_a_stop(six_axis_limits, share):
-    motion, period = executable(six_axis_limits, 5), 0.002
-    player = TrajectoryPlayer(motion, period, six_axis_limits)
-    player.begin(player.start)
-    rows = [player.start] * 3
-    for _ in range(int(share * motion.duration / period)):
-        rows.append(player.advance()[0])
-    player.stop()
-    while not player.finished:
-        rows.append(player.advance()[0])
-    rows += [rows[-1]] * 3
-    for order, name, factor in ((1, "velocity", 1.0), (2, "acceleration", 2.0), (3, "jerk", 3.0)):
-        rate = np.abs(np.diff(rows, order, axis=0)) / period**order
-        assert np.all(rate <= factor * getattr(six_axis_limits, name) * (1 + 1e-5)), name
-    path = motion.sample(np.linspace(0.0, motion.duration, 100_001))[0]
-    apart = np.min(np.linalg.norm(path - rows[-1], axis=1))
-    assert apart < motion.duration / 1e5 * np.linalg.norm(motion.extrema().velocity)
-
-
 def test_one_time_and_many_times_are_the_same(six_axis_limits):
     motion = executable(six_axis_limits, 7)
     for t in (-1.0, 0.0, 1.3, 12.0, motion.duration, 1e3):

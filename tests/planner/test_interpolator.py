@@ -205,15 +205,6 @@ def test_a_target_where_the_arm_is_takes_no_time(six_axis_limits, random_points)
         np.testing.assert_array_equal(step.position, point)
 
 
-def test_targets_at_one_place_are_told_one_after_the_other(six_axis_limits, random_points):
-    a, b, c = random_points(11, 3)
-    interpolator = ready(six_axis_limits, a, fly=100.0)
-    queue(interpolator, [b, b, b, c])
-    steps = steps_to_rest(interpolator)
-    assert [target for _, target in events(steps)] == [1, 2, 3, 4]
-    assert max(len(step.events) for step in steps) == 3
-
-
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 400), min_size=4, max_size=4))
 @settings(max_examples=15, deadline=None)
 def test_whenever_targets_come_the_steps_keep_the_limits(
@@ -230,23 +221,6 @@ def test_whenever_targets_come_the_steps_keep_the_limits(
     assert max(worst_ratios(points[0], positions(steps), six_axis_limits)) <= 1.0 + 1e-5
     ended = [target for kind, target in events(steps)]
     assert ended == [0, 1, 2, 3]
-
-
-def test_the_same_calls_give_the_same_bits(six_axis_limits, random_points):
-    def run():
-        points = random_points(20, 5)
-        interpolator = ready(six_axis_limits, points[0], fly=70.0)
-        queue(interpolator, points[1:3])
-        steps = [interpolator.get_next_step() for _ in range(150)]
-        interpolator.set_override_speed(33.0)
-        steps += [interpolator.get_next_step() for _ in range(100)]
-        queue(interpolator, points[3:], first=3)
-        interpolator.set_override_speed(100.0)
-        return steps + steps_to_rest(interpolator)
-
-    first, second = run(), run()
-    assert positions(first).tobytes() == positions(second).tobytes()
-    assert [s[2:] for s in first] == [s[2:] for s in second]
 
 
 # -- more data, targets -------------------------------------------------------------------
@@ -392,16 +366,6 @@ def test_an_override_changes_when_and_never_where(
     np.testing.assert_array_equal(q[-1], points[-1])
 
 
-def test_a_constant_override_stretches_time(six_axis_limits, points, flown):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
-    interpolator.set_override_speed(20.0)
-    queue(interpolator, points[1:])
-    steps = steps_to_rest(interpolator)
-    q, _, _ = flown.sample(0.2 * PERIOD * np.arange(1, len(steps) + 1))
-    np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
-    assert steps[-1].elapsed_time == pytest.approx(5.0 * flown.duration, rel=1e-9)
-
-
 @given(st.integers(1, 1200), st.integers(0, 300), st.sampled_from([100.0, 60.0, 5.0]))
 @settings(max_examples=20, deadline=None)
 def test_stop_and_continue_stay_on_the_path(
@@ -524,18 +488,6 @@ def test_a_cancelled_motion_leaves_the_arm_on_its_path(
     assert events(back) == [(EventKind.MOTION_ENDED, 9)]
 
 
-def test_targets_may_come_while_the_override_changes(six_axis_limits, points, flown, off_path):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
-    queue(interpolator, points[1:2])
-    interpolator.set_override_speed(30.0)
-    steps = [interpolator.get_next_step() for _ in range(20)]
-    interpolator.set_override_speed(100.0)
-    steps += [interpolator.get_next_step() for _ in range(20)]
-    queue(interpolator, points[2:], first=2)
-    steps += steps_to_rest(interpolator)
-    assert off_path(positions(steps)) <= 1e-9
-
-
 # -- refusals -----------------------------------------------------------------------------
 
 
@@ -644,22 +596,6 @@ def test_a_refused_service_changes_nothing(six_axis_limits, random_points, servi
     np.testing.assert_array_equal(run(disturbed=True), run(disturbed=False))
 
 
-def test_numbers_of_numpy_are_numbers(six_axis_limits, random_points):
-    points = random_points(56, 2)
-    interpolator = ready(six_axis_limits, points[0])
-    for status in (
-        interpolator.set_advance_motion(np.int64(2)),
-        interpolator.set_joint_speeds(np.float32(50.0), np.arange(2)),
-        interpolator.set_joint_speeds(np.full(6, 50)),
-        interpolator.set_override_speed(np.int32(100), np.int64(SpeedCorrection.PROGRAM)),
-        interpolator.select_flyby_mode(np.True_),
-        interpolator.select_flyby_criteria(np.int16(FlybyCriterion.DISTANCE)),
-    ):
-        assert status == Status.OK, interpolator.refusal
-    assert interpolator.set_next_target(np.int64(3), points[1]) >= 0
-    assert interpolator.get_current_target_id() == 3
-
-
 @pytest.mark.parametrize("wanted", ["joint", 5, None, [0], np.zeros(2)])
 def test_a_step_in_any_other_format_is_refused(six_axis_limits, random_points, wanted):
     a, b = random_points(57, 2)
@@ -733,16 +669,6 @@ def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, m
     steps = steps_to_rest(interpolator)
     assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
     assert max(worst_ratios(points[0], positions(steps), six_axis_limits)) <= 1.0 + 1e-5
-
-
-def test_corners_planned_in_a_child_process_are_the_same(six_axis_limits, random_points):
-    points = random_points(54, 4)
-    runs = []
-    for isolated in (False, True):
-        interpolator = ready(six_axis_limits, points[0], fly=60.0, isolated=isolated)
-        queue(interpolator, points[1:])
-        runs.append(positions(steps_to_rest(interpolator)))
-    np.testing.assert_array_equal(*runs)
 
 
 @pytest.mark.parametrize(

@@ -200,18 +200,6 @@ class TestMotion:
         fast = plan_moves(points[0], moves, limits, overrides).duration
         assert fast <= plan_moves(points[0], moves, limits, slower).duration * (1 + 1e-9)
 
-    @given(st.integers(0, 10**6), st.sampled_from([0.05, 0.25, 0.5, 1.0]))
-    @settings(max_examples=25)
-    def test_differences_of_its_set_points_keep_the_limits(
-        self, six_axis_limits, random_points, seed, fly
-    ):
-        motion = plan(random_points(seed), six_axis_limits, fly=fly)
-        period = 0.001
-        q = motion.sample(np.arange(-5.0, motion.duration / period + 5.0) * period)[0]
-        for order, bound in ((1, "velocity"), (2, "acceleration"), (3, "jerk")):
-            rate = np.abs(np.diff(q, order, axis=0)) / period**order
-            assert np.all(rate <= getattr(six_axis_limits, bound) * (1 + 1e-5)), bound
-
 
 def ramps(motion):
     """Largest acceleration while speeding up and while slowing down, along a line."""
@@ -237,17 +225,6 @@ class TestShares:
         np.testing.assert_allclose(extrema.velocity, before.velocity)
         np.testing.assert_allclose(extrema.jerk, before.jerk)
 
-    def test_an_override_of_speed_leaves_acceleration_and_jerk(
-        self, six_axis_limits, random_points
-    ):
-        start, end = random_points(4, 2)
-        full = plan_moves(start, [Move(end)], six_axis_limits).trajectory.extrema()
-        slow = plan_moves(start, [Move(end)], six_axis_limits, Overrides(speed=0.5))
-        extrema = slow.trajectory.extrema()
-        np.testing.assert_allclose(extrema.velocity, 0.5 * full.velocity)
-        np.testing.assert_allclose(extrema.acceleration, full.acceleration)
-        np.testing.assert_allclose(extrema.jerk, full.jerk)
-
     @pytest.mark.parametrize(
         ("of_move", "of_program", "quantity"),
         [
@@ -269,17 +246,6 @@ class TestShares:
         assert used[3] == pytest.approx(0.05, rel=0.03)
         assert used[3] <= 0.05
         assert np.all(used <= 1.0)
-
-    def test_each_move_keeps_its_own_shares(self, six_axis_limits, random_points):
-        points = random_points(6, 4)
-        speeds = (1.0, 0.2, 0.6)
-        moves = [Move(p, speed=s) for p, s in zip(points[1:], speeds, strict=True)]
-        motion = plan_moves(points[0], moves, six_axis_limits)
-        arrivals = [0.0, *(passage.time for passage in motion.targets)]
-        for (begin, end), speed in zip(pairwise(arrivals), speeds, strict=True):
-            _, qd, _ = motion.trajectory.sample(np.linspace(begin, end, 5000))
-            largest = np.max(np.abs(qd) / six_axis_limits.velocity)
-            assert 0.9 * speed < largest <= speed * (1 + 1e-12)
 
 
 class TestCorners:
@@ -320,15 +286,6 @@ class TestCorners:
         )
         assert distances == sorted(distances)
         np.testing.assert_allclose(distances[3:], [2.6, 8.0, 16.0], rtol=0.3)
-
-    def test_a_repeated_point_is_a_stop(self, six_axis_limits, random_points):
-        a, b, c = random_points(12, 3)
-        motion = plan([a, b, b, c], six_axis_limits, fly=1.0)
-        q, qd, _ = motion.sample(np.linspace(0.0, motion.duration, 5000)[1:-1])
-        apart = np.abs(q - b).max(axis=1)
-        assert np.max(np.abs(qd[np.argmin(apart)])) < 0.1
-        assert np.min(apart) < 1e-4
-        assert plan([a, b, c], six_axis_limits, fly=1.0).duration < motion.duration
 
     def test_a_motion_that_goes_nowhere_takes_no_time(self, six_axis_limits, random_points):
         point = random_points(13, 1)[0]
@@ -402,11 +359,6 @@ def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(six_axis_limits, fl
     grown = lengthened(six_axis_limits, fly, 3400)
     assert 0 < len(grown) < 30
     assert max(grown) < 0.1
-
-
-@pytest.mark.slow
-def test_with_a_stop_at_every_target_none_grows(six_axis_limits):
-    assert lengthened(six_axis_limits, FlyPercent(0.0), 1000) == []
 
 
 @pytest.mark.parametrize(
@@ -695,12 +647,3 @@ def test_tables_are_the_same_motions_without_empty_pieces(block):
         for ours, theirs in zip(motion.sample(times), whole.sample(times), strict=True):
             np.testing.assert_array_equal(ours, theirs)
         assert all(np.all(np.diff(knots) > 0.0) for knots in motion.knots)
-
-
-def test_a_motion_of_no_length_keeps_one_piece():
-    still = Block.from_jerks(
-        np.array([[[1.0, 0.0, 0.0]]]), np.zeros((1, 1, PIECES + 1)), np.zeros((1, 1, PIECES))
-    )
-    (motion,) = still.tables()
-    assert motion.duration == 0.0
-    assert motion.sample(np.array([0.0]))[0] == pytest.approx(1.0)

@@ -195,43 +195,6 @@ def test_nothing_that_can_be_asked_for_is_refused_by_the_guard(
         assert arm.player.rate == 0.0
 
 
-@given(which=st.integers(0, 7), seed=st.integers(0, 2**32 - 1), most=st.integers(1, 40))
-@settings(max_examples=30)
-def test_a_knob_turned_all_the_time_is_followed_within_the_bounds_of_an_override(
-    motions, six_axis_limits, which, seed, most
-):
-    arm = Arm(motions[which], six_axis_limits).begin()
-    knob = np.random.default_rng(seed)
-    for _ in range(2000 // most):
-        arm.ask("override", float(knob.choice([0.0, 1.0, knob.random()])))
-        arm.run(int(knob.integers(1, most + 1)))
-    arm.ask("override", 1.0).run(20_000)
-    assert arm.player.finished
-    assert "stop" not in arm.bounds
-    assert arm.off_the_path() <= 1e-9
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("at", [0.1, 0.4, 0.7])
-def test_full_speed_to_a_fifth_and_to_nothing_and_back_keeps_the_path(
-    random_points, six_axis_limits, seed, at
-):
-    motion = plan(random_points(seed, 4), six_axis_limits)
-    arm = Arm(motion, six_axis_limits).begin()
-    arm.run(int(at * motion.duration / PERIOD)).ask("override", 0.2).run(700)
-    assert arm.player.rate == 0.2
-    arm.ask("override", 1.0).run(300).ask("override", 0.0).run(900)
-    assert not arm.player.finished
-    assert arm.player.rate == 0.0
-    np.testing.assert_array_equal(arm.positions[-1], arm.positions[-2])
-    arm.ask("override", 1.0).run(20_000)
-    assert arm.player.finished
-    assert arm.off_the_path() <= 1e-9
-    np.testing.assert_allclose(
-        arm.positions[-1], motion.sample(np.array([np.inf]))[0][0], rtol=0, atol=1e-12
-    )
-
-
 def test_bounds_say_what_each_set_point_keeps(motions, six_axis_limits):
     arm = Arm(motions[0], six_axis_limits).begin().run(300)
     assert set(arm.bounds) == {"plan"}
@@ -292,11 +255,6 @@ def test_nothing_resumes_after_a_stop(motions, six_axis_limits):
         assert arm.player.finished
         assert arm.player.rate == 0.0
         arm.rest()
-
-
-def test_a_stop_while_held_is_over_at_once(motions, six_axis_limits):
-    arm = Arm(motions[1], six_axis_limits).begin().run(500).ask("hold").run(500).ask("stop")
-    assert arm.player.finished
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])

@@ -16,8 +16,6 @@ from planner.time_law import (
     admits,
     ramp,
     slowing_bounds,
-    stopping_rate,
-    within,
 )
 
 fractions = st.one_of(st.sampled_from([0.0, 0.2, 1.0]), st.floats(0.0, 1.0))
@@ -105,16 +103,6 @@ def test_no_sequence_of_targets_and_wider_bounds_leaves_the_range(state, changes
     assert max(seen) <= 1.0 + 1e-9
 
 
-@given(states(), fractions, st.floats(0.0, 1.0))
-def test_where_the_slope_would_die_away_moves_monotonically_to_the_target(state, target, share):
-    bounds, rate, slope = state
-    way = ramp(rate, slope, target, bounds)
-    now = way.sample(share * way.duration)
-    later = way.sample((share + (1.0 - share) / 2.0) * way.duration)
-    off = [abs(target - stopping_rate(r, dr, bounds.change)) for _, r, dr in (now, later)]
-    assert off[1] <= off[0] + 1e-9
-
-
 @given(states(), st.booleans())
 def test_a_state_outside_its_bounds_is_not_admitted(state, rising):
     bounds, rate, _ = state
@@ -152,13 +140,6 @@ def test_motion_time_follows_the_ramp_and_settles():
     assert law.rate == 0.25
 
 
-def test_aiming_at_the_rate_that_is_changes_nothing():
-    law = TimeLaw(0.001)
-    law.aim(1.0, RateBounds(1.0, 1.0))
-    assert law.settled
-    assert law.rate == 1.0
-
-
 rates = st.floats(-1.0, 2.0).map(lambda exponent: 10.0**exponent)
 joints = st.lists(st.tuples(rates, rates, rates), min_size=1, max_size=4)
 shares = st.floats(0.0, 1.5)
@@ -182,19 +163,6 @@ def test_the_worst_conceivable_path_just_keeps_the_bounds(joints, more, much_mor
     assert np.max(used_jerk) == pytest.approx(1.0 + much_more)
 
 
-@given(joints, rates, rates, st.floats(0.001, 1.0))
-def test_no_other_division_of_the_spare_jerk_stops_much_faster(joints, more, much_more, share):
-    velocity, acceleration, jerk = np.array(joints).T
-    bounds = slowing_bounds(limits_of(velocity, acceleration, jerk), 1.0 + more, 1.0 + much_more)
-    slope = share * np.min(
-        np.minimum(more * acceleration / velocity, much_more * jerk / (3 * acceleration))
-    )
-    change = np.min((much_more * jerk - 3 * acceleration * slope) / velocity)
-    if slope > 0.0 and change > 0.0:
-        other = ramp(1.0, 0.0, 0.0, RateBounds(float(slope), float(change)))
-        assert ramp(1.0, 0.0, 0.0, bounds).duration <= 1.02 * other.duration
-
-
 @given(joints, st.tuples(shares, shares, shares), rates, rates)
 @example([(1.0, 1.0, 1.0)], (0.0, 2.2250738585e-313, 0.0), 1.0, 1.0)
 def test_a_path_that_uses_less_than_its_limits_may_slow_faster(joints, used, more, much_more):
@@ -213,10 +181,6 @@ def test_a_path_that_uses_less_than_its_limits_may_slow_faster(joints, used, mor
     general = slowing_bounds(limits, 1.0 + more, 1.0 + much_more)
     duration = ramp(1.0, 0.0, 0.0, bounds).duration
     assert duration <= 1.02 * ramp(1.0, 0.0, 0.0, general).duration
-
-
-def test_bounds_within_others_are_the_narrower_of_each():
-    assert within(RateBounds(1.0, 9.0), RateBounds(2.0, 8.0)) == RateBounds(1.0, 8.0)
 
 
 @pytest.fixture(scope="module")

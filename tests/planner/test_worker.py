@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from planner import InvalidSetting, InvalidViaPoints, JointLimits, plan, plan_chunk
+from planner import InvalidSetting, JointLimits, plan, plan_chunk
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlannerOutOfStep, PlanningTimedOut
 from planner.worker import (
     WorkerProcess,
@@ -199,16 +197,6 @@ def killed(child):
     return pid
 
 
-def test_a_child_that_died_idle_is_replaced():
-    with WorkerProcess() as child:
-        pid = killed(child)
-        assert child.call(os.getpid) != pid
-        pid = killed(child)
-        with pytest.raises(PlannerCrashed, match="signal 9"):
-            child.send(os.getpid)
-        assert child.call(os.getpid) != pid
-
-
 def test_a_process_that_cannot_start_is_an_error_of_its_own(
     tmp_path, monkeypatch, six_axis_limits, random_points
 ):
@@ -263,24 +251,6 @@ def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits,
             assert same(planned[index], alone)
         again = together(children, points[:40], six_axis_limits)  # both are whole
         assert not any(isinstance(motion, Exception) for motion in again)
-
-
-@pytest.mark.slow
-def test_the_number_of_workers_changes_nothing(aborting_solver, six_axis_limits, random_points):
-    points = [random_points(seed, 2 + seed % 5) for seed in range(70)]
-    points[7] = points[7] + 100.0
-    speed = np.full((70, 6), 0.7)
-    speed[33, 0] = CREEP
-    runs = []
-    for count in (1, 2, 3):
-        with workers(count) as children:
-            runs.append(together(children, points, six_axis_limits, speed))
-    for index, (one, *others) in enumerate(zip(*runs, strict=True)):
-        for other in others:
-            assert type(one) is type(other)
-            assert str(one) == str(other) if index in (7, 33) else same(one, other)
-    assert isinstance(runs[0][7], InvalidViaPoints)
-    assert isinstance(runs[0][33], PlannerCrashed)
 
 
 def test_ctrl_c_ends_a_search_and_its_workers():
@@ -392,14 +362,6 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
 def importable(monkeypatch):
     """A child finds the functions of these tests under the name that they have here."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
-
-
-@given(st.integers(0, 200), st.integers(1, 50))
-def test_chunks_hold_every_index_once_and_in_order(count, size):
-    chunks = chunks_of(count, size)
-    assert [index for chunk in chunks for index in chunk] == list(range(count))
-    assert all(len(chunk) == size for chunk in chunks[:-1])
-    assert all(1 <= len(chunk) <= size for chunk in chunks)
 
 
 def test_results_come_in_order_whoever_was_free():

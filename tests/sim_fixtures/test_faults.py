@@ -265,22 +265,6 @@ class TestOwnMotion:
         assert pc.controller.phase is Phase.ENDED
         np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
 
-    def test_with_open_axes_too_it_is_over_after_a_trip(self) -> None:
-        pc = run(600, "e-stop@400", own_motion=self.POSTURES, open_mode=8)
-        pc.controller.drive_on()
-        there = pc.controller.plant.position.copy()
-        pc.run(1000)
-        assert pc.controller.phase is Phase.OPEN
-        np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
-
-    def test_told_to_finish_it_ends_in_the_next_posture(self) -> None:
-        pc = run(400, own_motion=self.POSTURES)
-        assert pc.controller.phase is Phase.MOVING
-        pc.controller.finish()
-        while (packet := pc.controller.next_packet()) is not None:
-            pc.controller.accept(pc._answer(packet))
-        np.testing.assert_allclose(pc.controller.plant.position, self.POSTURES[0], atol=1e-3)
-
     def test_in_a_mode_that_only_corrects_it_moves_with_open_axes(self) -> None:
         pc = run(2500, own_motion=self.POSTURES, open_mode=8, own_speed=0.8)
         assert pc.controller.phase is Phase.OPEN

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.packets import CyclicPacket, Mode, echo, next_number
+from drivers.packets import CyclicPacket, echo, next_number
 from sim_fixtures import Phase, SettingError, SimulatedController
 from tests.fault_matrix import small_cell
 
@@ -160,18 +160,6 @@ class TestFields:
         controller = opened()
         step(controller, {1: controller.servo.target} | {field: np.nan})
         assert receive(controller).status[0] == 0
-
-    @pytest.mark.parametrize("wish", [Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR])
-    def test_targets_beside_505_and_508_are_ignored(self, wish: int) -> None:
-        controller = opened()
-        held = np.array(controller.servo.target)
-        received = receive(controller)
-        reply = bytearray(answer(received, {1: 0.0}))
-        reply[12:16] = int(wish).to_bytes(4, "little")
-        controller.accept(bytes(reply))
-        for _ in range(100):
-            step(controller)
-        np.testing.assert_allclose(controller.servo.measured, held, atol=0.01)
 
 
 class TestWithoutAnAnswer:
