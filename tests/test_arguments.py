@@ -1,17 +1,24 @@
-"""The long commands refuse numbers that make no sense, before they do anything."""
+"""The long commands refuse numbers and journals that make no sense, before they do anything."""
 
 from __future__ import annotations
 
+import json
+import lzma
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.disk import damage
 from tests.endurance import __main__ as endurance
 from tests.fuzz import __main__ as fuzz
+from tests.fuzz.journal import Piece
+from tests.journal import Journal, JournalError, entries, rounds
 from tests.process_death import __main__ as process_death
 from tests.simulate import __main__ as simulate
+from tests.simulate.verdicts import Verdict
 
 Command = Callable[[list[str]], int]
 
@@ -45,3 +52,140 @@ def test_a_number_that_makes_no_sense_is_refused_by_its_option(
     assert refused.value.code == 2
     assert named in capsys.readouterr().err
     assert not journal.exists()
+
+
+@dataclass(frozen=True)
+class LongCommand:
+    """A command, how it is called, and a line of its journal."""
+
+    main: Callable[[list[str]], int]
+    arguments: list[str]
+    line: dict[str, Any]
+
+
+COMMANDS = {
+    "disk": LongCommand(
+        damage.main, ["--rounds", "1"], {"round": 3, "harm": "cut in x", "broken": []}
+    ),
+    "endurance": LongCommand(endurance.main, ["--merge"], {"kind": "begin", "rate": 1000}),
+    "fuzz": LongCommand(fuzz.main, ["codec"], asdict(Piece("codec", 9.0, 100, 5, 7, 3, 80))),
+    "deaths": LongCommand(
+        process_death.main,
+        ["--rounds", "1"],
+        {"round": 3, "broken": [], "seconds": 9.0, "processor": 2.0},
+    ),
+    "simulate": LongCommand(
+        simulate.main, ["--seeds", "1"], Verdict(3, "an arm", (), (), (), (), 9).to_dict()
+    ),
+}
+OTHERS = {
+    "a list": b"[1, 2]\n",
+    "notes": b"milk\n",
+    "another coding": b"\xff\xfe\n",
+    "no number": b'{"round": [], "harm": "", "broken": [], "seconds": 1, "processor": 1}\n',
+    **{name: json.dumps(command.line).encode() + b"\n" for name, command in COMMANDS.items()},
+}
+
+
+def number(said: dict[str, int]) -> int:
+    return said["n"]
+
+
+def read(path: Path) -> list[int]:
+    return entries(path, number, "number")
+
+
+@pytest.mark.parametrize("sync_every", [0.0, 60.0])
+def test_what_was_added_is_read_back_in_order(tmp_path: Path, sync_every: float) -> None:
+    path = tmp_path / "new" / "j.jsonl"
+    assert read(path) == []
+    for n in (3, 1, 3):
+        with Journal(path, sync_every) as journal:
+            journal.add(n=n)
+    assert read(path) == [3, 1, 3]
+
+
+def test_a_line_is_there_before_the_journal_is_closed(tmp_path: Path) -> None:
+    with Journal(tmp_path / "j.jsonl", 60.0) as journal:
+        journal.add(n=1)
+        assert read(tmp_path / "j.jsonl") == [1]
+
+
+def test_none_keeps_nothing() -> None:
+    with Journal(None) as journal:
+        journal.add(n=1)
+    assert rounds(None) == {}
+
+
+def test_a_torn_last_line_costs_itself_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    whole = b'{"n":1}\n{"n":2}\n'
+    for torn in range(1, len(whole)):
+        path.write_bytes(whole[:torn])
+        known = [1] if torn >= len(whole) // 2 else []
+        assert read(path) == known, torn
+        with Journal(path) as journal:
+            journal.add(n=9)
+        assert read(path) == [*known, 9]
+
+
+def test_a_compressed_journal_is_read_as_the_one_that_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl.xz"
+    path.write_bytes(lzma.compress(b'{"n":1}\n{"n":2}\n{"n'))
+    assert read(path) == [1, 2]
+
+
+@pytest.mark.parametrize("line", ["no", "{}", "[]", "7", "null", '{"n":1}{"n":2}'])
+def test_a_line_that_is_no_entry_is_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "j.jsonl"
+    path.write_text(f'{{"n":1}}\n{line}\n{{"n":2}}\n')
+    with pytest.raises(JournalError) as caught:
+        read(path)
+    assert str(caught.value) == f"{path}, line 2 is no number; name another --journal"
+
+
+def test_what_cannot_be_read_or_written_is_told_of(tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match="cannot be read"):
+        read(tmp_path)
+    with pytest.raises(JournalError, match="cannot be written: Is a directory"):
+        Journal(tmp_path)
+    (tmp_path / "j.jsonl.xz").write_bytes(b"no archive\n")
+    with pytest.raises(JournalError, match="cannot be read"):
+        read(tmp_path / "j.jsonl.xz")
+
+
+def test_rounds_are_known_by_number_and_the_last_of_one_counts(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    with Journal(path) as journal:
+        for n, text in ((4, "a"), (2, "b"), (4, "c")):
+            journal.add(round=n, text=text)
+    assert {n: one["text"] for n, one in rounds(path, "text").items()} == {4: "c", 2: "b"}
+    with pytest.raises(JournalError, match="line 1 is no result of a round"):
+        rounds(path, "harm")
+
+
+@pytest.mark.parametrize(
+    ("name", "other"), [(name, other) for name in COMMANDS for other in OTHERS if other != name]
+)
+def test_a_command_refuses_what_is_no_journal_of_its_own_and_leaves_it(
+    name: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "j.jsonl"
+    path.write_bytes(OTHERS[other])
+    command = COMMANDS[name]
+    assert command.main([*command.arguments, "--journal", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert f"{path}, line 1 is no " in said
+    assert said.endswith("; name another --journal\n")
+    assert said.count("\n") == 1
+    assert path.read_bytes() == OTHERS[other]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_folder_is_no_journal(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = COMMANDS[name]
+    assert command.main([*command.arguments, "--journal", str(tmp_path)]) == 2
+    assert f"{tmp_path} cannot be read: " in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -21,7 +21,7 @@ from drivers import (
 from planner import TrajectoryPlayer, plan
 from sim_fixtures import Phase
 from tests.fault_matrix import small_cell
-from tests.fault_matrix.laws import LIMITS, N
+from tests.fault_matrix.faulty_runs import LIMITS, N
 
 HOME = np.array(small_cell.HOME)
 WAY = np.array([0.3, 0.375])

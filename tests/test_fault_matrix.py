@@ -32,12 +32,13 @@ from tests.fault_matrix.faulty_runs import (
     SITUATIONS,
     SPEEDS,
     behaviours,
+    broken_in_records,
+    broken_on_the_wire,
     cases,
     cycles_without_a_fault,
     play,
     play_at,
 )
-from tests.fault_matrix.laws import broken_in_records, broken_on_the_wire
 from tests.fault_matrix.outcomes import AT_SPEED, EXPECTED, HEADING, at_speed, row
 
 

@@ -86,7 +86,6 @@ LONG: Final = (
     "identification/test_verdict.py",
     "independent",
     "planner/test_interpolator.py",
-    "planner/test_player_live.py",
     "planner/test_worker.py",
 )
 """Files that take too long for every change."""
@@ -98,7 +97,6 @@ QUICK: Final = (
     "drivers/test_guard.py",
     "drivers/test_packets.py",
     "drivers/test_session_motion.py",
-    "drivers/test_session_opening.py",
     "drivers/test_simulated_transport.py",
     "drivers/test_states.py",
     "drivers/test_session_start.py",

@@ -1,20 +1,39 @@
-"""Sessions over CAN on a bench: packets for both ends, and a link paced by its packets."""
+"""Sessions over CAN on a bench: packets, buses, an emulated adapter, and the contract of a bus."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
+import pty
+import select
+import threading
 import tomllib
+import tty
 from math import radians
 
 import numpy as np
 from can.interfaces.virtual import VirtualBus
 
-from drivers import CyclicPacket, DriveTrain, GuardLimits, InitPacket, TransportClosed
+from drivers import (
+    CycleRing,
+    CyclicPacket,
+    DriveTrain,
+    Guard,
+    GuardLimits,
+    InitPacket,
+    Session,
+    TransportClosed,
+    exchange,
+)
+from drivers.packets import next_number
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from drivers.transports.can.transport import CanTransport
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
 from sim_fixtures.can_end import CanFarEnd
+from tests.drivers.rig import smooth_move
+from tests.drivers.transport_contract import TransportContract
 
 N = 6
 PROFILES = ("fd", "classic")
@@ -222,3 +241,200 @@ def ns16_controller(**settings) -> SimulatedController:
         seed=1,
         initial_position=HOME,
     )
+
+
+MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+PERIOD = 0.002
+
+
+class Run:
+    """One session from cold start to its end, paced by its packets."""
+
+    def __init__(self, profile, *, ends=None, cycles=300, lost=(), mode=4, **settings):
+        clock = Cycles()
+        self.near, self.far = ends or virtual_ends(profile, clock)
+        self.controller = ns16_controller(open_mode=mode, **settings)
+        self.link = PacedByPackets(self.near, self.far, self.controller, lost=lost, clock=clock)
+        self.ring = CycleRing(N, 8192)
+        guard = Guard(wide_limits(), PERIOD)
+        self.session = Session(ns16_train(), guard, self.ring, settle_cycles=20, mode=mode)
+        self.session.request(smooth_move(MOVE, cycles, start=HOME))
+        self.events = []
+        exchange(self.link, self.session, until=self._until)
+        self.link.close()
+        self.events += self.session.events()
+
+    def _until(self):
+        self.events += self.session.events()
+        return self.link.cycle > 5000
+
+    def seen(self, kind):
+        return [event for event in self.events if isinstance(event, kind)]
+
+    @property
+    def records(self):
+        return self.ring.last(self.ring.capacity)
+
+
+_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+_OK, _BELL = b"\r", b"\a"
+
+
+class _Adapter:
+    """One adapter: its end of the pseudo-terminal and what it was told."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self.master)
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self.open = False
+        self.rates: list[str] = []
+        self.waiting = bytearray()
+        self._line = bytearray()
+        os.set_blocking(self.master, False)
+
+    def hand_over(self) -> None:
+        """Give the host as much of what waits for it as it takes."""
+        with contextlib.suppress(BlockingIOError):
+            del self.waiting[: os.write(self.master, self.waiting)]
+
+    def lines(self) -> list[str]:
+        """Commands that have come in whole."""
+        self._line += os.read(self.master, 4096)
+        *whole, rest = self._line.split(b"\r")
+        self._line = bytearray(rest)
+        return [line.decode("ascii") for line in whole]
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self._slave)
+
+
+def _is_frame(line: str) -> bool:
+    """Whether a command is a well-formed data frame with a standard identifier."""
+    if len(line) < 5 or line[0] not in "tdb":
+        return False
+    length = int(line[4], 16)
+    if line[0] == "t" and length > 8:
+        return False
+    return len(line) == 5 + 2 * _LENGTHS[length] and int(line[1:4], 16) < 0x800
+
+
+class SlcanBus:
+    """Two adapters joined by a bus, served by a thread.
+
+    Attributes:
+        ports: the two serial devices.
+        refused: commands that were answered with the bell.
+    """
+
+    def __init__(self) -> None:
+        self._adapters = (_Adapter(), _Adapter())
+        self.ports = tuple(adapter.port for adapter in self._adapters)
+        self.refused: list[str] = []
+        self._wake = os.pipe()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    @property
+    def rates(self) -> list[list[str]]:
+        """The bit rate commands each adapter was given."""
+        return [adapter.rates for adapter in self._adapters]
+
+    def _serve(self) -> None:
+        masters = {adapter.master: adapter for adapter in self._adapters}
+        ending = False
+        while True:
+            # What was written before the end is still obeyed.
+            sources = [*masters] if ending else [*masters, self._wake[0]]
+            full = [adapter.master for adapter in self._adapters if adapter.waiting]
+            ready, free, _ = select.select(sources, full, [], 0.0 if ending else None)
+            if ending and not ready:
+                return
+            for master in free:
+                masters[master].hand_over()
+            ending = ending or self._wake[0] in ready
+            for master in ready:
+                if master not in masters:
+                    continue
+                adapter = masters[master]
+                other = next(a for a in self._adapters if a is not adapter)
+                for line in adapter.lines():
+                    self._obey(adapter, other, line)
+
+    def _obey(self, adapter: _Adapter, other: _Adapter, line: str) -> None:
+        answer = _OK
+        if line == "O":
+            adapter.open = True
+        elif line in ("C", ""):
+            adapter.open = adapter.open and line == ""
+        elif line[0] in "SY":
+            adapter.rates.append(line)
+        elif adapter.open and _is_frame(line):
+            if other.open:
+                other.waiting += line.encode() + b"\r"
+            answer = b"z\r"
+        else:
+            self.refused.append(line)
+            answer = _BELL
+        adapter.waiting += answer
+
+    def close(self) -> None:
+        os.write(self._wake[1], b"x")
+        self._thread.join()
+        for adapter in self._adapters:
+            adapter.close()
+        for end in self._wake:
+            os.close(end)
+
+
+class Far:
+    """The contract's far end around ours."""
+
+    def __init__(self, end: CanFarEnd) -> None:
+        self.end = end
+        self.replies: list[bytes] = []
+
+    def send(self, packet: bytes) -> None:
+        self.end.send(packet)
+
+    def wait(self) -> None:
+        reply = self.end.receive(2.0)
+        assert reply is not None
+        self.replies.append(reply)
+
+
+class CanContract(TransportContract):
+    """The contract of every transport, and what the cyclic frames have to do besides."""
+
+    def test_cyclic_packets_go_both_ways_once_an_init_has_passed(self, link):
+        near, far = link
+        # Cycles so long that no pause of this machine tears the frames of one apart.
+        begin = init_packet(sample_time=100)
+        far.send(begin)
+        init = near.receive(2.0)
+        assert init == begin
+        near.send(init)
+        far.wait()
+        rng = np.random.default_rng(1)
+        for number in (11, 12, 13):
+            sent = random_packet(rng, number)
+            far.send(sent)
+            received = CyclicPacket.decode(near.receive(2.0), 6)
+            wanted = CyclicPacket.decode(sent, 6)
+            assert received.number == number
+            assert received.status == wanted.status
+            for column in (0, 2, 4):
+                np.testing.assert_array_equal(
+                    received.axes["d"][:, column], wanted.axes["d"][:, column]
+                )
+            axes = wanted.axes.copy()
+            axes["d"][:, 1:] = axes["extra"] = 0.0
+            reply = CyclicPacket(next_number(number), bytes(4), bytes(4), axes).encode()
+            near.send(reply)
+            far.wait()
+            arrived = CyclicPacket.decode(far.replies[-1], 6)
+            np.testing.assert_array_equal(arrived.axes["d"][:, 0], axes["d"][:, 0])
+            assert arrived.number == next_number(number)
+        assert near.rejected() == {}

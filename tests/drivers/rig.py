@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from drivers import (
     CycleRing,
@@ -20,6 +23,7 @@ from drivers import (
     State,
     StateChanged,
 )
+from drivers.errors import GuardError
 from drivers.packets import DRIVE_ON, cyclic_length, next_number
 from drivers.states import POSITION_MODES
 
@@ -401,3 +405,33 @@ def assert_refused(rig: Rig, answer: CyclicPacket, kind: type) -> Exception:
     assert type(error) is kind
     assert error.cycle == rig.records[-1]["cycle"]
     return error
+
+
+REST = np.zeros(N)
+WIDE = 1e9
+JUST_BELOW, JUST_ABOVE = 1.0 + 5e-7, 1.0 + 2e-6
+"""Of a bound, which has a relative tolerance of 1e-6."""
+FACTORS = {"plan": (1.0, 1.0), "override": (1.3, 1.7), "stop": (2.0, 3.0)}
+"""On acceleration and jerk, of each set of bounds."""
+
+joints = pytest.mark.parametrize("joint", [0, N - 1])
+signs = pytest.mark.parametrize("sign", [-1.0, 1.0])
+
+
+def at(joint: int, value: float) -> np.ndarray:
+    """Zero but for one joint."""
+    return value * np.eye(N)[joint]
+
+
+def only(**bounds: float) -> GuardLimits:
+    """Every rate but those given is out of reach."""
+    wide = dict.fromkeys(("velocity", "acceleration", "jerk"), WIDE)
+    return limits(**{name: np.full(N, bound) for name, bound in (wide | bounds).items()})
+
+
+def refused(kind: type, check: Callable[..., object], *args: Any, **named: Any) -> GuardError:
+    """What a check raises, which is of exactly this kind."""
+    with pytest.raises(GuardError) as caught:
+        check(*args, **named)
+    assert type(caught.value) is kind
+    return caught.value

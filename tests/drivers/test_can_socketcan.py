@@ -13,9 +13,7 @@ import pytest
 from drivers import CyclicPacket, MotionEnded
 from drivers.transports.can.transport import CanSpec
 from sim_fixtures.can_end import open_far_end
-from tests.drivers.can_bench import PROFILES, init_packet
-from tests.drivers.can_contract import CanContract, Far
-from tests.drivers.can_run import PERIOD, Run
+from tests.drivers.can_bench import PERIOD, PROFILES, CanContract, Far, Run, init_packet
 
 CHANNEL = "vcan0"
 pytestmark = pytest.mark.skipif(

@@ -19,9 +19,20 @@ from drivers.errors import (
     VelocityLimit,
 )
 from drivers.guard import CorrectionGuard
-from tests.drivers import edges
-from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
-from tests.drivers.rig import PERIOD, N, limits
+from tests.drivers import rig
+from tests.drivers.rig import (
+    FACTORS,
+    JUST_ABOVE,
+    JUST_BELOW,
+    PERIOD,
+    REST,
+    N,
+    at,
+    joints,
+    limits,
+    refused,
+    signs,
+)
 
 BOUNDS = limits()
 
@@ -150,7 +161,7 @@ def begun(kind: str, bounds: GuardLimits | None = None) -> CorrectionGuard:
 
 def only(kind: str, **bounds: float) -> CorrectionGuard:
     """Every rate but those given is out of reach."""
-    return begun(kind, edges.only(**bounds))
+    return begun(kind, rig.only(**bounds))
 
 
 V, A, J = 0.5, 8.0, 100.0

@@ -1,24 +1,420 @@
-"""What the exchange process does between two packets, in virtual time."""
+"""What the exchange shares with other processes, and does between two packets."""
 
 from __future__ import annotations
 
+import ctypes
+import fcntl
+import math
+import mmap
+import os
+import pickle
 import socket
+import struct
 import time
+from typing import get_args
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from drivers import CyclicPacket, Mode, State
+from drivers import CyclicPacket, GapSeen, Mode, MotionEnded, State, StateChanged
 from drivers.errors import RequestError
-from drivers.events import Counters, GapSeen, MotionEnded, PacketRejected
-from drivers.exchange import control, event_log
+from drivers.events import AnswersLost, Counters, Outcome, PacketRejected
+from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.__main__ import Rehearsal, rehearse
-from drivers.exchange.control import PATIENCE, STALE, ControlBlock, Ended
-from drivers.exchange.event_log import NO_SUPERVISOR, EventReader, EventWriter, HoldRefused, Leaving
+from drivers.exchange.control import (
+    BINS,
+    LONGEST_LOOK,
+    PATIENCE,
+    SHORTEST,
+    STALE,
+    ControlBlock,
+    Ended,
+    Pulse,
+    bin_of,
+    quantile,
+    upper_edge,
+)
+from drivers.exchange.event_log import (
+    NO_SUPERVISOR,
+    EventReader,
+    EventsLost,
+    EventWriter,
+    HoldRefused,
+    Leaving,
+)
 from drivers.exchange.loop import POLL
-from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Serving
-from drivers.record import CycleRing
-from tests.drivers.rig import PERIOD, N, drive_train, limits
+from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Digest, Serving
+from drivers.record import CycleRing, RingReader, cycle_dtype
+from tests.drivers.rig import PERIOD, Cruise, N, drive_train, limits, still
+
+
+def write(ring: CycleRing, numbers) -> None:
+    for number in numbers:
+        row = ring.slot
+        ring.number[row] = number
+        ring.cycle[row] = 10 * number
+        ring.measured[row] = number
+        ring.commanded[row] = -number
+        ring.commit()
+
+
+class TestRing:
+    def test_what_is_written_is_read_elsewhere_once(self):
+        ring = CycleRing.shared(N, 100)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(5))
+        records = reader.drain()
+        assert records["number"].tolist() == [0, 1, 2, 3, 4]
+        assert records["cycle"].tolist() == [0, 10, 20, 30, 40]
+        np.testing.assert_array_equal(records["position"], np.arange(5.0)[:, None] * np.ones(N))
+        np.testing.assert_array_equal(records["commanded_velocity"][3], np.full(N, -3.0))
+        assert len(reader.drain()) == 0
+
+    def test_it_keeps_what_a_private_ring_keeps(self):
+        shared, private = CycleRing.shared(N, 50), CycleRing(N, 50)
+        write(shared, range(70))
+        write(private, range(70))
+        assert shared.last(50).tobytes() == private.last(50).tobytes()
+        assert shared.rows.dtype == cycle_dtype(N)
+
+    def test_a_reader_that_comes_later_begins_with_what_is_still_there(self):
+        ring = CycleRing.shared(N, 10)
+        write(ring, range(25))
+        reader = RingReader(ring.fd, N)
+        assert reader.drain()["number"].tolist() == list(range(16, 25))
+        assert reader.overflow == 0
+
+    def test_the_writer_counts_what_it_overwrites_unread(self):
+        ring = CycleRing.shared(N, 10)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(10))
+        assert ring.overflow == 0
+        write(ring, range(10, 13))
+        assert ring.overflow == 3
+        reader.drain()
+        write(ring, range(13, 23))
+        assert ring.overflow == 3
+        write(ring, range(23, 24))
+        assert ring.overflow == 4
+
+    def test_a_spectator_changes_nothing(self):
+        ring = CycleRing.shared(N, 10)
+        spectator = RingReader(ring.fd, N, acknowledge=False)
+        write(ring, range(10))
+        assert len(spectator.drain()) == 9
+        write(ring, range(10, 13))
+        assert ring.overflow == 3
+
+    @given(st.lists(st.integers(0, 25), max_size=30))
+    def test_every_record_is_read_in_order_or_counted_as_lost(self, steps):
+        ring = CycleRing.shared(1, 10)
+        reader = RingReader(ring.fd, 1)
+        seen, written = [], 0
+        for count in steps:
+            write(ring, range(written, written + count))
+            written += count
+            seen += reader.drain()["number"].tolist()
+        assert seen == sorted(set(seen))
+        assert len(seen) + reader.overflow == written
+        os.close(ring.fd)
+
+    def test_records_overwritten_while_they_are_copied_are_not_given_out(self):
+        ring = CycleRing.shared(N, 10)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(9))
+        rows = reader.rows
+
+        class Overtaken:
+            def take(self, index, mode):
+                write(ring, range(9, 13))
+                return rows.take(index, mode=mode)
+
+        reader.rows = Overtaken()
+        assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
+        assert reader.overflow == 4
+
+    def test_memory_of_something_else_is_refused(self):
+        ring = CycleRing.shared(N, 10)
+        with pytest.raises(ValueError, match="for 6 joints, not 7"):
+            RingReader(ring.fd, 7)
+        with pytest.raises(ValueError, match="not a ring"):
+            CycleRing(N, fd=control.create())
+        with pytest.raises(ValueError, match="at least 2"):
+            CycleRing.shared(N, 1)
+
+
+def gaps(numbers):
+    return [GapSeen(1, number) for number in numbers]
+
+
+class TestEventLog:
+    def test_events_arrive_in_order_and_equal(self):
+        fd = event_log.create(4096)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        events = [GapSeen(2, 7), StateChanged(State.OPEN, State.EXITING, 9)]
+        for event in events:
+            writer.write(event)
+        assert reader.drain() == events
+        assert reader.drain() == []
+        assert reader.lost == 0
+
+    def test_several_readers_each_get_all(self):
+        fd = event_log.create(4096)
+        writer = EventWriter(fd)
+        writer.write(GapSeen(1, 1))
+        assert EventReader(fd).drain() == EventReader(fd).drain() == [GapSeen(1, 1)]
+
+    @given(st.lists(st.integers(0, 12), max_size=40), st.integers(300, 1100))
+    def test_every_event_is_read_in_order_or_counted_as_lost(self, steps, capacity):
+        fd = event_log.create(capacity)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        written, seen, told = 0, [], 0
+        for count in steps:
+            for cycle in range(written, written + count):
+                writer.write(PacketRejected("x" * (cycle % 30), cycle))
+            written += count
+            events = reader.drain()
+            seen += [event.count for event in events if isinstance(event, PacketRejected)]
+            told += sum(event.count for event in events if isinstance(event, EventsLost))
+        assert seen == sorted(set(seen))
+        assert len(seen) + reader.lost == written
+        assert told == reader.lost
+        os.close(fd)
+
+    def test_a_torn_frame_is_lost_and_not_believed(self):
+        fd = event_log.create(4096)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        for event in gaps([1, 2, 3]):
+            writer.write(event)
+        length = struct.unpack("<I", os.pread(fd, 4, 256))[0]
+        os.pwrite(fd, b"\xff", 256 + 16 + length // 2)
+        assert reader.drain() == [EventsLost(1), *gaps([2, 3])]
+        assert reader.lost == 1
+
+    def test_frames_given_up_while_they_are_copied_are_not_given_out(self):
+        fd = event_log.create(400)
+        writer, reader = EventWriter(fd), EventReader(fd)
+        for event in gaps([1, 2, 3]):
+            writer.write(event)
+        copy = reader._get
+
+        def overtaken(position, count):
+            for event in gaps([4, 5]):
+                writer.write(event)
+            reader._get = copy
+            return copy(position, count)
+
+        reader._get = overtaken
+        lost, *seen = reader.drain() + reader.drain()
+        assert lost == EventsLost(reader.lost)
+        assert seen == gaps(range(6 - len(seen), 6))
+        assert 0 < len(seen) < 5
+        assert len(seen) + reader.lost == 5
+
+    def test_an_event_longer_than_the_log_is_an_error(self):
+        writer = EventWriter(event_log.create(100))
+        with pytest.raises(ValueError, match="an event of"):
+            writer.write(PacketRejected("x" * 200, 1))
+
+
+class TestDigest:
+    @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=200))
+    def test_nothing_is_lost_and_little_is_told(self, steps):
+        digest, told, now, rejected, missed = Digest(), [], 0.0, 0, 0
+        for count, kind in steps:
+            events = [PacketRejected(f"kind {kind}", count), GapSeen(count, round(now * 1000))]
+            rejected += count
+            missed += count
+            told += [(now, event) for event in digest.take(events, now)]
+            now += 0.001
+        told += [(now, event) for event in digest.rest()]
+        assert sum(e.count for _, e in told if isinstance(e, PacketRejected)) == rejected
+        assert sum(e.missed for _, e in told if isinstance(e, GapSeen)) == missed
+        assert len(told) <= 5 * (now / 0.1 + 2)
+
+    def test_the_first_of_a_sort_is_told_at_once_and_the_rest_when_the_time_is_over(self):
+        digest = Digest()
+        assert digest.take([GapSeen(1, 7)], 0.0) == [GapSeen(1, 7)]
+        assert digest.take([GapSeen(2, 9), AnswersLost(1, 9)], 0.01) == [AnswersLost(1, 9)]
+        assert digest.take([GapSeen(1, 12), AnswersLost(2, 12)], 0.05) == []
+        assert digest.take([], 0.099) == []
+        assert digest.take([], 0.1) == [GapSeen(3, 12)]
+        assert digest.take([], 0.11) == [AnswersLost(2, 12)]
+        assert digest.take([], 1.0) == digest.rest() == []
+
+    def test_the_end_of_a_motion_comes_after_what_led_to_it(self):
+        digest = Digest()
+        digest.take([GapSeen(1, 7)], 0.0)
+        ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
+        assert digest.take([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
+
+    def test_everything_else_passes_in_order(self):
+        changed = [StateChanged(State.OPEN, State.EXITING, k) for k in range(50)]
+        assert Digest().take(changed, 0.0) == changed
+
+
+class TestControlBlock:
+    def test_each_field_keeps_its_own_value(self):
+        fd = control.create()
+        here, there = ControlBlock(fd), ControlBlock(fd)
+        numbers = ctypes.c_int64, ctypes.c_double
+        fields = [name for name, kind in ControlBlock._fields_ if kind in numbers]
+        assert len(fields) > 20
+        for index, name in enumerate(fields):
+            setattr(here, name, index - 7)
+        assert {name: getattr(there, name) for name in fields} == {
+            name: index - 7 for index, name in enumerate(fields)
+        }
+
+    def test_memory_of_something_else_is_refused(self):
+        with pytest.raises(ValueError, match="not a control block"):
+            ControlBlock(CycleRing.shared(N, 10).fd)
+
+    def test_the_names_of_the_ends_are_those_of_the_events(self):
+        names = {ended.name.lower() for ended in Ended if ended is not Ended.NONE}
+        assert names == set(get_args(Outcome))
+
+
+class TestProgram:
+    def test_it_plays_as_the_original_does(self):
+        there = motion_transfer.unpack(motion_transfer.pack(still(5000)))
+        here = still(5000)
+        there.begin(there.start)
+        here.begin(here.start)
+        for _ in range(3):
+            np.testing.assert_array_equal(there.advance(), here.advance())
+
+    def test_large_arrays_are_mapped_and_read_only_small_ones_are_not(self):
+        source = still(5000)
+        there = motion_transfer.unpack(motion_transfer.pack(source))
+        assert not there.positions.flags.writeable
+        assert isinstance(_root(there.positions), mmap.mmap)
+        small = motion_transfer.unpack(motion_transfer.pack(Cruise()))
+        small.start += 1.0
+
+    def test_its_memory_cannot_change_any_more(self):
+        fd = motion_transfer.pack(still(10))
+        with pytest.raises(OSError, match="not permitted"):
+            os.pwrite(fd, b"x", 0)
+        with pytest.raises(PermissionError):
+            mmap.mmap(fd, 10)
+        assert fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_WRITE
+
+    def test_memory_that_could_still_change_is_refused(self):
+        with pytest.raises((ValueError, OSError)):
+            motion_transfer.unpack(control.create())
+
+    def test_what_does_not_pickle_is_not_handed_over(self):
+        source = still(10)
+        source.callback = lambda: None
+        with pytest.raises((pickle.PicklingError, AttributeError)):
+            motion_transfer.pack(source)
+
+
+def _root(array):
+    base = array
+    while not isinstance(base, mmap.mmap):
+        base = base.obj if isinstance(base, memoryview) else base.base
+    return base
+
+
+WIDTH = 2.0**0.25
+"""From one bin to the next, a fifth at most."""
+LONGEST = upper_edge(BINS - 2)
+
+latencies = st.floats(SHORTEST, LONGEST)
+
+
+def counted(seconds) -> list[int]:
+    counts = [0] * BINS
+    for one in seconds:
+        counts[bin_of(one)] += 1
+    return counts
+
+
+@given(latencies)
+def test_each_latency_is_at_most_the_edge_of_its_bin_and_above_that_of_the_one_before(seconds):
+    edge = upper_edge(bin_of(seconds))
+    assert seconds <= edge * (1.0 + 1e-12)
+    assert edge <= max(seconds, SHORTEST) * WIDTH * (1.0 + 1e-12)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1e-3, math.nan, SHORTEST])
+def test_what_is_shorter_than_the_first_edge_or_no_number_is_in_the_first_bin(seconds):
+    assert bin_of(seconds) == 0
+
+
+@pytest.mark.parametrize("seconds", [1.0, 1e300, math.inf])
+def test_what_is_longer_than_all_is_in_the_last_which_has_no_end(seconds):
+    assert bin_of(seconds) == BINS - 1
+    assert upper_edge(BINS - 1) == math.inf
+    assert 5e-3 < LONGEST < 6e-3
+
+
+@given(st.lists(latencies, min_size=1), st.floats(0.0, 1.0, exclude_min=True))
+def test_a_quantile_is_not_exceeded_by_its_share_and_by_no_more_than_a_bin_too_long(found, share):
+    estimated = quantile(counted(found), share)
+    assert estimated is not None
+    needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
+    assert needed <= estimated * (1.0 + 1e-12)
+    assert estimated <= needed * WIDTH * (1.0 + 1e-12)
+
+
+def test_a_share_of_nothing_is_the_shortest_there_was():
+    assert quantile(counted([1e-3]), 0.0) == upper_edge(bin_of(1e-3))
+
+
+def test_without_an_answer_there_is_none():
+    assert quantile([0] * BINS, 0.5) is None
+
+
+class Machine:
+    """A clock, and another process's heartbeat."""
+
+    now, beat = 100.0, 1.0
+
+    def watch(self, pulse: Pulse, seconds: float, *, beating: bool = False) -> float:
+        """Look each 0.1 s; the last quiet time seen."""
+        quiet = 0.0
+        for _ in range(round(seconds / 0.1)):
+            self.now += 0.1
+            self.beat += beating
+            quiet = pulse.quiet()
+        return quiet
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
+    machine = Machine()
+    monkeypatch.setattr(time, "monotonic", lambda: machine.now)
+    return machine
+
+
+def test_a_living_process_is_never_quiet(machine: Machine) -> None:
+    assert machine.watch(Pulse(lambda: machine.beat), 10.0, beating=True) == 0.0
+
+
+def test_silence_is_counted_and_ends_with_the_next_beat(machine: Machine) -> None:
+    pulse = Pulse(lambda: machine.beat)
+    assert machine.watch(pulse, 6.0) == pytest.approx(6.0)
+    assert machine.watch(pulse, 0.1, beating=True) == 0.0
+
+
+@pytest.mark.parametrize("longest", [LONGEST_LOOK, 0.1])
+def test_a_machine_that_was_suspended_takes_nobody_for_dead(
+    machine: Machine, longest: float
+) -> None:
+    pulse = Pulse(lambda: machine.beat, longest_look=longest)
+    machine.now += 3600.0
+    assert pulse.quiet() == longest
+
+
+def test_a_process_that_has_not_begun_is_not_quiet_yet(machine: Machine) -> None:
+    machine.beat = 0.0
+    assert machine.watch(Pulse(lambda: machine.beat), 10.0) == 0.0
+
 
 STEP = 0.01
 

@@ -23,9 +23,21 @@ from drivers.errors import (
     VelocityLimit,
     VelocityMismatch,
 )
-from tests.drivers import edges
-from tests.drivers.edges import FACTORS, JUST_ABOVE, JUST_BELOW, REST, at, joints, refused, signs
-from tests.drivers.rig import PERIOD, START, N, limits
+from tests.drivers import rig
+from tests.drivers.rig import (
+    FACTORS,
+    JUST_ABOVE,
+    JUST_BELOW,
+    PERIOD,
+    REST,
+    START,
+    N,
+    at,
+    joints,
+    limits,
+    refused,
+    signs,
+)
 
 
 def begun(**changes) -> Guard:
@@ -169,7 +181,7 @@ names = pytest.mark.parametrize("bounds", FACTORS)
 
 def only(**bounds: float) -> Guard:
     """At START, at rest; every rate but those given is out of reach."""
-    guard = Guard(edges.only(**bounds), PERIOD)
+    guard = Guard(rig.only(**bounds), PERIOD)
     guard.begin(START, REST, REST, np.zeros((2, N)), 0)
     return guard
 

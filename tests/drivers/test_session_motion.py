@@ -1,4 +1,4 @@
-"""A motion from request to closed axes, and every set-point on the way."""
+"""A motion from request to closed axes: how open mode begins, every set-point, every record."""
 
 from __future__ import annotations
 
@@ -6,19 +6,33 @@ import numpy as np
 import pytest
 
 from drivers import (
+    AxisLeft,
+    CurrentLimit,
+    FirstSetPoint,
     Mode,
     MotionEnded,
+    MotionHeld,
     MotionStarted,
+    NotAtStandstill,
+    PositionLimit,
     RequestError,
     State,
 )
+from drivers.errors import FirstSetPointUnknown, MotionUnknown
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
+    PERIOD,
     START,
     Cruise,
     N,
     Rig,
+    all_drive_off,
+    assert_refused,
     closed,
+    init_packet,
+    limits,
+    moving,
+    opened,
     running,
     smooth_move,
     still,
@@ -197,3 +211,411 @@ def test_a_motion_at_either_cycle_in_every_mode_of_positions(period, mode):
     )
     rig.run_to("completed")
     assert rig.session.period == period
+
+
+class TestFirstSetPoint:
+    """Ten per cent of the axis's following-error threshold, and at rest; refused, never clamped."""
+
+    def opening_with(self, change, **options) -> Rig:
+        rig = Rig(**options)
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.close()
+        change(rig.axes["d"])
+        rig.modes = Mode.POSITION
+        rig.answer = rig.cycle()
+        return rig
+
+    def refused(self, rig: Rig):
+        assert (rig.answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert rig.ended.outcome == "refused"
+        assert rig.seen(MotionStarted) == []
+        assert rig.state is State.FAULTED
+        assert np.isnan(rig.records[-1]["commanded_position"]).all()
+        return rig.refusal
+
+    @pytest.mark.parametrize("joint", range(N))
+    @pytest.mark.parametrize("sign", [-1, 1])
+    def test_a_target_away_from_the_arm_is_refused(self, joint, sign):
+        def change(d):
+            d[joint, 2] = d[joint, 0] + sign * 0.21
+
+        error = self.refused(self.opening_with(change))
+        assert type(error) is FirstSetPoint
+        assert error.joint == joint
+        assert error.value == pytest.approx(0.21, abs=1e-5)
+        assert error.bound == pytest.approx(0.2)
+
+    def test_the_narrower_threshold_of_cell_and_controller_counts(self):
+        def change(d):
+            d[1, 2] += 0.06
+
+        cell = limits(following_error=np.full(N, 0.5))
+        assert self.refused(self.opening_with(change, guard_limits=cell)).bound == pytest.approx(
+            0.05
+        )
+        controller = init_packet(arm_1={"following_error": np.full(N, 0.5)})
+        assert self.refused(self.opening_with(change, init=controller)).bound == pytest.approx(0.05)
+
+    @pytest.mark.parametrize("field", [1, 3], ids=["target", "actual"])
+    def test_an_axis_in_motion_is_refused(self, field):
+        def change(d):
+            d[2, field] = -0.001
+
+        error = self.refused(self.opening_with(change))
+        assert type(error) is NotAtStandstill
+        assert error.joint == 2
+
+    def test_an_axis_that_already_needs_too_much_current_is_refused(self):
+        def change(d):
+            d[3, 4] = 20.1
+
+        assert type(self.refused(self.opening_with(change))) is CurrentLimit
+
+    def test_an_arm_outside_its_range_is_refused(self):
+        rig = Rig()
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.close()
+        outside = START.copy()
+        outside[3] = 2.01
+        rig.put_arm_at(outside)
+        rig.modes = Mode.POSITION
+        rig.answer = rig.cycle()
+        error = self.refused(rig)
+        assert type(error) is PositionLimit
+        assert (error.joint, error.bound) == (3, 2.0)
+        assert error.value == pytest.approx(2.01, abs=1e-5)
+
+    def test_the_rule_holds_without_a_motion_too(self):
+        rig = closed()
+        rig.axes["d"][0, 2] += 1.0
+        assert (rig.cycle(mode=Mode.POSITION).axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+
+    def test_a_source_that_wants_to_begin_elsewhere_is_refused(self):
+        class Elsewhere(Cruise):
+            def begin(self, position):
+                raise ValueError("start is 3 rad away")
+
+        rig = Rig()
+        rig.session.request(Elsewhere())
+        rig.answer = rig.open()
+        assert "3 rad away" in str(self.refused(rig))
+
+
+class TestStaggeredOpening:
+    def test_nothing_moves_until_the_last_axis_is_open(self):
+        rig = Rig()
+        source = Cruise()
+        rig.session.request(source)
+        rig.close()
+        target = rig.axes["d"][:, 0].copy()
+        for joint in range(N - 1):
+            rig.axes["mode"][joint] = Mode.POSITION
+            for _ in range(3):
+                answer = rig.cycle()
+                assert rig.state is State.OPENING
+                np.testing.assert_array_equal(answer.axes["mode"], rig.axes["mode"])
+                np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
+                assert not answer.axes["d"][:, 1:].any()
+        assert source.begun_at is None
+        rig.cycle(mode=Mode.POSITION)
+        assert rig.state is State.OPEN
+        assert source.begun_at is not None
+
+    def test_records_say_which_axes_had_a_set_point(self):
+        rig = closed()
+        rig.axes["mode"][[1, 4]] = Mode.POSITION
+        rig.cycle()
+        record = rig.records[-1]
+        has = np.isfinite(record["commanded_position"])
+        np.testing.assert_array_equal(has, [False, True, False, False, True, False])
+        np.testing.assert_allclose(record["commanded_position"][has], START[has], atol=1e-6)
+        np.testing.assert_array_equal(record["commanded_velocity"][has], 0.0)
+        assert record["interval"] == -1
+
+    def test_an_open_axis_that_is_not_where_its_target_is_gets_508(self):
+        rig = closed()
+        rig.axes["mode"][[1, 4]] = Mode.POSITION
+        rig.axes["d"][4, 2] += 2.1
+        answer = rig.cycle()
+        assert answer.axes["mode"].tolist() == [0, 4, 0, 0, 508, 0]
+
+    def test_axes_that_close_again_lose_the_motion(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.axes["mode"][0] = Mode.POSITION
+        rig.cycle()
+        rig.cycle(mode=Mode.CLOSED)
+        assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
+        rig.open()
+        rig.cycle(20)
+        assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
+
+    def test_a_motion_does_not_start_in_a_mode_it_was_not_asked_for(self):
+        rig = Rig()
+        rig.session.request(still(3))
+        rig.close()
+        rig.axes["mode"][2] = Mode.POSITION_RELATIVE
+        answer = rig.cycle()
+        assert (answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+        assert rig.ended.outcome == "refused"
+        assert "mode 5" in rig.ended.reason
+
+    def test_without_a_motion_another_open_mode_is_answered_by_holding(self):
+        rig = closed()
+        answer = rig.cycle(mode=Mode.POSITION_RELATIVE)
+        assert rig.state is State.OPENING
+        np.testing.assert_array_equal(answer.axes["d"][:, 0], rig.axes["d"][:, 0])
+        answer = rig.cycle(mode=Mode.DELTA_POSITION)
+        np.testing.assert_array_equal(answer.axes["mode"], Mode.DELTA_POSITION)
+        assert not answer.axes["d"].any()
+
+
+class TestOnlyAxis:
+    """One axis is open and moved; the others keep the safe answer of closed ones."""
+
+    def moving(self, by: np.ndarray) -> Rig:
+        rig = Rig(only_axis=1)
+        rig.session.request(smooth_move(by, 300))
+        rig.close()
+        rig.modes = np.array([Mode.POSITION, *[Mode.CLOSED] * (N - 1)])
+        return rig
+
+    def test_only_its_slot_carries_set_points(self):
+        rig = self.moving(MOVE * (np.arange(N) == 0))
+        before = rig.axes["d"].copy()
+        for _ in range(200):
+            answer = rig.cycle()
+            assert rig.state is State.OPEN
+            np.testing.assert_array_equal(answer.axes["mode"], rig.modes)
+            np.testing.assert_array_equal(answer.axes["d"][1:, :2], before[1:, :2])
+            rig.axes["d"][0, :4] = [*answer.axes["d"][0, :2]] * 2
+        assert abs(rig.axes["d"][0, 0] - before[0, 0]) > 0.5
+
+    @pytest.mark.parametrize("joint", range(1, N))
+    def test_a_motion_of_another_joint_is_refused(self, joint):
+        rig = self.moving(MOVE * np.isin(np.arange(N), [0, joint]))
+        for _ in range(300):
+            answer = rig.cycle()
+            if rig.state is State.FAULTED:
+                break
+            rig.axes["d"][0, :4] = [*answer.axes["d"][0, :2]] * 2
+        assert type(rig.refusal) is AxisLeft
+        assert (rig.refusal.joint, rig.refusal.mode) == (joint, Mode.CLOSED)
+
+    def test_another_axis_that_opens_ends_the_motion(self):
+        rig = self.moving(MOVE * (np.arange(N) == 0))
+        rig.cycle()
+        rig.modes[2] = Mode.POSITION
+        rig.cycle()
+        assert type(rig.refusal) is AxisLeft
+        assert rig.refusal.joint == 2
+
+
+class TestRecords:
+    def test_one_record_per_answered_cyclic_packet_with_the_packet_in_si(self):
+        rig = Rig()
+        rig.start(cold=True)
+        rig.cycle(4, status=0)
+        rig.status = 5
+        rig.close()
+        d = rig.axes["d"]
+        d[:, 1] = [0.01, -0.02, 0.03, 0.0, 0.01, -0.01]
+        d[:, 3] = [0.02, -0.01, 0.01, 0.02, 0.0, 0.01]
+        d[:, 4] = [1, 2, 3, 4, 5, 6]
+        rig.axes["extra"] = np.arange(18).reshape(6, 3)
+        rig.cycle()
+        assert len(rig.records) == 6
+        record = rig.records[-1]
+        assert (record["cycle"], record["number"], record["gap"]) == (8, 18, 0)
+        assert (record["state"], record["status"]) == (State.CLOSED, 5)
+        assert record["arrival"] == pytest.approx(rig.now)
+        np.testing.assert_array_equal(record["mode"], Mode.CLOSED)
+        np.testing.assert_allclose(record["target_position"], START, atol=1e-6)
+        np.testing.assert_allclose(record["position"], START, atol=1e-6)
+        wire = d.astype(np.float64)
+        for name, column in (("target_velocity", 1), ("velocity", 3)):
+            expected = rig.train.joint_velocity(wire[:, column], PERIOD)
+            np.testing.assert_allclose(record[name], expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(record["target_current"], [1, 2, 3, 4, 5, 6])
+        np.testing.assert_array_equal(record["model_current"], [0, 3, 6, 9, 12, 15])
+        np.testing.assert_array_equal(record["diagonal_inertia"], [1, 4, 7, 10, 13, 16])
+        np.testing.assert_array_equal(record["extra3"], [2, 5, 8, 11, 14, 17])
+        assert np.isnan(record["commanded_position"]).all()
+        assert np.isnan(record["commanded_velocity"]).all()
+
+    def test_records_of_an_interval_hold_what_was_commanded_and_nothing_else_does(self):
+        source = smooth_move(MOVE, 300)
+        rig = running(source)
+        rig.run()
+        rig.cycle(5)
+        inside = rig.records[rig.records["interval"] == 0]
+        outside = rig.records[rig.records["interval"] == -1]
+        # first set-point, 300 more, 5 of settling of which the last asks for exit
+        assert len(inside) == 306
+        np.testing.assert_allclose(inside["commanded_position"][:301], source.positions, atol=1e-7)
+        np.testing.assert_allclose(
+            inside["commanded_velocity"][1:301], source.velocities[1:], atol=1e-4
+        )
+        assert set(inside["state"]) == {State.OPEN, State.EXITING}
+        assert np.isnan(outside["commanded_position"]).all()
+
+
+D1, D2, D3, D4, D5 = range(5)
+
+
+def fresh(n_axes: int = N) -> np.ndarray:
+    return np.zeros((n_axes, 8), np.uint16)
+
+
+class TestAgesInRecords:
+    def test_without_ages_all_is_fresh(self):
+        rig = closed()
+        assert not rig.records[-1]["age"].any()
+
+    def test_the_oldest_joint_counts(self):
+        rig = Rig()
+        rig.ages = fresh()
+        rig.ages[:, 1] = [3, 17, 4, 0, 65535, 2]
+        rig.ages[5, 7] = 9
+        rig.close()
+        assert rig.records[-1]["age"].tolist() == [0, 65535, 0, 0, 0, 0, 0, 9]
+        rig.ages = None
+        rig.cycle()
+        assert not rig.records[-1]["age"].any()
+
+    def test_axes_that_are_not_ours_do_not_count(self):
+        axes_map = np.full((4, 10), 0xFF)
+        axes_map[0, :N] = [6, 5, 4, 2, 1, 0]
+        axes_map[1, 0] = 3
+        init = init_packet(n_axes=7, open_axes_map=axes_map)
+        rig = Rig(init=init, slots=axes_map[0, :N], other_axes={(2, 1)})
+        rig.ages = fresh(7)
+        rig.ages[3] = 50
+        rig.ages[6, 0] = 2
+        rig.close()
+        assert rig.records[-1]["age"].tolist() == [2, 0, 0, 0, 0, 0, 0, 0]
+
+
+class TestAgesAtTheStart:
+    @pytest.mark.parametrize("mode", [4, 8])
+    @pytest.mark.parametrize("column", [D1, D3, D4])
+    def test_target_position_and_velocity_have_to_be_of_this_cycle(self, mode, column):
+        rig = Rig(mode=mode)
+        rig.ages = fresh()
+        rig.close()
+        rig.ages[3, column] = 1
+        assert (rig.cycle(mode=mode).axes["mode"] == 505).all()
+        error = rig.refusal
+        assert type(error) is FirstSetPointUnknown
+        assert (error.joint, error.value, error.bound, error.unit) == (3, 1.0, 0.0, "cycles")
+        assert rig.state is State.FAULTED
+
+    @pytest.mark.parametrize("column", [D2, D5, 5, 6, 7])
+    def test_the_others_need_not(self, column):
+        rig = Rig()
+        rig.ages = fresh()
+        rig.ages[:, column] = 40
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.open()
+        rig.run_to("completed")
+
+    @pytest.mark.parametrize("column", [D1, D3, D4])
+    def test_none_may_be_older_for_a_motion_that_begins_in_open_mode(self, column):
+        rig = opened()
+        rig.ages = fresh()
+        rig.ages[1, column] = 1
+        rig.cycle(5)
+        assert rig.state is State.OPEN
+        rig.session.request(still(5))
+        assert_refused(rig, rig.cycle(), FirstSetPointUnknown)
+
+
+class TestAgesAfterGaps:
+    def after(self, missed: int, column: int, age: int):
+        rig, source = moving()
+        rig.ages = fresh()
+        rig.ages[2, column] = age
+        rig.cycle(5)
+        assert rig.state is State.OPEN
+        rig.miss(missed)
+        return rig, source, rig.cycle()
+
+    @pytest.mark.parametrize("column", [D1, D2, D4])
+    def test_a_velocity_from_before_the_gap_says_nothing_about_it(self, column):
+        rig, source, answer = self.after(3, column, 1)
+        error = assert_refused(rig, answer, MotionUnknown)
+        assert isinstance(error, MotionHeld)
+        assert (error.joint, error.value, error.unit) == (2, 1.0, "cycles")
+        assert source.advances == 305
+
+    @pytest.mark.parametrize("column", [D1, D2, D4])
+    def test_one_of_this_cycle_does(self, column):
+        rig, source, _ = self.after(3, column, 0)
+        assert (rig.state, source.stops) == (State.OPEN, 1)
+
+    def test_short_gaps_are_bridged_whatever_the_ages(self):
+        rig, source, _ = self.after(2, D2, 60)
+        assert (rig.state, source.stops) == (State.OPEN, 0)
+
+    @pytest.mark.parametrize("leaving", [False, True])
+    def test_a_velocity_from_before_the_gap_says_nothing_of_an_arm_that_is_held(self, leaving):
+        rig = opened()
+        if leaving:
+            rig.session.stop()
+            rig.cycle()
+            assert rig.state is State.EXITING
+        rig.ages = fresh() + np.uint16(3)
+        rig.cycle()
+        rig.miss(10)
+        assert all_drive_off(rig.cycle())
+        assert type(rig.refusal) is MotionUnknown
+
+
+class TestTargetsGivenBack:
+    def opening(self) -> Rig:
+        rig = Rig()
+        rig.ages = fresh()
+        rig.close()
+        rig.axes["mode"][2] = Mode.POSITION
+        rig.cycle()
+        assert rig.state is State.OPENING
+        return rig
+
+    def test_one_of_an_earlier_cycle_is_not_given_to_an_axis_that_opens(self):
+        rig = self.opening()
+        rig.ages[4, D1] = 1
+        rig.cycle()
+        assert rig.state is State.OPENING, "axis 5 is closed"
+        rig.ages[2, D1] = 1
+        assert all_drive_off(rig.cycle())
+        error = rig.refusal
+        assert type(error) is FirstSetPointUnknown
+        assert (error.joint, error.value) == (2, 1.0)
+
+    def test_one_of_an_earlier_cycle_is_not_given_to_one_that_opens_again_on_the_way_out(self):
+        rig = Rig()
+        rig.ages = fresh()
+        rig.open()
+        rig.session.stop()
+        rig.cycle()
+        rig.axes["mode"][2] = Mode.CLOSED
+        rig.cycle()
+        rig.ages[:, D1] = 1
+        rig.cycle()
+        assert rig.state is State.EXITING, "axes still open are given the last set-point"
+        rig.axes["mode"][2] = Mode.POSITION
+        assert all_drive_off(rig.cycle())
+        assert type(rig.refusal) is FirstSetPointUnknown
+
+
+def test_a_motion_under_changing_ages_is_the_same_motion():
+    def replies(ages):
+        rig = running(Cruise())
+        for cycle in range(100):
+            rig.ages = ages(cycle)
+            rig.cycle()
+        return [reply for _, reply in rig.transcript]
+
+    rng = np.random.default_rng(5)
+    assert replies(lambda _: None) == replies(lambda _: rng.integers(0, 99, (N, 8), np.uint16))

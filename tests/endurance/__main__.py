@@ -36,9 +36,8 @@ from pathlib import Path
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
 from tests.arguments import time_above_0
-from tests.endurance.journal import Piece, read_journal
 from tests.endurance.piece import run_piece
-from tests.endurance.verdict import Verdict, judge
+from tests.endurance.verdict import Piece, Verdict, judge, read_journal
 from tests.journal import COMPRESSED, JournalError
 
 LONGEST = 90.0

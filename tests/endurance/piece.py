@@ -28,8 +28,8 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
-from tests.endurance.journal import SYNC_EVERY, Ran, Use
 from tests.endurance.stalls import so_far, watched
+from tests.endurance.verdict import SYNC_EVERY, Ran, Use
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 

@@ -18,9 +18,8 @@ import pytest
 
 from drivers.exchange.control import BINS, upper_edge
 from tests.endurance.__main__ import main
-from tests.endurance.journal import Piece, Ran, Sample, Use, read_journal
 from tests.endurance.piece import held, own_memory
-from tests.endurance.verdict import PROCESSES, judge
+from tests.endurance.verdict import PROCESSES, Piece, Ran, Sample, Use, judge, read_journal
 from tests.journal import Journal
 
 MIB = 2**20

@@ -20,9 +20,8 @@ from drivers import (
     Session,
 )
 from tests.drivers import oracle
-from tests.drivers.judge import POSITION_MODES, Conduct
-from tests.drivers.judged import Judged
-from tests.drivers.reception import number_of
+from tests.drivers.judge import POSITION_MODES, Conduct, Judged
+from tests.drivers.oracle import number_of
 from tests.drivers.sources import (
     FAULTS,
     WILD,

@@ -20,8 +20,7 @@ from mcap.records import Attachment, Chunk, Metadata
 from hil.archive import container, header
 from hil.archive.container import Damage, encoded
 from hil.archive.header import chunk_list
-from tests.fuzz.mutate_bytes import mutate_bytes
-from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.hil.mcap_bytes import Indexed
 from tests.hil.mcap_bytes import record as record_of
 

@@ -1,8 +1,10 @@
-"""The simulated arm: energy, equations of motion, friction and rest."""
+"""The simulated arm: plant, servo loops and gears."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from math import pi
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,15 @@ from sim_fixtures import (
     Plant,
     PlantDiverged,
     PlantTruth,
+    ServoSettings,
     SettingError,
+    SimulatedDrive,
     UnmodelledEffects,
     ns16,
 )
 from sim_fixtures.arm import FrictionDrift, TorqueRipple
 from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
+from sim_fixtures.servo import INERTIA_CYCLES, CurrentLoop, NominalModel, Servo
 
 Array = NDArray[np.float64]
 START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
@@ -360,3 +365,226 @@ def test_a_joint_slides_on_when_its_coulomb_torque_grows_a_little() -> None:
     """A guess just short of the bound must not pass for a torque that holds."""
     result = resolve_dry_friction([1.0], np.eye(1), [10.0 * (1.0 + 1e-9)], STEP, [10.0])
     assert result.velocity[0] > 0.9
+
+
+GRAVITY = (0.0, 0.0, -9.81)
+POSTURE = [0.2, -1.2, 2.5, 0.3, 1.0, 0.2]
+
+
+@pytest.fixture
+def make_servo(drive: SimulatedDrive, truth: PlantTruth) -> Callable[..., Servo]:
+    def make(resolution: float = 0.0, **gains: Any) -> Servo:
+        settings = ServoSettings(**gains)
+        model = NominalModel(
+            ns16.urdf_text(), truth, gravity=GRAVITY, error=settings.model_error,
+            rng=np.random.default_rng(2),
+        )  # fmt: skip
+        servo = Servo(drive, model, settings, period=0.001, current_resolution=resolution)
+        servo.start_at(drive.motor_revolutions(POSTURE))
+        return servo
+
+    return make
+
+
+def hold(servo: Servo) -> list[float]:
+    return servo.advance(servo.target, [0.0] * 6)
+
+
+def test_a_servo_at_rest_asks_for_the_model_current_alone(make_servo: Callable[..., Servo]) -> None:
+    servo = make_servo()
+    assert hold(servo) == servo.model_current
+    assert servo.model_current[1] != 0.0  # gravity
+
+
+def test_an_error_of_position_calls_for_current_that_reduces_it(
+    make_servo: Callable[..., Servo],
+) -> None:
+    servo = make_servo()
+    target = [p + 0.01 for p in servo.measured]
+    servo.advance(target, [0.0] * 6)
+    current = np.array(servo.advance(target, [0.0] * 6))
+    assert np.all(current > servo.model_current)  # positive current turns a motor forward
+
+
+def test_the_integral_takes_over_what_stays(make_servo: Callable[..., Servo]) -> None:
+    servo = make_servo()
+    target = [p + 0.01 for p in servo.measured]
+    first, *_, last = [servo.advance(target, [0.0] * 6) for _ in range(50)]
+    assert np.all(np.array(last) > np.array(first))
+
+
+def test_within_the_deadband_nothing_is_integrated(
+    make_servo: Callable[..., Servo], drive: SimulatedDrive
+) -> None:
+    servo = make_servo()
+    target = [p + 2.0 / drive.encoder_counts for p in servo.measured]
+    currents = [servo.advance(target, [0.0] * 6) for _ in range(50)]
+    settled = currents[INERTIA_CYCLES + 1]  # the gains are those of the new posture by then
+    np.testing.assert_allclose(currents[-1], settled, rtol=1e-12)
+
+
+def test_current_stays_within_its_limit_and_does_not_wind_up(
+    make_servo: Callable[..., Servo], drive: SimulatedDrive
+) -> None:
+    servo = make_servo()
+    home = list(servo.measured)
+    far = [p + 20.0 for p in home]
+    for _ in range(500):
+        current = servo.advance(far, [0.0] * 6)
+        assert np.all(np.abs(current) <= drive.current_limit)
+    assert current == list(drive.current_limit)
+    servo.advance(home, [0.0] * 6)
+    back = np.array(servo.advance(home, [0.0] * 6))
+    assert np.all(back < 0.5 * np.array(drive.current_limit))
+
+
+def test_target_currents_come_in_steps(make_servo: Callable[..., Servo]) -> None:
+    servo = make_servo(resolution=0.005)
+    steps = np.array(hold(servo)) / 0.005
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+
+
+def test_the_model_is_wrong_by_five_to_ten_per_cent(
+    drive: SimulatedDrive, truth: PlantTruth
+) -> None:
+    model = NominalModel(
+        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.05, 0.10), rng=np.random.default_rng(3)
+    )
+    off = np.abs(model.rotor_inertia / truth.rotor_inertia - 1.0)
+    assert np.all((off >= 0.05) & (off <= 0.10))
+    exact = NominalModel(
+        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
+    )
+    q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
+    truly = exact.torque(q, qd, qdd)
+    error = np.abs(model.torque(q, qd, qdd) - truly).max() / np.abs(truly).max()
+    assert 0.01 < error < 0.5
+
+
+def test_without_errors_the_model_is_the_plants(truth: PlantTruth) -> None:
+    import pinocchio as pin
+
+    exact = NominalModel(
+        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
+    )
+    plain = pin.buildModelFromXML(ns16.urdf_text())
+    q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
+    rigid = pin.rnea(plain, plain.createData(), q, qd, qdd) + truth.rotor_inertia * qdd
+    np.testing.assert_allclose(exact.torque(q, qd, qdd), rigid + truth.friction(qd), rtol=1e-12)
+    inertia = np.diag(pin.crba(plain, plain.createData(), q)) + truth.rotor_inertia
+    np.testing.assert_allclose(exact.diagonal_inertia(q), inertia, rtol=1e-12)
+
+
+@pytest.mark.parametrize("substeps", [1, 2, 5])
+def test_the_current_follows_with_the_stated_lag_whatever_the_substeps(substeps: int) -> None:
+    """Area above a step response is the time constant."""
+    lag, period = 0.0007, 0.001
+    loop = CurrentLoop(1, lag=lag, substep=period / substeps, delay_substeps=0)
+    missing = 0.0
+    for _ in range(50 * substeps):
+        missing += (1.0 - loop.substep([1.0], [0.0])[0]) * period / substeps
+    assert missing == pytest.approx(lag, rel=1e-12)
+
+
+def test_a_delay_shifts_the_current_by_whole_substeps() -> None:
+    loop = CurrentLoop(1, lag=0.0, substep=0.0005, delay_substeps=3)
+    flowing = [loop.substep([1.0], [0.0])[0] for _ in range(5)]
+    assert flowing == [0.0, 0.0, 0.0, 1.0, 1.0]
+    loop.cut()
+    assert loop.substep([1.0], [0.0])[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [{"position_gain": 0.0}, {"current_lag": -1.0}, {"model_error": (0.2, 0.1)}],
+)
+def test_impossible_gains_are_refused(gains: dict[str, Any]) -> None:
+    with pytest.raises(SettingError):
+        ServoSettings(**gains)
+
+
+angles = st.lists(st.floats(-7.0, 7.0), min_size=6, max_size=6)
+numbers = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
+
+
+@given(q=angles)
+def test_motor_positions_follow_the_formulas(
+    drive: SimulatedDrive, motor_matrix: Callable[[SimulatedDrive], Array], q: list[float]
+) -> None:
+    controller = np.array(q) * drive.joint_sign + drive.joint_offset
+    expected = motor_matrix(drive) @ controller + drive.calibration
+    np.testing.assert_allclose(drive.motor_revolutions(q), expected, rtol=1e-12, atol=1e-11)
+
+
+@given(q=angles)
+def test_motor_to_joint_undoes_joint_to_motor(drive: SimulatedDrive, q: list[float]) -> None:
+    np.testing.assert_allclose(drive.joint_angles(drive.motor_revolutions(q)), q, atol=1e-12)
+    np.testing.assert_allclose(drive.joint_speeds(drive.motor_speeds(q)), q, atol=1e-12)
+
+
+@given(qd=angles, currents=numbers)
+def test_power_at_the_motors_is_power_at_the_joints(
+    drive: SimulatedDrive, qd: list[float], currents: list[float]
+) -> None:
+    motor_torque = np.array(currents) * drive.torque_constant
+    motor_speed = 2.0 * pi * np.array(drive.motor_speeds(qd))
+    joint_power = np.dot(drive.joint_torques(currents), qd)
+    assert joint_power == pytest.approx(motor_torque @ motor_speed, rel=1e-10, abs=1e-6)
+
+
+@given(torques=numbers)
+def test_currents_give_the_torques_asked_for(drive: SimulatedDrive, torques: list[float]) -> None:
+    np.testing.assert_allclose(
+        drive.joint_torques(drive.currents(torques)), torques, rtol=1e-12, atol=1e-10
+    )
+
+
+def test_coupling_acts_on_4_and_5_and_nowhere_else(
+    drive: SimulatedDrive, make_drive: Callable[..., SimulatedDrive]
+) -> None:
+    plain = make_drive(k54=0.0, k64=0.0, k65=0.0)
+    one_ampere = [1.0] * 6
+    difference = np.subtract(drive.joint_torques(one_ampere), plain.joint_torques(one_ampere))
+    np.testing.assert_allclose(difference[[0, 1, 2, 5]], 0.0, atol=0.0)
+    assert np.all(np.abs(difference[[3, 4]]) > 0.1)
+
+
+def test_encoders_read_whole_counts(drive: SimulatedDrive) -> None:
+    positions = [0.1, -2.34567, 57.0000001, 3.0, -0.00001, 12.5]
+    read = np.array(drive.encoder(positions, [0.0] * 6))
+    counts = read * drive.encoder_counts
+    np.testing.assert_array_equal(counts, np.round(counts))
+    assert np.abs(read - positions).max() <= 0.5 / drive.encoder_counts
+    shifted = np.array(drive.encoder(positions, [2.0] * 6))
+    np.testing.assert_allclose((shifted - read) * drive.encoder_counts, 2.0, atol=1e-6)
+
+
+def test_an_arm_without_a_wrist_needs_no_coupling() -> None:
+    two = [1.0, 1.0]
+    drive = SimulatedDrive([100.0, -50.0], [0.5, 0.0], two, [0.0, 0.1], two, two, two, 4096)
+    np.testing.assert_allclose(drive.joint_angles(drive.motor_revolutions([0.3, 0.4])), [0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"gear_ratio": [100.0] * 5 + [0.0]}, "gear_ratio"),
+        ({"calibration": [0.0] * 5}, "calibration"),
+        ({"joint_sign": [2.0] * 6}, "joint_sign"),
+        ({"torque_constant": [-1.0] * 6}, "torque_constant"),
+        ({"current_limit": [float("nan")] * 6}, "current_limit"),
+        ({"k54": float("inf")}, "k54"),
+        ({"encoder_counts": 0}, "encoder_counts"),
+    ],
+)
+def test_impossible_figures_are_refused_by_name(
+    make_drive: Callable[..., SimulatedDrive], change: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(SettingError, match=name):
+        make_drive(**change)
+
+
+def test_coupling_without_a_wrist_is_refused() -> None:
+    two = [1.0, 1.0]
+    with pytest.raises(SettingError, match="below six axes"):
+        SimulatedDrive(two, two, two, two, two, two, two, 4096, k54=0.1)

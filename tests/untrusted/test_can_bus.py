@@ -19,8 +19,7 @@ from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.transport import CanTransport
 from sim_fixtures import Phase
 from sim_fixtures.can_end import CanFarEnd
-from tests.drivers.can_bench import HOME, PROFILES, Cycles, UnstampedBus
-from tests.drivers.can_run import MOVE, PERIOD, Run
+from tests.drivers.can_bench import HOME, MOVE, PERIOD, PROFILES, Cycles, Run, UnstampedBus
 
 ANSWERS = {0x100, 0x120, 0x121, 0x122, 0x180}
 """Identifiers of what the PC says (`docs/can.md`)."""

@@ -11,7 +11,7 @@ import numpy as np
 from hil.cell import Cell, CellError
 from hil.cell.text import NoTableError
 from hil.errors import HilError
-from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import CELL, URDF
 

@@ -17,8 +17,7 @@ from drivers.packets import (
 )
 from drivers.transports.can.bus_load import BusRates
 from tests.fuzz.can_talk import Talk
-from tests.fuzz.draw import Draw
-from tests.fuzz.mutate_bytes import mutate_bytes
+from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 
 GENTLE = np.array((0, 0, 1, 192, 194, 201), np.uint8)

@@ -20,7 +20,7 @@ from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
 from hil.errors import InputError
 from hil.results import Results
-from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import fast_campaign, fast_cell
 

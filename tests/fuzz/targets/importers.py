@@ -15,9 +15,8 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.errors import ArchiveWriteError, InputError, SourceError
 from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
-from tests.fuzz.mutate_bytes import mutate_bytes
+from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.fuzz.mutate_mcap import mutate_mcap
-from tests.fuzz.mutate_text import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.test_importers_rosbag2 import STATE, STORE, URDF, bag, mcap, states
 from tests.hil.test_importers_rosbag2 import many as messages

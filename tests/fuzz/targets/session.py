@@ -6,8 +6,7 @@ import random
 
 from drivers import State
 from tests.fuzz.conversation import Conversation
-from tests.fuzz.draw import Draw
-from tests.fuzz.mutate_bytes import mutate_bytes
+from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 
 

@@ -19,7 +19,7 @@ from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.errors import CollisionModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.robot import RobotModel
-from tests.fuzz.mutate_text import mutate_text
+from tests.fuzz.draw import mutate_text
 from tests.fuzz.targets import Target, place_of
 from tests.hil.fast_cell import URDF
 

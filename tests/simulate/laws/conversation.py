@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.events import Event, InitReceived
 from tests.drivers import oracle
-from tests.drivers.reception import LAST, Kind, Reception, number_of
+from tests.drivers.oracle import LAST, Kind, Reception, number_of
 from tests.simulate.observed import Exchanged, Life, Observed
 
 from .wire import CLOSED, PAUSES, Flags, Init, Packets, SafeAnswers, safe_answers

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from tests.drivers import oracle
-from tests.drivers.reception import LAST, number_of
+from tests.drivers.oracle import LAST, number_of
 from tests.simulate.observed import Broken, Life, Observed
 
 from .conversation import Heard, Talk, heard

@@ -1,0 +1,319 @@
+"""The NS 16: its URDF, its planted parameters (Table 2 of the paper), its cell file."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from sim_fixtures import ControllerSettings, FixtureError, ns16
+from sim_fixtures.ns16 import LinkInertia, geometry, inertial
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def model() -> pin.Model:
+    return pin.buildModelFromXML(ns16.urdf_text())
+
+
+def dh(controller_deg: list[float]) -> Array:
+    """DH angles [rad] of controller angles [deg]."""
+    angles = np.array(controller_deg) - geometry.JOINT_OFFSET_DEG
+    return np.radians(angles * geometry.JOINT_SIGN)
+
+
+def wrist_and_flange(model: pin.Model, controller_deg: list[float]) -> tuple[Array, Array]:
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, dh(controller_deg))
+    flange = data.oMf[model.getFrameId("flange")].translation
+    return np.array(data.oMi[6].translation), np.array(flange)
+
+
+def test_the_file_has_the_nominal_inertias() -> None:
+    cell = tomllib.loads(ns16.CELL_PATH.read_text(encoding="utf-8"))
+    nominal = ns16.urdf_text(cell["simulation"]["inertia_scale"])
+    assert ns16.URDF_PATH.read_text(encoding="utf-8") == nominal
+
+
+def test_pinocchio_reads_the_planted_standard_parameters(model: pin.Model) -> None:
+    planted = ns16.standard_parameters()
+    for i in range(1, 7):
+        keys = [f"m{i}", *(f"mc{i}{a}" for a in "xyz")]
+        keys += [f"I{i}{k}" for k in ("xx", "xy", "yy", "xz", "yz", "zz")]
+        read = model.inertias[i].toDynamicParameters()
+        np.testing.assert_allclose(read, [planted[k] for k in keys], rtol=1e-12, atol=1e-12)
+
+
+def test_every_link_is_a_possible_rigid_body(model: pin.Model) -> None:
+    for inertia in list(model.inertias)[1:]:
+        moments = np.linalg.eigvalsh(inertia.inertia)
+        assert moments[0] > 0.0
+        assert moments[2] < moments[0] + moments[1]
+
+
+def test_an_impossible_body_is_refused() -> None:
+    with pytest.raises(FixtureError, match="link_9"):
+        inertial(LinkInertia(1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.1, 0.0, 0.1)), "link_9")
+
+
+def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) -> None:
+    """Independent of the URDF: multiply the DH matrices."""
+    q = np.array([0.3, -0.7, 1.9, 0.4, -1.1, 2.0])
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    before = np.eye(4)
+    for i in range(6):
+        alpha = geometry.ALPHA_QUARTER_TURNS[i] * np.pi / 2
+        c, s, ca, sa = np.cos(q[i]), np.sin(q[i]), np.cos(alpha), np.sin(alpha)
+        after = before @ np.array(
+            [
+                [c, -s * ca, s * sa, geometry.A[i] * c],
+                [s, c * ca, -c * sa, geometry.A[i] * s],
+                [0.0, sa, ca, geometry.D[i]],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+        placement = data.oMi[i + 1]
+        np.testing.assert_allclose(placement.rotation, after[:3, :3], atol=1e-14)
+        origin = before[:3, 3] + ([0.0, 0.0, 0.6] if i == 0 else 0.0)  # O_0 at joint 2's height
+        np.testing.assert_allclose(placement.translation, origin, atol=1e-14)
+        before = after
+
+
+def test_home_has_the_wrist_in_front_of_and_above_the_base(model: pin.Model) -> None:
+    wrist, flange = wrist_and_flange(model, list(geometry.HOME_DEG))
+    np.testing.assert_allclose(wrist, [0.300 + 0.624, 0.0, 0.600 + 0.700 - 0.185], atol=1e-12)
+    # a wrist bent by 90 deg turns the flange out of the forearm's line, straight up or down
+    np.testing.assert_allclose(np.abs(flange - wrist), [0.0, 0.0, 0.135], atol=1e-12)
+
+
+def test_joint_2_forward_is_positive_on_the_teach_pendant(model: pin.Model) -> None:
+    upright, _ = wrist_and_flange(model, [0.0, 0.0, -90.0, 0.0, 0.0, 0.0])
+    leaning, _ = wrist_and_flange(model, [0.0, 10.0, -90.0, 0.0, 0.0, 0.0])
+    assert leaning[0] > upright[0]
+    assert leaning[2] < upright[2]
+
+
+def test_limits_are_the_controllers_mapped_to_dh_angles(model: pin.Model) -> None:
+    np.testing.assert_allclose(
+        np.degrees(np.column_stack([model.lowerPositionLimit, model.upperPositionLimit])),
+        [(-180, 180), (-140, 5), (-20, 260), (-360, 360), (-120, 120), (-360, 360)],
+        atol=1e-12,
+    )
+    ends = np.sort([dh(list(geometry.LOWER_DEG)), dh(list(geometry.UPPER_DEG))], axis=0)
+    np.testing.assert_allclose(ends[0], model.lowerPositionLimit, atol=1e-12)
+    np.testing.assert_allclose(ends[1], model.upperPositionLimit, atol=1e-12)
+
+
+class Collisions:
+    """Distances between the shapes of links that are not neighbours."""
+
+    def __init__(self, model: pin.Model) -> None:
+        self.model = model
+        self.shapes = pin.buildGeomFromUrdfString(
+            model, ns16.urdf_text(), pin.GeometryType.COLLISION
+        )
+        objects = list(self.shapes.geometryObjects)
+        for a, first in enumerate(objects):
+            for b, second in enumerate(objects[:a]):
+                if abs(first.parentJoint - second.parentJoint) > 1:
+                    self.shapes.addCollisionPair(pin.CollisionPair(b, a))
+
+    def smallest_distance(self, q: Array) -> float:
+        data, shapes = self.model.createData(), self.shapes.createData()
+        pin.computeDistances(self.model, data, self.shapes, shapes, q)
+        return min(result.min_distance for result in shapes.distanceResults)
+
+
+@pytest.fixture(scope="module")
+def collisions(model: pin.Model) -> Collisions:
+    return Collisions(model)
+
+
+@pytest.mark.parametrize("wrist_deg", [-120.0, -90.0, 0.0, 90.0, 120.0])
+@pytest.mark.parametrize("forearm_deg", [-130.0, -90.0, -45.0, 0.0, 45.0])
+@pytest.mark.parametrize("arm_deg", [-50.0, 0.0, 45.0, 90.0])
+def test_working_postures_are_free_by_the_cells_margin(
+    collisions: Collisions, arm_deg: float, forearm_deg: float, wrist_deg: float
+) -> None:
+    q = dh([0.0, arm_deg, forearm_deg, 30.0, wrist_deg, 0.0])
+    assert collisions.smallest_distance(q) > 0.05
+
+
+def test_a_folded_arm_collides(collisions: Collisions) -> None:
+    assert collisions.smallest_distance(dh([0.0, 0.0, -165.0, 0.0, 0.0, 0.0])) <= 0.0
+
+
+PRINT_PRECISION = 0.0005  # the table prints three decimals
+FACTOR_PRECISION = 0.001  # and cuts factors off after three
+TENSOR_ORDER = ("xx", "xy", "yy", "xz", "yz", "zz")  # of pinocchio's parameter vector
+
+
+def column_names() -> list[str]:
+    """Names of the columns of pinocchio's torque regressor, then of the rotors' columns."""
+    names = []
+    for i in range(1, 7):
+        names += [f"m{i}", f"mc{i}x", f"mc{i}y", f"mc{i}z"]
+        names += [f"I{i}{key}" for key in TENSOR_ORDER]
+    return names + [f"I{i}m" for i in range(1, 7)]
+
+
+def full_regressor(model: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
+    links = pin.computeJointTorqueRegressor(model, model.createData(), q, qd, qdd)
+    return np.hstack([links, np.diag(qdd)])
+
+
+def base_regressor(model: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
+    """Each base column is the column of the row's pivot, with its sign."""
+    names = column_names()
+    rows = ns16.TABLE2[: ns16.N_ESSENTIAL]
+    columns = [names.index(row.pivot) for row in rows]
+    signs = np.array([row.sign for row in rows])
+    return full_regressor(model, q, qd, qdd)[:, columns] * signs
+
+
+def test_there_are_58_rows_in_order() -> None:
+    assert [row.id for row in ns16.TABLE2] == list(range(1, 59))
+    assert [row.parameter for row in ns16.TABLE2[40:46]] == [
+        f"{kind}_{axis}" for axis in (1, 2, 3) for kind in ("f0", "f1")
+    ]
+
+
+def test_the_planted_base_vector_is_column_c_of_all_forty_rows() -> None:
+    base = ns16.base_from_standard(ns16.standard_parameters())
+    printed = np.array([row.pi_c for row in ns16.TABLE2[: ns16.N_ESSENTIAL]])
+    assert base.shape == (40,)
+    np.testing.assert_allclose(base, printed, rtol=0.0, atol=PRINT_PRECISION)
+    # the planted member of the feasible family fits the printed figures far better than they print
+    np.testing.assert_allclose(base, printed, rtol=0.0, atol=1e-6)
+
+
+def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> None:
+    column = {row.parameter: row.pi_c for row in ns16.TABLE2}
+    truth = ns16.load_truth()
+    assert truth.coulomb == tuple(column[f"f0_{i}"] for i in range(1, 7))
+    per_degree = [column[f"f1_{i}"] for i in range(1, 7)]
+    np.testing.assert_allclose(np.radians(truth.viscous), per_degree, rtol=1e-14)
+    # Coulomb friction falls with the size of the axis, which is how the interleaving shows
+    assert truth.coulomb[0] > truth.coulomb[2] > truth.coulomb[3] > truth.coulomb[5]
+
+
+def test_factors_are_exact_products_of_the_link_lengths() -> None:
+    rows = {row.id: row for row in ns16.TABLE2}
+    assert rows[29].terms["m5"] == 0.624
+    assert rows[30].terms["m6"] == pytest.approx(0.624**2 - 0.185**2, rel=1e-15)
+    assert rows[31].terms["mc4y"] == -0.185
+    assert rows[23].terms["m4"] == pytest.approx(0.3**2 + 0.7**2 + 0.185**2, rel=1e-15)
+
+
+@pytest.mark.parametrize("row_id", range(23, 41))
+def test_the_print_names_the_same_terms_rounded(row_id: int) -> None:
+    row = ns16.TABLE2[row_id - 1]
+    printed: dict[str, float] = {}
+    factor, sign = 1.0, 1.0
+    for word in row.printed_symbol.split():
+        if word in "+-":
+            sign, factor = (1.0 if word == "+" else -1.0), 1.0
+        elif word[0].isdigit():
+            factor = float(word)
+        else:
+            printed[word] = sign * factor
+            sign, factor = 1.0, 1.0
+    assert printed == pytest.approx(dict(row.terms), abs=FACTOR_PRECISION)
+
+
+def test_forty_columns_are_independent_and_nothing_else_is(model: pin.Model) -> None:
+    rng = np.random.default_rng(1)
+    states = [rng.uniform(-2.0, 2.0, (3, 6)) for _ in range(40)]
+    full = np.vstack([full_regressor(model, *s) for s in states])
+    base = np.vstack([base_regressor(model, *s) for s in states])
+    assert np.linalg.matrix_rank(base) == 40
+    assert np.linalg.matrix_rank(full, tol=1e-9 * np.linalg.norm(full)) == 40
+
+
+def test_base_torques_are_the_torques_of_the_rigid_bodies_and_rotors(model: pin.Model) -> None:
+    rng = np.random.default_rng(2)
+    base = ns16.base_from_standard(ns16.standard_parameters())
+    rotors = np.array(ns16.load_truth().rotor_inertia)
+    data = model.createData()
+    for _ in range(50):
+        q, qd, qdd = rng.uniform(-3.0, 3.0, (3, 6))
+        expected = pin.rnea(model, data, q, qd, qdd) + rotors * qdd
+        torque = base_regressor(model, q, qd, qdd) @ base
+        np.testing.assert_allclose(torque, expected, rtol=0.0, atol=1e-9)
+
+
+def test_the_planted_figures_are_those_of_the_truth(cell: dict[str, Any]) -> None:
+    planted, truth = cell["simulation"], ns16.load_truth()
+    for name in ("rotor_inertia", "coulomb", "viscous", "third"):
+        assert tuple(planted[name]) == getattr(truth, name), name
+
+
+class TestNominal:
+    """Law: figures known before the arm moves are 10 to 20 % off the planted ones, both ways."""
+
+    @pytest.mark.parametrize("name", ["rotor_inertia", "coulomb", "viscous"])
+    def test_drives(self, cell: dict[str, Any], name: str) -> None:
+        self.check(np.divide(cell["nominal"][name], cell["simulation"][name]))
+
+    def test_links(self) -> None:
+        """The planted links are those of Table 2, however the URDF of the cell has them."""
+        nominal, planted = (
+            np.array([body.toDynamicParameters() for body in list(model.inertias)[1:]])
+            for model in (
+                pin.buildModelFromXML(text)
+                for text in (ns16.URDF_PATH.read_text(encoding="utf-8"), ns16.urdf_text())
+            )
+        )
+        scale = nominal[:, 0] / planted[:, 0]
+        self.check(scale)
+        np.testing.assert_allclose(nominal, scale[:, None] * planted, rtol=1e-12, atol=1e-14)
+
+    def check(self, share: Array) -> None:
+        errors = np.abs(share - 1.0)
+        assert np.all((errors > 0.0995) & (errors < 0.2005))  # figures of 4 digits
+        assert share.min() < 1.0 < share.max()
+
+
+def test_the_limits_and_signs_are_those_of_the_geometry(cell: dict[str, Any]) -> None:
+    limits, train = cell["limits"], cell["drive_train"]
+    assert limits["frame"] == "controller"
+    assert tuple(limits["lower_deg"]) == geometry.LOWER_DEG
+    assert tuple(limits["upper_deg"]) == geometry.UPPER_DEG
+    assert tuple(limits["velocity_deg"]) == geometry.VELOCITY_DEG
+    assert tuple(train["joint_sign"]) == geometry.JOINT_SIGN
+    assert tuple(train["joint_offset_deg"]) == geometry.JOINT_OFFSET_DEG
+    assert tuple(cell["campaign"]["home_deg"]) == geometry.HOME_DEG
+
+
+def test_nothing_of_the_drive_train_is_trivial(cell: dict[str, Any]) -> None:
+    """Zeros would hide mistakes in coupling and calibration."""
+    train = cell["drive_train"]
+    assert all(train[k] for k in ("k54", "k64", "k65"))
+    assert all(train["calibration"])
+    assert len({np.sign(ratio) for ratio in train["gear_ratio"]}) == 2
+
+
+def test_every_assumed_field_exists(cell: dict[str, Any]) -> None:
+    for path in cell["cell"]["assumed"]:
+        section, name = path.split(".")
+        assert name in cell[section], path
+
+
+def test_everything_unpublished_about_the_drives_is_marked_assumed(cell: dict[str, Any]) -> None:
+    assumed = set(cell["cell"]["assumed"])
+    published = {"joint_sign", "joint_offset_deg"}
+    for name in set(cell["drive_train"]) - published:
+        assert f"drive_train.{name}" in assumed
+
+
+def test_the_stated_current_delay_is_that_of_the_default_servo(cell: dict[str, Any]) -> None:
+    settings = ControllerSettings()
+    assert cell["controller"]["cycle_ms"] == 1000.0 * settings.period
+    delay = 0.5 - settings.servo.current_lag / settings.period
+    assert cell["controller"]["current_delay_cycles"] == delay
