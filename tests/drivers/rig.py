@@ -198,6 +198,13 @@ def smooth_move(distance, cycles: int, start=START) -> Table:
     return Table(np.asarray(start) + share * np.asarray(distance))
 
 
+class Unspeakable(BaseException):
+    """One whose message cannot be had either."""
+
+    def __str__(self):
+        raise KeyboardInterrupt
+
+
 class Rig:
     """Session and controller. The arm is where the last answer told it to be."""
 
@@ -389,6 +396,13 @@ def moving(cycles: int = 300, **options) -> tuple[Rig, Cruise]:
     rig = running(source, cycles, **options)
     assert rig.state is State.OPEN
     return rig, source
+
+
+def exiting(**options) -> Rig:
+    """A short motion is over, and the end of open mode was asked for."""
+    rig = running(still(2), 6, **options)
+    assert rig.state is State.EXITING
+    return rig
 
 
 def all_drive_off(answer: CyclicPacket) -> bool:

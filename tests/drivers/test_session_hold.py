@@ -25,6 +25,7 @@ from tests.drivers.rig import (
     GoesOn,
     N,
     Rig,
+    Unspeakable,
     all_drive_off,
     assert_refused,
     closed,
@@ -282,35 +283,7 @@ class TestResume:
             rig.session.resume()
 
 
-class Unspeakable(BaseException):
-    def __str__(self):
-        raise KeyboardInterrupt
-
-
 class TestSourcesThatRaiseAnything:
-    @pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, GeneratorExit, Unspeakable])
-    @pytest.mark.parametrize("where", ["begin", "advance", "stop", "finished", "bounds"])
-    def test_become_refusals(self, kind, where):
-        def fails(self, *_):
-            raise kind
-
-        named = property(fails) if where in ("finished", "bounds") else fails
-        source = type("Odd", (Cruise,), {where: named, "__init__": lambda self: None})
-        for name, value in vars(Cruise()).items():
-            if name != where:
-                setattr(source, name, value)
-        rig = Rig()
-        rig.session.request(source())
-        answer = rig.open()
-        if where == "stop":
-            rig.cycle(50)
-            rig.session.stop()
-        if where != "begin" and where != "finished":
-            answer = rig.cycle()
-        assert all_drive_off(answer)
-        assert type(rig.refusal) is SourceFailed
-        assert kind.__name__ in str(rig.refusal)
-
     def test_so_does_a_property_where_a_method_should_be(self):
         def fails(self):
             raise SystemExit("no")

@@ -405,29 +405,6 @@ class TestCorrections:
         rig.run()
         assert (rig.ended.outcome, source.stops) == ("stopped", 1)
 
-    @pytest.mark.parametrize("what", ["begin", "advance", "finished", "stop"])
-    def test_a_source_that_raises(self, what):
-        def fails(self):
-            raise ZeroDivisionError("no row 17")
-
-        odd = type("Odd", (Correction,), {what: property(fails) if what == "finished" else fails})
-        rig = Rig(mode=8)
-        rig.session.request(odd(rows=20))
-        answer = rig.open()
-        if what == "stop":
-            rig.session.stop()
-        if what in ("advance", "stop"):
-            answer = rig.cycle()
-        error = assert_refused(rig, answer, SourceFailed)
-        assert "ZeroDivisionError: no row 17" in str(error)
-
-    @pytest.mark.parametrize("given", [None, 1.0, (1.0, 2.0), (np.zeros(5), np.zeros(6))])
-    def test_a_source_that_gives_something_else(self, given):
-        source = Correction(rows=20)
-        source.advance = lambda: given
-        rig = begun(8, source)
-        assert_refused(rig, rig.cycle(), SourceFailed)
-
     def test_a_source_may_reuse_its_arrays(self):
         class Reusing(Correction):
             buffer = np.zeros(N), np.zeros(N)

@@ -7,13 +7,10 @@ import pytest
 
 from drivers import (
     AxisLeft,
-    CurrentLimit,
-    FirstSetPoint,
     Mode,
     MotionEnded,
     MotionHeld,
     MotionStarted,
-    NotAtStandstill,
     PositionLimit,
     RequestError,
     State,
@@ -233,18 +230,6 @@ class TestFirstSetPoint:
         assert np.isnan(rig.records[-1]["commanded_position"]).all()
         return rig.refusal
 
-    @pytest.mark.parametrize("joint", range(N))
-    @pytest.mark.parametrize("sign", [-1, 1])
-    def test_a_target_away_from_the_arm_is_refused(self, joint, sign):
-        def change(d):
-            d[joint, 2] = d[joint, 0] + sign * 0.21
-
-        error = self.refused(self.opening_with(change))
-        assert type(error) is FirstSetPoint
-        assert error.joint == joint
-        assert error.value == pytest.approx(0.21, abs=1e-5)
-        assert error.bound == pytest.approx(0.2)
-
     def test_the_narrower_threshold_of_cell_and_controller_counts(self):
         def change(d):
             d[1, 2] += 0.06
@@ -255,21 +240,6 @@ class TestFirstSetPoint:
         )
         controller = init_packet(arm_1={"following_error": np.full(N, 0.5)})
         assert self.refused(self.opening_with(change, init=controller)).bound == pytest.approx(0.05)
-
-    @pytest.mark.parametrize("field", [1, 3], ids=["target", "actual"])
-    def test_an_axis_in_motion_is_refused(self, field):
-        def change(d):
-            d[2, field] = -0.001
-
-        error = self.refused(self.opening_with(change))
-        assert type(error) is NotAtStandstill
-        assert error.joint == 2
-
-    def test_an_axis_that_already_needs_too_much_current_is_refused(self):
-        def change(d):
-            d[3, 4] = 20.1
-
-        assert type(self.refused(self.opening_with(change))) is CurrentLimit
 
     def test_an_arm_outside_its_range_is_refused(self):
         rig = Rig()

@@ -9,11 +9,15 @@ from drivers import (
     AccelerationLimit,
     CurrentLimit,
     CyclicPacket,
+    FirstSetPoint,
     FollowingError,
     JerkLimit,
     LinkLost,
     Mode,
     ModeRefused,
+    MotionNotCarriedOn,
+    MotionStarted,
+    NotAtStandstill,
     NotFinite,
     RefusalError,
     Refused,
@@ -32,14 +36,17 @@ from drivers.session import FLIGHT_RECORDER, MAX_GAP, STOP_TIMEOUT
 from tests.drivers.rig import (
     PERIOD,
     START,
+    Correction,
     Cruise,
     GoesOn,
     N,
     Rig,
     Table,
+    Unspeakable,
     all_drive_off,
     assert_refused,
     closed,
+    exiting,
     init_packet,
     limits,
     moving,
@@ -106,55 +113,6 @@ class TestRefusedSetPoints:
         source.bounds = "override"
         assert_refused(rig, rig.cycle(), SourceFailed)
 
-    def test_a_source_that_raises(self):
-        class Broken(Cruise):
-            def advance(self):
-                raise ZeroDivisionError("no row 17")
-
-        rig = running(Broken())
-        error = assert_refused(rig, rig.cycle(), SourceFailed)
-        assert isinstance(error.__cause__, ZeroDivisionError)
-
-    @pytest.mark.parametrize(
-        "answer",
-        [(START[:5], np.zeros(6)), (START, 0.0), (None, None), ("x", "y"), START],
-    )
-    def test_a_source_that_gives_something_else(self, answer):
-        class Odd(Cruise):
-            def advance(self):
-                return answer
-
-        rig = running(Odd())
-        assert_refused(rig, rig.cycle(), SourceFailed)
-
-    @pytest.mark.parametrize(
-        "bounds", ["whatever", None, 1, np.array(["plan"]), np.full(2, "plan"), ["plan"]]
-    )
-    @pytest.mark.parametrize("finished", [False, True])
-    def test_a_source_that_names_no_set_of_bounds(self, bounds, finished):
-        source = Cruise()
-        source.bounds, source.finished = bounds, finished
-        rig = running(source)
-        assert_refused(rig, rig.cycle(), SourceFailed)
-
-    @pytest.mark.parametrize("from_cycle", [0, 1])
-    def test_a_source_that_cannot_say_whether_it_is_over(self, from_cycle):
-        class Unclear(Cruise):
-            @property
-            def finished(self):
-                return self.advances >= from_cycle and np.array([True, False])
-
-            @finished.setter
-            def finished(self, value):
-                pass
-
-        rig = Rig()
-        rig.session.request(Unclear())
-        answer = rig.open()
-        if from_cycle:
-            answer = rig.cycle()
-        assert_refused(rig, answer, SourceFailed)
-
     def test_a_source_that_ignores_a_stop(self):
         class Deaf(Cruise):
             SPEED = 0.1
@@ -174,12 +132,6 @@ class TestRefusedSetPoints:
         rig.session.stop()
         rig.run(12_000)
         assert rig.ended.outcome == "stopped"
-
-    def test_a_source_that_fails_to_stop(self):
-        rig, source = moving()
-        source.stop = None
-        rig.session.stop()
-        assert_refused(rig, rig.cycle(), SourceFailed)
 
 
 class Narrowing(GoesOn):
@@ -228,6 +180,139 @@ class TestNarrowingBounds:
         assert rig.refusal.value > 150.0
 
 
+NO_STEP = [None, 1.0, (1.0, 2.0), (None, None), ("x", "y"), START, (START[:5], np.zeros(6))]
+
+
+class TestSources:
+    """Whatever a source does wrong, its motion or correction is refused."""
+
+    def refused(self, base: type, *, stopped: bool = False, **parts) -> SourceFailed:
+        """Why a source with these methods and properties was refused."""
+        odd = type("Odd", (base,), {"__init__": lambda self: None, **parts})()
+        usual = Correction(rows=90) if base is Correction else base()
+        for name in vars(usual).keys() - parts.keys():
+            setattr(odd, name, getattr(usual, name))
+        rig = Rig(mode=Mode.VELOCITY if base is Correction else Mode.POSITION)
+        rig.session.request(odd)
+        answer = rig.open()
+        if stopped:
+            rig.cycle(50)
+            rig.session.stop()
+        if rig.state is State.OPEN:
+            answer = rig.cycle()
+        return assert_refused(rig, answer, SourceFailed)
+
+    @pytest.mark.parametrize(
+        ("base", "where"),
+        [
+            *((Cruise, part) for part in ("begin", "advance", "stop", "finished", "bounds")),
+            *((Correction, part) for part in ("begin", "advance", "stop", "finished")),
+        ],
+    )
+    @pytest.mark.parametrize(
+        "kind", [ZeroDivisionError, SystemExit, KeyboardInterrupt, GeneratorExit, Unspeakable]
+    )
+    def test_by_raising_anything_anywhere(self, base, where, kind):
+        def fails(self, *_):
+            raise kind
+
+        part = property(fails) if where in ("finished", "bounds") else fails
+        error = self.refused(base, stopped=where == "stop", **{where: part})
+        assert kind.__name__ in str(error)
+        assert isinstance(error.__cause__, kind)
+
+    @pytest.mark.parametrize("base", [Cruise, Correction])
+    @pytest.mark.parametrize("given", [*NO_STEP, (START, 0.0)])
+    def test_by_giving_what_is_no_step(self, base, given):
+        self.refused(base, advance=lambda self: given)
+
+    @pytest.mark.parametrize(
+        "bounds", ["whatever", None, 1, np.array(["plan"]), np.full(2, "plan"), ["plan"]]
+    )
+    @pytest.mark.parametrize("finished", [False, True])
+    def test_by_naming_no_set_of_bounds(self, bounds, finished):
+        self.refused(
+            Cruise, bounds=property(lambda _: bounds), finished=property(lambda _: finished)
+        )
+
+    @pytest.mark.parametrize("from_cycle", [0, 1])
+    def test_by_not_saying_whether_it_is_over(self, from_cycle):
+        def unclear(self):
+            return self.advances >= from_cycle and np.array([True, False])
+
+        self.refused(Cruise, finished=property(unclear))
+
+
+FOLLOWING = {"moving": lambda: moving()[0], "leaving": exiting, "held": lambda: opened(20)}
+
+
+class TestFeedback:
+    """Thresholds of 2 revolutions and 20 A; a target may be a tenth of the threshold off."""
+
+    @pytest.mark.parametrize(
+        ("situation", "columns", "near", "far", "kind"),
+        [
+            *((of, [2], 1.99, 2.01, FollowingError) for of in FOLLOWING),
+            # The controller may have missed our answers; the arm counts, not its target.
+            *((of, [0, 2], 0.19, 2.01, FollowingError) for of in ("moving", "leaving")),
+            *((of, [0, 2], 0.19, 0.21, MotionNotCarriedOn) for of in FOLLOWING),
+            *((of, [0], 0.19, 0.21, MotionNotCarriedOn) for of in FOLLOWING),
+            *((of, [4], 19.9, 20.1, CurrentLimit) for of in FOLLOWING),
+            *((of, [column], 0.0, np.nan, NotFinite) for of in FOLLOWING for column in (0, 2, 4)),
+        ],
+    )
+    def test_what_is_too_far_off_is_refused(self, situation, columns, near, far, kind):
+        for sign in (-1.0, 1.0):
+            rig = FOLLOWING[situation]()
+            rig.axes["d"][3, columns] += sign * near
+            rig.cycle()
+            assert not rig.seen(Refused)
+            rig.axes["d"][3, 4] = 0.0
+            rig.axes["d"][3, columns] += sign * far
+            answer = rig.cycle()
+            assert (type(rig.refusal), rig.refusal.joint) == (kind, 3)
+            modes = [4, 4, 4, 508, 4, 4] if kind is FollowingError else [505] * N
+            assert answer.axes["mode"].tolist() == modes
+            assert (rig.ended is None) == (situation == "held")
+
+    @pytest.mark.parametrize(("stated", "bound"), [(7.5, 7.5), (25.0, 20.0), (np.nan, 20.0)])
+    def test_the_narrower_limit_of_cell_and_controller_counts(self, stated, bound):
+        for sign in (-1, 1):
+            limits = {"current_limit": [20, 20, 20, 20, 20, stated]}
+            rig, _ = moving(init=init_packet(arm_1=limits))
+            rig.axes["d"][5, 4] = sign * bound
+            rig.cycle()
+            assert rig.state is State.OPEN
+            rig.axes["d"][5, 4] = sign * (bound + 0.01)
+            error = assert_refused(rig, rig.cycle(), CurrentLimit)
+            assert (error.joint, error.bound) == (5, pytest.approx(bound, rel=1e-5))
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("mode", [1, 4, 5])
+@pytest.mark.parametrize(
+    ("columns", "near", "far", "kind"),
+    [
+        ([0], 0.19, 0.21, FirstSetPoint),
+        ([2], 0.19, 0.21, FirstSetPoint),
+        ([1], 4e-4, 6e-4, NotAtStandstill),
+        ([3], 4e-4, 6e-4, NotAtStandstill),
+        ([4], 19.9, 20.1, CurrentLimit),
+    ],
+)
+def test_a_motion_begins_only_at_rest_and_at_its_target(held, mode, columns, near, far, kind):
+    """Requested before open mode, or while the arm is held in it; refused, never clamped."""
+    for share, begins in ((near, True), (-near, True), (far, False), (-far, False)):
+        rig = opened(20, mode=mode) if held else closed(mode=mode)
+        rig.session.request(source := Cruise())
+        rig.axes["d"][4, columns] += share
+        answer = rig.cycle(mode=mode)
+        assert (source.begun_at is not None) == begins
+        assert len(rig.seen(MotionStarted)) == begins
+        if not begins:
+            assert assert_refused(rig, answer, kind).joint == 4
+
+
 class TestArmThatDoesNotFollow:
     def test_following_error_is_reported_as_508_in_the_offending_slot(self):
         rig, _ = moving()
@@ -242,12 +327,6 @@ class TestArmThatDoesNotFollow:
         assert (error.joint, error.bound) == (3, pytest.approx(2.0, rel=1e-5))
         assert rig.ended.outcome == "refused"
         assert rig.state is State.FAULTED
-
-    def test_it_is_held_against_the_set_point_sent_as_well_as_the_target_received(self):
-        """The controller may have missed our answers; the arm counts, not its target."""
-        rig, _ = moving()
-        rig.axes["d"][0, [0, 2]] -= 2.01
-        assert rig.cycle().axes["mode"].tolist() == [508, 4, 4, 4, 4, 4]
 
     def test_it_goes_on_being_reported_while_the_axes_stay_open(self):
         rig, _ = moving()
@@ -267,29 +346,6 @@ class TestArmThatDoesNotFollow:
         rig.cycle(status=0)
         rig.status, rig.modes = 5, Mode.POSITION
         assert all_drive_off(rig.cycle())
-
-    @pytest.mark.parametrize("sign", [-1, 1])
-    def test_current_beyond_the_narrower_limit_asks_for_drive_off(self, sign):
-        rig, _ = moving(init=init_packet(arm_1={"current_limit": [20, 20, 20, 20, 20, 7.5]}))
-        rig.axes["d"][:, 4] = sign * 7.5
-        rig.cycle()
-        assert rig.state is State.OPEN
-        rig.axes["d"][5, 4] = sign * 7.51
-        error = assert_refused(rig, rig.cycle(), CurrentLimit)
-        assert (error.joint, error.bound) == (5, pytest.approx(7.5, rel=1e-5))
-
-    @pytest.mark.parametrize("field", [0, 2, 4])
-    def test_feedback_that_is_no_number_is_a_refusal(self, field):
-        rig, _ = moving()
-        rig.axes["d"][2, field] = np.nan
-        assert rig.cycle().axes["mode"].max() == Mode.DRIVE_OFF_REQUEST
-        assert type(rig.refusal) is NotFinite
-
-    def test_limits_the_controller_does_not_know_are_the_cells(self):
-        unknown = {"following_error": np.full(N, np.nan), "current_limit": np.full(N, np.nan)}
-        rig, _ = moving(init=init_packet(arm_1=unknown))
-        rig.axes["d"][0, 4] = 20.1
-        assert_refused(rig, rig.cycle(), CurrentLimit)
 
 
 class TestAfterARefusal:
