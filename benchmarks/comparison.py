@@ -61,16 +61,19 @@ def measure(repetitions: int) -> dict[str, Any]:
         def compared(name: str) -> dict[str, Any]:
             pair = [str(places["first"]), str(places[name])]
             found = compare_campaigns(gather(pair, workers, Silent()))
+            shares = found.friction.shares[:, 1]
             return {
                 "verdict": found.verdict,
                 "axes": {
-                    axis.joint: {
-                        "change": [axis.change[1], *(axis.interval[1] or [])],
-                        "changed": axis.changed[1],
-                    }
-                    for axis in found.axes
+                    axis.joint: {"change": share, "changed": changed}
+                    for axis, share, changed in zip(
+                        found.axes,
+                        shares.tolist(),
+                        found.friction.changed[:, 1].tolist(),
+                        strict=True,
+                    )
                 },
-                "prediction": found.prediction.overall,
+                "prediction": found.prediction.tolist(),
             }
 
         return {name: compared(name) for name in ("unchanged", "rubbing")}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_module
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
 from hil.batch.workers import LocalWorkers
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.compare import compare_campaigns, gather
 from hil.files import make_folder, write_together
 from hil.progress import reporter as make_reporter
@@ -41,20 +40,19 @@ def compare(
     with LocalWorkers() as workers:
         found = compare_campaigns(gather(campaigns, workers, reporter))
     if output is not None:
-        from hil.report.comparison import comparison_bytes  # figures are slow to import
+        from hil.report.changes import comparison_page  # figures are slow to import
 
         make_folder(output.parent)
-        write_together(output.parent, {output.name: comparison_bytes(found)})
+        write_together(output.parent, {output.name: comparison_page(found)})
         reporter.say(f"report: {output}")
     if json:
-        typer.echo(json_module.dumps(found.model_dump()))
+        print_json(found.document)
     else:
         if not quiet:
             for one in found.findings:
                 typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
             for warning in found.warnings:
                 typer.echo(printable(f"note: {warning}"), err=True)
-            typer.echo(f"note: {found.caveat}", err=True)
         typer.echo(printable(f"{found.verdict}."))
     if fail_on_change and found.changed:
         raise typer.Exit(CHANGED)

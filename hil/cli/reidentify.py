@@ -31,7 +31,7 @@ from hil.cli.identify_options import (
     options_from,
 )
 from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
-from hil.files import make_folder, writing_to
+from hil.files import make_folder, write_atomically, writing_to
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
@@ -255,12 +255,12 @@ def reidentify(
     found = trends(result)
     written: list[Path] = []
     if output is not None:
-        from hil.report.trend import FILE_NAME, write_trend_report  # matplotlib is slow to import
+        from hil.report.changes import trend_page  # matplotlib is slow to import
 
-        page = output / FILE_NAME
+        page = output / "trend.html"
         with writing_to(output):
             written = [*write_tables(output, result), page]
-            write_trend_report(page, found)
+            write_atomically(page, trend_page(found))
     if json:
         print_json(as_dict(result, found, written))
     else:

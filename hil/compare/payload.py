@@ -1,22 +1,13 @@
 """What an arm carries from campaign to campaign: one test on all that a payload would change.
 
-A body at the last link adds its ten inertial parameters to that link's, and through the grouping
-to base parameters of links before it: they move together, in ten directions at most of the base
-parameters' space. The base parameters of each campaign are projected onto these directions,
+A body at the last link changes base parameters in ten directions at most. Those of each campaign
+are projected onto these directions K, by least squares for the body with friction free,
 
     x = (K' M K)^+ K' M b,    M = inverse of the inertial part of (sum of information)^-1,
 
-which is least squares for the body with friction free. The same projection serves all
-campaigns, so x of one less x of another is what was put on in between. Their difference is tested
-jointly by Hotelling's T² (1931), the chi-square test for a covariance that was estimated from a
-finite number of blocks. What campaigns differ by anyhow is part of the measure: T² is divided by
-the median that the arm's own changes of campaign have, where there are enough of them.
-
-A payload that a cell states is known, and its torque is no part of the parameters. Parameters that
-change although nothing else was stated are a discovered change. Where the statement changes, two
-things are tested: the parameters as they are, which stay where they were if the arm now carries
-what is stated, and the parameters with the stated body put back, which stay where they were if it
-carried the same before and only the statement is new.
+and the difference of two campaigns is tested jointly by Hotelling's T² (1931), divided by the
+median that the arm's own changes of campaign have. A payload that a cell states is no part of the
+parameters; where the statement changes, they are tested with the stated body put back, too.
 """
 
 from __future__ import annotations
@@ -47,28 +38,27 @@ PAYLOAD_LIKE: Final = 0.5
 """Share of a change of the inertial parameters that a payload has to explain to be one."""
 
 Level = Literal["alarm", "past", "quiet", "changed", "same"]
-Verdict = Literal["agrees", "statement only", "either", "differs", "untested"]
+Verdict = Literal[
+    "torques agree",
+    "carried before as well",
+    "torques cannot tell",
+    "torques disagree",
+    "not tested",
+]
 
 _MASS_PLACE: Final = LINK_SYMBOLS.index("m")
 _MOMENT_PLACES: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
 # Directions in which a body changes less than this share of the strongest are not seen.
 _SEEN: Final = 1e-4
 _BLIND: Final = 1e-3
-# What is put on an arm: of this order.
-_MASS, _MOMENT, _INERTIA = 1.0, 0.3, 0.1
+# What is put on an arm (mass, moments, inertia) is of this order.
+_USUAL: Final = {"m": 1.0, "c": 0.3, "I": 0.1}
 # Median of the arm's own changes from fewer than this says nothing of what campaigns scatter.
 _FEWEST_CHANGES: Final = 4
 # A covariance of fewer blocks than coordinates cannot be tested.
 _FEWEST_SPARE: Final = 2
 _NORMAL: Final = float(student.ppf(0.975, 1e6))
 _CERTAIN: Final = 2.0
-_VERDICTS: Final[dict[Verdict, str]] = {
-    "agrees": "the torques agree",
-    "statement only": "by its torques it carries the same as before: only the statement is new",
-    "either": "the torques do not show whether it was carried before as well",
-    "differs": "the torques do not agree",
-    "untested": "whether the torques agree was not tested",
-}
 
 
 @dataclass(frozen=True)
@@ -170,9 +160,8 @@ def projection(
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]
-    usual = {"m": _MASS, "c": _MOMENT, "I": _INERTIA}  # by "m", "mc" and "I" of the names
     names = [model.standard_names[k] for k in last]
-    scale = np.array([usual["c" if name.startswith("mc") else name[0]] for name in names])
+    scale = np.array([_USUAL["c" if name.startswith("mc") else name[0]] for name in names])
     grouping = model.base.grouping[np.ix_(places, last)] * scale
     if not grouping.any():
         return None
@@ -193,36 +182,22 @@ def projection(
 def state(onto: Projection, values: Array, covariance: Array, freedom: float) -> State:
     """A campaign with parameters (p,) and covariance (p, p) as the test sees it."""
     own = covariance[np.ix_(onto.places, onto.places)]
-    reader = onto.reader
-    return State(values[onto.places], reader @ own @ reader.T, freedom)
-
-
-def pooled(states: Sequence[State]) -> State:
-    """Mean of campaigns between which nothing changed."""
-    values, covariances, freedoms = zip(*states, strict=True)
-    covariance = np.sum(covariances, axis=0) / len(states) ** 2
-    return State(np.mean(values, axis=0), covariance, float(np.sum(freedoms)))
+    return State(values[onto.places], onto.reader @ own @ onto.reader.T, freedom)
 
 
 def compare(onto: Projection, before: State, after: State, scatter: float = 1.0) -> Change | None:
     """Test whether something was put on or subtracted, None where blocks are too few to tell.
 
-    Args:
-        onto: the projection.
-        before: state of the campaigns before.
-        after: of the one in question.
-        scatter: by how much T² of this arm is larger than it should be, see :func:`own_scatter`.
+    `scatter` says by how much T² of this arm is larger than it should be.
     """
     difference = after.values - before.values
     coordinates = onto.reader @ difference
     covariance = before.covariance + after.covariance
-    # The mean of many campaigns is known so well that the blocks of the other one are what counts.
-    freedom = min(before.freedom, after.freedom)
-    if freedom < onto.rank - 1 + _FEWEST_SPARE:
+    spare = _spare(onto, before, after)
+    if spare < _FEWEST_SPARE:
         return None
     squared = float(coordinates @ np.linalg.solve(covariance, coordinates))
-    spare = freedom - onto.rank + 1
-    statistic = squared * spare / (freedom * onto.rank)
+    statistic = squared * spare / ((spare + onto.rank - 1) * onto.rank)
     explained = float(coordinates @ coordinates)
     whole = float(difference @ onto.metric @ difference)
     body = onto.body @ coordinates
@@ -239,38 +214,42 @@ def compare(onto: Projection, before: State, after: State, scatter: float = 1.0)
     )
 
 
-def own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float:
+def _spare(onto: Projection, one: State, other: State) -> float:
+    """Degrees of freedom of the denominator.
+
+    The mean of many campaigns is known so well that the blocks of the other one are what counts.
+    """
+    return min(one.freedom, other.freedom) - onto.rank + 1
+
+
+def _own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float:
     """How much more campaigns of this arm differ than their covariances say, at least 1.
 
     The median over successive campaigns that state the same payload, so that a payload put on once
     is no part of it.
     """
-    ratios = []
-    for one, other in pairs:
-        change = compare(onto, one, other)
-        if change is not None:
-            spare = min(one.freedom, other.freedom) - onto.rank + 1
-            ratios.append(change.statistic / float(fisher.median(onto.rank, spare)))
+    ratios = [
+        change.statistic / float(fisher.median(onto.rank, _spare(onto, one, other)))
+        for one, other in pairs
+        if (change := compare(onto, one, other)) is not None
+    ]
     return max(1.0, float(np.median(ratios))) if len(ratios) >= _FEWEST_CHANGES else 1.0
 
 
 # From campaign to campaign
 
 
-class Statement(NamedTuple):
-    """A campaign that states another payload than the one before.
+@dataclass(frozen=True)
+class Statement:
+    """A campaign that states another payload than the one before, None being none.
 
-    Attributes:
-        before: what was stated before; None for nothing.
-        after: what is stated now.
-        verdict: what the torques say: "agrees", the arm carries what is stated as it did before;
-            "statement only", it carries the same as before; "either", both are possible; "differs",
-            neither is; "untested".
+    `verdict` says whether the arm, by its torques, carries what is stated as it did before, the
+    same as before (only the statement is new), one of these, or neither.
     """
 
     before: Payload | None
     after: Payload | None
-    verdict: Verdict
+    verdict: Verdict = "not tested"
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +297,7 @@ def payload_trend(
         bare.append(own)
         laden.append(own._replace(values=own.values + load))
     same = [one.payload == other.payload for one, other in pairwise(campaigns)]
-    scatter = own_scatter(onto, list(compress(pairwise(bare), same)))
+    scatter = _own_scatter(onto, list(compress(pairwise(bare), same)))
 
     def different(change: Change | None) -> bool:
         return change is not None and change.p_value < share and change.effect >= LEAST_EFFECT
@@ -327,20 +306,23 @@ def payload_trend(
     changed, other = [False], [False]
     first = 0  # campaign since which nothing has changed
     for k in range(1, len(campaigns)):
-        history = pooled(bare[first:k])
+        values, covariances, freedoms = zip(*bare[first:k], strict=True)
+        mean = np.sum(covariances, axis=0) / len(values) ** 2
+        history = State(np.mean(values, axis=0), mean, float(np.sum(freedoms)))
         change = compare(onto, history, bare[k], scatter)
         differs, statement = different(change), None
-        like = change is not None and change.share >= PAYLOAD_LIKE
         if not same[k - 1]:
             # As if what was stated before were stated now.
             put_back = bare[k]._replace(values=bare[k].values + stated[k] - stated[k - 1])
             restated = not different(compare(onto, history, put_back, scatter))
-            verdict: Verdict = "differs" if differs else "agrees"
+            verdict: Verdict = "torques disagree" if differs else "torques agree"
             if restated:
-                verdict = "statement only" if differs else "either"
-            verdict = "untested" if change is None else verdict
+                verdict = "carried before as well" if differs else "torques cannot tell"
+            if change is None:
+                verdict = "not tested"
             statement = Statement(campaigns[k - 1].payload, campaigns[k].payload, verdict)
-        found = differs and (statement is None or statement.verdict == "differs")
+        found = differs and (statement is None or statement.verdict == "torques disagree")
+        like = change is not None and change.share >= PAYLOAD_LIKE
         changes.append(change)
         changed.append(found and like)
         other.append(found and not like)
@@ -378,11 +360,10 @@ def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projec
 
 
 def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:
-    count, stated = len(campaigns), [one.payload for one in campaigns]
-    no, unknown = (False,) * count, np.full(count, np.nan)
-    pairs = (Statement(*pair, "untested") for pair in pairwise(stated))
-    statements = (None, *(None if one.before == one.after else one for one in pairs))
-    return PayloadTrend((None,) * count, no, no, statements, unknown, unknown, why)
+    no, unknown = (False,) * len(campaigns), np.full(len(campaigns), np.nan)
+    pairs = pairwise(one.payload for one in campaigns)
+    statements = (None, *(Statement(*pair) if pair[0] != pair[1] else None for pair in pairs))
+    return PayloadTrend((None,) * len(no), no, no, statements, unknown, unknown, why)
 
 
 def freedom_of(level: LevelEstimate) -> float:
@@ -399,13 +380,12 @@ def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Findin
     for k, (change, statement) in enumerate(zip(payload.changes, payload.statements, strict=True)):
         level: Level = "alarm" if k == len(payload.changes) - 1 else "past"
         if statement is not None:
-            after, before = _load(statement.after), _load(statement.before)
             words = (
-                f"From {names[k]} on the cell states {after} instead of {before};"
-                f" {_VERDICTS[statement.verdict]}."
+                f"From {names[k]} on the cell states {_load(statement.after)} instead of"
+                f" {_load(statement.before)}: {statement.verdict}."
             )
             step = "Weigh the payload and measure its centre, then correct the cell file."
-            wrong = statement.verdict == "differs"
+            wrong = statement.verdict == "torques disagree"
             found.append(Finding(level, words, step) if wrong else Finding("quiet", words))
         where = f"between {names[k - 1]} and {names[k]}"
         if change is not None and payload.changed[k]:
@@ -424,8 +404,7 @@ def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Findin
 
 
 def _load(payload: Payload | None) -> str:
-    mass = 0.0 if payload is None else payload.mass
-    return f"a payload of {mass:g} kg" if mass else "nothing"
+    return f"a payload of {payload.mass:g} kg" if payload and payload.mass else "nothing"
 
 
 def _what(change: Change) -> str:
@@ -433,14 +412,10 @@ def _what(change: Change) -> str:
     if not math.isfinite(change.mass):
         moment = float(np.linalg.norm(np.nan_to_num(change.moment)))
         return f"first moment by {moment:.2g} kg·m, while its mass cannot be seen by this arm"
+    mass = f"{change.mass:+.2f} ± {change.mass_std:.2g} kg"
     if abs(change.mass) < _CERTAIN * change.mass_std:
-        return (
-            f"its mass not significantly ({change.mass:+.2g} ± {change.mass_std:.1g} kg),"
-            " but its centre or inertia"
-        )
-    verb = "put on" if change.mass > 0 else "removed"
-    text = f"{abs(change.mass):.2f} ± {change.mass_std:.2g} kg {verb}"
-    if np.isfinite(change.moment).all():
-        centre = ", ".join(f"{1e3 * c / change.mass:.0f}" for c in change.moment)
-        text += f", centred at ({centre}) mm of the last joint"
-    return text
+        return f"its mass not significantly ({mass}), but its centre or inertia"
+    if not np.isfinite(change.moment).all():
+        return mass
+    centre = ", ".join(f"{1e3 * c / change.mass:.0f}" for c in change.moment)
+    return f"{mass}, centred at ({centre}) mm of the last joint"

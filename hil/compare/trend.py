@@ -1,17 +1,11 @@
 """What became of an arm: friction, torque error, parameters and payload from campaign to campaign.
 
-A robust control chart asks of each figure of an axis whether it could belong to the values before
-it. Location is their median and scale their Qn (Rousseeuw and Croux 1993), so that an odd value in
-the history neither moves the centre nor widens the limits. Values that departed are no history for
-later ones, unless `FEWEST` of them in a row stay on one side: they are a new level, by which later
-ones are judged. A value that belongs to an earlier level has returned to it. Scatter is that about
-all levels.
-
-The limits are Student's: Qn of n normal values is as uncertain as a standard deviation of about
-0.6 (n - 1) + 0.5 values, found by simulation (n = 5 to 30, tail 1e-2 and 1e-3, on the safe side).
-
-Drift is Kendall's rank correlation with time (Mann 1945), exact for few values, with the slope of
-Theil and Sen (Sen 1968). What counts as a change is in `docs/batch.md`.
+A robust control chart asks of each figure of an axis whether it belongs to the values before it:
+location is their median, scale their Qn (Rousseeuw and Croux 1993), so that an odd value neither
+moves the centre nor widens the limits. The limits are Student's: Qn of n normal values is as
+uncertain as a standard deviation of about 0.6 (n - 1) + 0.5 values, found by simulation (n = 5 to
+30, tail 1e-2 and 1e-3, on the safe side). Drift is Kendall's rank correlation with time (Mann
+1945), with the slope of Theil and Sen (Sen 1968). What counts as a change is in `docs/batch.md`.
 """
 
 from __future__ import annotations
@@ -50,27 +44,22 @@ LEAST_ERROR: Final = 0.10
 
 _RULES: Final = 3
 _DAY: Final = 86400.0
-_MONTH, _YEAR = 365.25 / 12.0, 365.25  # days
 _QN_NORMAL: Final = 2.2219
-_CONFIDENCE: Final = 0.95  # of the interval of a drift
 # Speed [rad/s, m/s] where the data cannot say how fast an axis went: it has no viscous friction.
 _ANY_SPEED: Final = 0.5
-_SHIFTS: Final = 2  # of a figure that are described one by one
+_SHIFTS: Final = 2  # of a figure that are described, the last ones
 _NAMED: Final = 5
 
 
 class Limits(NamedTuple):
-    """Where a value would be, judged by those before it.
-
-    Attributes:
-        centre: median of the earlier values.
-        low: lower limit, -inf or 0 where only a rise counts.
-        high: upper limit.
-    """
+    """Where a value would be, judged by those before it; NaN before there are enough of them."""
 
     centre: float
     low: float
     high: float
+
+
+_UNKNOWN: Final = Limits(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +69,7 @@ class Watched:
     Attributes:
         values: (c,); NaN where there is none.
         stds: (c,); zero where only the scatter of the history is known.
-        limits: by the level that the value belongs to, or was expected at; None before there are
-            enough values.
+        limits: centre, low, high by the level that it belongs to, or was expected at (c, 3).
         departs: which values belong to no level that was known then, by enough to matter.
         levels: number of the level that a value belongs to, from 0; -1 for one that is not known,
             or departed and made no new level.
@@ -89,7 +77,7 @@ class Watched:
 
     values: Array
     stds: Array
-    limits: tuple[Limits | None, ...]
+    limits: Array
     departs: tuple[bool, ...]
     levels: tuple[int, ...]
 
@@ -101,10 +89,9 @@ class Watched:
 
 
 class Drift(NamedTuple):
-    """A slope per unit of time.
+    """A slope per unit of time, and the ends of its 95 % interval.
 
     Attributes:
-        slope: with the ends `low` and `high` of its 95 % interval.
         p_value: of no drift, two-sided.
         span: time from the first value to the last.
     """
@@ -116,15 +103,26 @@ class Drift(NamedTuple):
     span: float
 
 
+@dataclass(frozen=True)
+class Axis:
+    """An axis, the unit of its friction, and the speed at which that is compared, NaN for any."""
+
+    joint: str
+    unit: str
+    speed: float
+    speed_unit: str
+
+    @property
+    def at(self) -> str:
+        """The speed as the end of a phrase; "" if it does not matter."""
+        return f" at {self.speed:.2g} {self.speed_unit}" if math.isfinite(self.speed) else ""
+
+
 @dataclass(frozen=True, eq=False)
-class AxisTrend:
-    """An axis.
+class AxisTrend(Axis):
+    """An axis over the campaigns.
 
     Attributes:
-        joint: its name.
-        unit: of friction and torque error.
-        speed: at which friction is compared; NaN if it has none that depends on speed.
-        speed_unit: its unit.
         friction: mean of both directions.
         error: standard deviation of what the model leaves of the torque.
         drift: of the friction at the level reached last [unit per day, or per campaign]; None if
@@ -132,10 +130,6 @@ class AxisTrend:
         drifts: whether that is more than chance, and enough to matter.
     """
 
-    joint: str
-    unit: str
-    speed: float
-    speed_unit: str
     friction: Watched
     error: Watched
     drift: Drift | None
@@ -143,16 +137,16 @@ class AxisTrend:
 
     @property
     def size(self) -> float:
-        """Median friction; infinite where none is known."""
+        """Median friction; NaN where none is known."""
         known = self.friction.values[np.isfinite(self.friction.values)]
-        return (abs(float(np.median(known))) if known.size else 0.0) or math.inf
+        return abs(float(np.median(known))) or math.nan if known.size else math.nan
 
     @property
-    def relative_drift(self) -> float | None:
-        """Drift over its whole time, as a share of the median friction; None if not known."""
-        if self.drift is None or math.isinf(self.size):
-            return None
-        return self.drift.slope * self.drift.span / self.size
+    def relative_drift(self) -> Array:
+        """Slope and the ends of its interval over the whole time, shares of the friction (3,)."""
+        if self.drift is None:
+            return np.full(3, np.nan)
+        return np.array(self.drift[:3]) * self.drift.span / self.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +158,7 @@ class ArmTrend:
         campaigns: in order of time.
         time: (c,) [days since the first]; number of the campaign where no time is known.
         dated: whether times are known. If not, campaigns are in the order of their names.
-        labels: see `campaign_names`.
-        names: the same with their days, if known.
+        names: of the campaigns, with their days if known.
         undated: folders of further campaigns, without a time, that are no part of the history.
         warnings: what a reader must know of the archives.
     """
@@ -176,7 +169,6 @@ class ArmTrend:
     dated: bool
     axes: tuple[AxisTrend, ...]
     payload: PayloadTrend
-    labels: tuple[str, ...]
     names: tuple[str, ...]
     undated: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -229,7 +221,6 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
         dated=bool(known),
         axes=_axes(model, ordered, time),
         payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
-        labels=tuple(campaign_names(ordered)),
         names=tuple(campaign_names(ordered, days=bool(known))),
         undated=tuple(one.campaign for one in campaigns if id(one) not in within),
     )
@@ -271,19 +262,26 @@ def short_names(folders: Sequence[str]) -> list[str]:
 # Friction and torque error of the axes
 
 
-def friction_weights(model: RobotModel, speed: Array) -> Array:
-    """Weights G (n, p): ``G @ values`` is the friction of each axis at a speed [N·m, N].
+def axes_of(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[Axis]:
+    """All axes, each with one speed, the median of what the campaigns had."""
+    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
+    found = []
+    for j, (joint, turns) in enumerate(zip(model.joint_names, model.chain.revolute, strict=True)):
+        own = [row[j] for row in speeds if np.isfinite(row[j])]
+        speed = float(np.median(own)) if own else math.nan
+        found.append(Axis(joint, "N·m" if turns else "N", speed, "rad/s" if turns else "m/s"))
+    return found
+
+
+def friction_weights(model: RobotModel, axes: Sequence[Axis]) -> Array:
+    """Weights G (n, p): ``G @ values`` is the friction of each axis at its speed [N·m, N].
 
     The mean of forwards and backwards, so that an offset and a difference by direction are no
     part of it. Where coupled motors have friction, that of the axis' own motor counts as well.
-
-    Args:
-        model: the robot.
-        speed: of each axis (n,) [rad/s, m/s], above zero; NaN for half a radian or metre a second.
     """
     weights = np.zeros((model.n_joints, model.n_parameters))
     for k, term in enumerate(model.friction.terms):
-        own = float(speed[term.owner])
+        own = axes[term.owner].speed
         at = own if math.isfinite(own) and own > 0.0 else _ANY_SPEED
         forwards, backwards = term.term.column(np.array([at, -at]), np.array([1.0, -1.0]))
         weights[term.owner, model.base.rank + k] = 0.5 * (forwards - backwards)
@@ -305,42 +303,29 @@ def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
     return value, np.where(whole, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
-def typical_speed(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Array:
-    """One speed for each axis (n,), the median of what the campaigns had; NaN if none has one."""
-    speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
-    columns = [[row[j] for row in speeds if np.isfinite(row[j])] for j in range(model.n_joints)]
-    return np.array([np.median(own) if own else np.nan for own in columns])
-
-
 def _axes(
     model: RobotModel, campaigns: Sequence[LevelEstimate], time: Array
 ) -> tuple[AxisTrend, ...]:
-    speed = typical_speed(model, campaigns)
-    weights = friction_weights(model, speed)
-    each = [friction_in(one, weights) for one in campaigns]
-    friction, stds = (np.array(columns) for columns in zip(*each, strict=True))
+    axes = axes_of(model, campaigns)
+    weights = friction_weights(model, axes)
+    friction, stds = np.array([friction_in(one, weights) for one in campaigns]).swapaxes(0, 1)
     error = np.array([one.noise_std for one in campaigns])
     share = FALSE_ALARMS / _RULES / model.n_joints
     found = []
-    for j, joint in enumerate(model.joint_names):
-        turns = bool(model.chain.revolute[j])
+    for j, axis in enumerate(axes):
         known = np.abs(friction[np.isfinite(friction[:, j]), j])
         least = LEAST_FRICTION * (float(np.median(known)) if len(known) else 0.0)
         watched = chart(friction[:, j], stds[:, j], share, least=least)
         # At one level: a step is no drift.
         slope = drift(time, np.where(watched.at_last_level, watched.values, np.nan))
+        certain = slope is not None and slope.p_value < FALSE_ALARMS / model.n_joints
         found.append(
             AxisTrend(
-                joint=joint,
-                unit="N·m" if turns else "N",
-                speed=float(speed[j]),
-                speed_unit="rad/s" if turns else "m/s",
+                **vars(axis),
                 friction=watched,
                 error=_error(error[:, j], share),
                 drift=slope,
-                drifts=slope is not None
-                and slope.p_value < FALSE_ALARMS / model.n_joints
-                and abs(slope.slope) * slope.span >= least,
+                drifts=slope is not None and certain and abs(slope.slope) * slope.span >= least,
             )
         )
     return tuple(found)
@@ -355,10 +340,7 @@ def _error(values: Array, share: float) -> Watched:
         logarithm = np.where(values > 0.0, np.log(values), np.nan)
     least = float(np.log1p(LEAST_ERROR))
     judged = chart(logarithm, np.zeros(len(values)), share, least=least, rise_only=True)
-    limits = tuple(
-        band and Limits(math.exp(band.centre), 0.0, math.exp(band.high)) for band in judged.limits
-    )
-    return replace(judged, values=values, limits=limits)
+    return replace(judged, values=values, limits=np.exp(judged.limits))
 
 
 # The chart
@@ -369,6 +351,10 @@ def chart(
 ) -> Watched:
     """Judge each value by those before it that did not depart themselves.
 
+    Values that departed are no history for later ones, unless `FEWEST` of them in a row stay on one
+    side: they are a new level, by which later ones are judged. A value that belongs to an earlier
+    level has returned to it. Scatter is that about all levels.
+
     Args:
         values: in order of time (n,); NaN where there is none.
         stds: standard deviations that they came with (n,).
@@ -378,17 +364,17 @@ def chart(
     """
     known = Levels(values, stds, 2.0 * share if rise_only else share, [[]])
     now, away = 0, list[int]()
-    found: list[Limits | None] = []
+    found = np.full((len(values), 3), np.nan)
     departs, levels = [False] * len(values), [-1] * len(values)
     for k, value in enumerate(values):
-        expected = known.limits(now, float(stds[k]))
-        home = known.home(k, now, least, rise_only=rise_only) if math.isfinite(value) else None
+        expected = found[k] = known.limits(now, float(stds[k]))
+        if not math.isfinite(value):
+            continue
+        home = known.home(k, now, least, rise_only=rise_only)
         if home is not None:
             now, levels[k], away = home, home, []
-            expected = known.limits(home, float(stds[k]))
+            found[k] = known.limits(home, float(stds[k]))
             known.members[home].append(k)
-        found.append(expected)
-        if home is not None or expected is None or not math.isfinite(value):
             continue
         departs[k] = True
         if away and (value > expected.centre) != (values[away[-1]] > expected.centre):
@@ -401,8 +387,8 @@ def chart(
                 levels[one] = now
             away = []
     if rise_only:
-        found = [band and band._replace(low=-math.inf) for band in found]
-    return Watched(values, stds, tuple(found), tuple(departs), tuple(levels))
+        found[:, 1] = np.where(np.isnan(found[:, 1]), np.nan, -np.inf)
+    return Watched(values, stds, found, tuple(departs), tuple(levels))
 
 
 class Levels(NamedTuple):
@@ -420,11 +406,11 @@ class Levels(NamedTuple):
     share: float
     members: list[list[int]]
 
-    def limits(self, level: int, std: float) -> Limits | None:
+    def limits(self, level: int, std: float) -> Limits:
         """Where a value with a standard deviation would be if it belonged to a level."""
         own = self.members[level]
         if len(own) < FEWEST:
-            return None
+            return _UNKNOWN
         centre = float(np.median(self.values[own]))
         every = np.concatenate(self.members)
         residuals = np.concatenate(
@@ -447,7 +433,8 @@ class Levels(NamedTuple):
         value, std = float(self.values[k]), float(self.stds[k])
         for level in (now, *(one for one in reversed(range(len(self.members))) if one != now)):
             band = self.limits(level, std)
-            if band is None or band.low <= value <= band.high or abs(value - band.centre) < least:
+            outside = value < band.low or value > band.high  # and of unknown limits never
+            if not outside or abs(value - band.centre) < least:
                 return level
         below = value < float(np.median(self.values[self.members[now]]))
         return now if rise_only and below else None
@@ -475,7 +462,7 @@ def drift(time: Array, values: Array) -> Drift | None:
     at, own = time[known], values[known]
     if len(own) < FEWEST or np.ptp(at) == 0.0 or np.ptp(own) == 0.0:
         return None
-    slope, _, low, high = theilslopes(own, at, _CONFIDENCE)
+    slope, _, low, high = theilslopes(own, at, 0.95)
     p_value = float(kendalltau(at, own).pvalue)
     return Drift(float(slope), float(low), float(high), p_value, float(np.ptp(at)))
 
@@ -487,11 +474,19 @@ def findings(arm: ArmTrend) -> tuple[Finding, ...]:
     """What was found of an arm, what concerns its last campaign first; never empty."""
     found = payload_findings(arm.payload, arm.names)
     for axis in arm.axes:
-        found += _shift_findings(arm, axis, axis.friction, "friction")
-        found += _shift_findings(arm, axis, axis.error, "torque error")
-        found += _drift_findings(arm, axis)
+        for what, watched in (("friction", axis.friction), ("torque error", axis.error)):
+            found += [_shift(arm, axis, what, one) for one in shifts(watched)[-_SHIFTS:]]
+        if axis.drifts:
+            slope, low, high = 100.0 * axis.relative_drift
+            since = arm.names[int(np.flatnonzero(axis.friction.at_last_level)[0])]
+            words = (
+                f"Friction of {axis.joint} {'rises' if slope > 0 else 'falls'} steadily:"
+                f" {slope:+.0f} % since {since} (95 %: {low:+.0f} to {high:+.0f})."
+            )
+            step = "Wear, lubricant that ages, or campaigns run ever warmer."
+            found.append(Finding("alarm", words, step))
     if all(one.level == "quiet" for one in found):
-        found.insert(0, _nothing(arm))
+        found.insert(0, Finding("quiet", _nothing(arm)))
     order: list[Level] = ["alarm", "past", "quiet"]
     return (*sorted(found, key=lambda one: order.index(one.level)), *_order_findings(arm))
 
@@ -505,12 +500,9 @@ def summary(arm: ArmTrend) -> str:
     if count < 2:
         return "one campaign, nothing to compare it with"
     if past:
-        return f"no new change; {past} earlier {'one' if past == 1 else 'ones'}"
-    return (
-        "as before"
-        if count > FEWEST
-        else "no change found, but too few campaigns to judge the axes"
-    )
+        return f"no new change; {plural(past, 'earlier change')}"
+    few = "no change found, but too few campaigns to judge the axes"
+    return "as before" if count > FEWEST else few
 
 
 class Shift(NamedTuple):
@@ -540,17 +532,17 @@ def shifts(watched: Watched) -> list[Shift]:
 
     def place(k: int) -> tuple[int, bool]:
         """The level of a campaign, and if it has none its side of the history."""
-        level, band = watched.levels[k], watched.limits[k]
-        return level, level < 0 and band is not None and bool(watched.values[k] > band.centre)
+        level = watched.levels[k]
+        return level, level < 0 and bool(watched.values[k] > watched.limits[k, 0])
 
     known = [k for k, value in enumerate(watched.values) if np.isfinite(value)]
     runs = [(level, list(own)) for (level, _), own in groupby(known, place)]
     found = []
     for number, (level, own) in enumerate(runs[1:], start=1):
         fresh = level < 0 or level not in {earlier for earlier, _ in runs[:number]}
-        band, value = watched.limits[own[0]], float(np.median(watched.values[own]))
+        centre, value = watched.limits[own[0], 0], float(np.median(watched.values[own]))
         left = float(np.median(watched.values[runs[number - 1][1]]))
-        before = band.centre if fresh and band is not None else left
+        before = float(centre) if fresh and np.isfinite(centre) else left
         lasts = number == len(runs) - 1
         found.append(Shift(not fresh, own[0], own[-1], before, value, level >= 0, lasts))
     return found
@@ -566,69 +558,34 @@ _STEPS: Final = {
 }
 
 
-def _shift_findings(arm: ArmTrend, axis: AxisTrend, watched: Watched, what: str) -> list[Finding]:
-    """The last shifts of a figure, and how many there were before."""
-    every = shifts(watched)
-    at = ""
-    if what == "friction" and math.isfinite(axis.speed):
-        at = f" at {axis.speed:.2g} {axis.speed_unit}"
-    found = []
-    for shift in every[-_SHIFTS:]:
-        first, last = arm.names[shift.first], arm.names[shift.last]
-        when = f"since {first}" if shift.lasts else f"from {first} to {last}"
-        when = f"in {first}" if shift.first == shift.last else when
-        rise = shift.value > shift.before
-        change = abs(shift.value - shift.before) / (abs(shift.before) or math.inf)
-        side = "returned" if shift.returns else "above" if rise else "below"
-        how = "has returned to an earlier level" if shift.returns else "departs from its history"
-        words = (
-            f"{axis.joint} {how}: {what}{at} is {100.0 * change:.0f} %"
-            f" {'above' if rise else 'below'} what it was, {shift.value:.3g} against"
-            f" {shift.before:.3g} {axis.unit}, {when}."
-        )
-        # What has risen stays a thing to look into until it returns, however long ago it was.
-        alarming = not shift.returns and (rise or not shift.is_level)
-        level: Level = "alarm" if shift.lasts and alarming else "past"
-        found.append(Finding(level, words, _STEPS.get((what, side), "")))
-    if len(every) > _SHIFTS:
-        earlier = plural(len(every) - _SHIFTS, "earlier change")
-        words = f"{axis.joint} had {earlier} of its {what}: see the figures."
-        found.append(Finding("past", words))
-    return found
-
-
-def _drift_findings(arm: ArmTrend, axis: AxisTrend) -> list[Finding]:
-    slope, total = axis.drift, axis.relative_drift
-    if slope is None or total is None or not axis.drifts:
-        return []
-    unit, scale = _per(arm, slope.span)
-    per, low, high = (100.0 * one * scale / axis.size for one in slope[:3])
-    first = int(np.flatnonzero(axis.friction.at_last_level)[0])
+def _shift(arm: ArmTrend, axis: AxisTrend, what: str, shift: Shift) -> Finding:
+    first, last = arm.names[shift.first], arm.names[shift.last]
+    when = f"since {first}" if shift.lasts else f"from {first} to {last}"
+    when = f"in {first}" if shift.first == shift.last else when
+    rise = shift.value > shift.before
+    change = abs(shift.value - shift.before) / (abs(shift.before) or math.inf)
+    side = "above" if rise else "below"
+    how = "has returned to an earlier level" if shift.returns else "departs from its history"
     words = (
-        f"Friction of {axis.joint} {'rises' if per > 0 else 'falls'} steadily: {per:+.2g} % {unit}"
-        f" (95 %: {low:+.2g} to {high:+.2g}), {100.0 * total:+.0f} % since {arm.names[first]}."
+        f"{axis.joint} {how}: {what}{axis.at if what == 'friction' else ''} is"
+        f" {100.0 * change:.0f} % {side} what it was, {shift.value:.3g} against"
+        f" {shift.before:.3g} {axis.unit}, {when}."
     )
-    return [Finding("alarm", words, "Wear, lubricant that ages, or campaigns run ever warmer.")]
+    # What has risen stays a thing to look into until it returns, however long ago it was.
+    alarming = shift.lasts and not shift.returns and (rise or not shift.is_level)
+    step = _STEPS.get((what, "returned" if shift.returns else side), "")
+    return Finding("alarm" if alarming else "past", words, step)
 
 
-def _per(arm: ArmTrend, span: float) -> tuple[str, float]:
-    """A unit of time in which the slope is a number that people can judge."""
-    if not arm.dated:
-        return "per campaign", 1.0
-    if span < 14.0:
-        return "per day", 1.0
-    return ("per month", _MONTH) if span < 2.0 * _YEAR else ("per year", _YEAR)
-
-
-def _nothing(arm: ArmTrend) -> Finding:
+def _nothing(arm: ArmTrend) -> str:
     count, untested = len(arm.campaigns), arm.payload.untested
     if count < 2:
-        return Finding("quiet", "There is one campaign, and nothing to compare it with.")
-    carried = f"Its payload was not tested: {untested}." if untested else "Its payload is the same."
+        return "There is one campaign, and nothing to compare it with."
+    payload = f"Its payload was not tested: {untested}." if untested else "Its payload is the same."
     axes = "Friction and torque error of every axis are within the limits of those before"
     if count <= FEWEST:
         axes = f"Its axes are judged from the campaign on that has {FEWEST} before it"
-    return Finding("quiet", f"No change was found in {count} campaigns. {carried} {axes}.")
+    return f"No change was found in {count} campaigns. {payload} {axes}."
 
 
 def _order_findings(arm: ArmTrend) -> list[Finding]:
@@ -640,12 +597,12 @@ def _order_findings(arm: ArmTrend) -> list[Finding]:
             f"{plural(len(arm.undated), 'further campaign')} ({', '.join(names)}) without a time of"
             " recording: left out here, since nobody knows where they belong."
         )
-        return [Finding("quiet", words)]
-    if arm.dated or len(arm.campaigns) < 2:
+    elif arm.dated or len(arm.campaigns) < 2:
         return []
-    words = (
-        "No campaign has a time of recording: they are used in the order of their folders'"
-        f" names, from {arm.names[0]} to {arm.names[-1]}."
-        " If that is not the order of time, before and after mean nothing here."
-    )
+    else:
+        words = (
+            "No campaign has a time of recording: they are used in the order of their folders'"
+            f" names, from {arm.names[0]} to {arm.names[-1]}."
+            " If that is not the order of time, before and after mean nothing here."
+        )
     return [Finding("quiet", words)]

@@ -15,25 +15,20 @@ _MOST_DECIMALS = 6
 
 def significant(value: float | None, digits: int = 3) -> str:
     """`value` with `digits` significant digits; an exponent only where zeros would pile up."""
-    if value is None:
-        return MISSING
-    if not math.isfinite(value):
-        return str(value)
-    if value == 0.0:
-        return "0"
-    size = abs(value)
-    if not _SMALLEST_DECIMAL <= size < _LARGEST_DECIMAL:
+    if value is None or not math.isfinite(value) or value == 0.0:
+        return fixed(value, 0)
+    if not _SMALLEST_DECIMAL <= abs(value) < _LARGEST_DECIMAL:
         return _short_exponent(f"{value:.{digits - 1}e}")
     # Rounding first: 9.996 to three digits is 10.0, with one decimal and not two.
-    exponent = int(f"{size:.{digits - 1}e}".split("e")[1])
+    exponent = int(f"{abs(value):.{digits - 1}e}".split("e")[1])
     return fixed(value, max(0, digits - 1 - exponent))
 
 
 def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
     """`value` with `decimals` decimals; never "-0.00"."""
-    if value is None:
+    if value is None or math.isnan(value):
         return MISSING
-    if not math.isfinite(value):
+    if math.isinf(value):
         return str(value)
     text = f"{value:+.{decimals}f}" if sign else f"{value:.{decimals}f}"
     return text if float(text) else text.replace("-", "+" if sign else "")
@@ -41,10 +36,8 @@ def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
 
 def beside(value: float | None, std: float) -> str:
     """`value` rounded where the second significant digit of `std` stands."""
-    if value is None:
-        return MISSING
-    if value == 0.0:
-        return "0"
+    if value is None or value == 0.0:
+        return significant(value)
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return significant(value, 4)
     place = int(f"{std:.1e}".split("e")[1]) - 1
@@ -58,25 +51,19 @@ def beside(value: float | None, std: float) -> str:
 
 def percent(fraction: float | None, decimals: int | None = None) -> str:
     """A fraction in per cent, without the sign: the column head carries it."""
-    if fraction is None:
-        return MISSING
-    if decimals is not None:
-        return fixed(100.0 * fraction, decimals)
+    if fraction is None or math.isnan(fraction) or decimals is not None:
+        return fixed(None if fraction is None else 100.0 * fraction, decimals or 0)
     size = abs(100.0 * fraction)
-    if math.isnan(size):
-        return "nan"
     if size >= 1000.0:
         return ">999"
     return fixed(100.0 * fraction, 0 if size >= 99.5 else 1 if size >= 9.95 else 2)
 
 
 def with_std(value: float | None, std: float | None) -> str:
-    """`value ± std`; the value alone without a usable one."""
-    if value is None or not math.isfinite(value):
+    """`value ± std`; the value alone if it is exact, and none where either is not known."""
+    if value is None or std is None or not math.isfinite(value) or not math.isfinite(std):
         return MISSING
-    if std is None or not std > 0.0:
-        return significant(value)
-    return f"{beside(value, std)} ± {significant(std, 2)}"
+    return f"{beside(value, std)} ± {significant(std, 2)}" if std > 0.0 else significant(value)
 
 
 def speed_text(speed: float | None, unit: str) -> str:

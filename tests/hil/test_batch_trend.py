@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from hil.compare.trend import (
     FALSE_ALARMS,
     FEWEST,
     ArmTrend,
+    Axis,
     Levels,
     Limits,
     Trends,
@@ -34,7 +34,7 @@ from hil.compare.trend import (
     shifts,
     summary,
 )
-from hil.report.trend import render_trend_report, write_trend_report
+from hil.report.changes import trend_page
 from identification.model.payload import Payload
 
 from .arm_histories import FRICTION, Condition, Load, history, model, motion, steady, trend_of
@@ -43,7 +43,7 @@ from .test_report import assert_stands_alone
 # --- the chart ---------------------------------------------------------------------------------
 
 
-def limits(earlier: np.ndarray, stds: np.ndarray, share: float = 0.01) -> Limits | None:
+def limits(earlier: np.ndarray, stds: np.ndarray, share: float = 0.01) -> Limits:
     """Of one more value after a history of one level."""
     return Levels(earlier, stds, share, [list(range(len(earlier)))]).limits(0, 0.0)
 
@@ -62,7 +62,6 @@ def test_unchanged_values_depart_no_more_often_than_the_share(count: int, share:
     factor = qn_scale(values[0]) / raw[0]
     assert qn_scale(values[1]) == pytest.approx(factor * raw[1])
     one = limits(values[0], np.zeros(count), share)
-    assert one is not None
     reach = (one.high - one.centre) / qn_scale(values[0])
     new = random.standard_normal(runs)
     outside = np.mean(np.abs(new - np.median(values, axis=1)) > reach * factor * raw)
@@ -84,8 +83,6 @@ def test_limits_move_and_stretch_with_the_values(shift: float, stretch: float) -
     values = np.array([0.3, -0.2, 0.9, 0.1, -1.1, 0.4, 0.0])
     plain = limits(values, np.zeros(7))
     moved = limits(shift + stretch * values, np.zeros(7))
-    assert plain is not None
-    assert moved is not None
     assert moved.low == pytest.approx(shift + stretch * plain.low, abs=1e-9)
     assert moved.high == pytest.approx(shift + stretch * plain.high, abs=1e-9)
 
@@ -114,9 +111,7 @@ def test_values_that_stay_away_are_a_new_level() -> None:
     found = chart(np.array([*SCATTER, *there, 4.9]), np.zeros(15), 0.01)
     assert found.departs == (False,) * 7 + (True,) * FEWEST + (False,) * 2 + (True,)
     assert found.levels == (0,) * 7 + (1,) * 7 + (-1,)
-    band = found.limits[-1]
-    assert band is not None
-    assert band.centre == pytest.approx(3.0)
+    assert found.limits[-1, 0] == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("stay", [1, 3, FEWEST, 9])
@@ -165,6 +160,7 @@ def test_a_drift_is_a_rank_correlation_and_a_median_slope() -> None:
 def test_friction_of_an_axis_is_the_mean_of_both_directions() -> None:
     arm, one = model(), history(steady, 1, seed=1)[0]
     speed = np.array([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+    axes = [Axis(name, "N·m", at, "rad/s") for name, at in zip(arm.joint_names, speed, strict=True)]
     values = np.random.default_rng(1).uniform(0.1, 2.0, arm.n_parameters)
     values[: arm.base.rank] = 0.0
     still = np.zeros((1, 6))
@@ -174,7 +170,7 @@ def test_friction_of_an_axis_is_the_mean_of_both_directions() -> None:
     variances = np.ones(arm.n_parameters)
     variances[arm.parameter_names.index("f1_2")] = np.inf  # then that of the axis is not known
     level = replace(one, values=values, covariance=np.diag(variances))
-    found, std = friction_in(level, friction_weights(arm, speed))
+    found, std = friction_in(level, friction_weights(arm, axes))
     expected = 0.5 * (forwards - backwards)
     expected[1] = np.nan
     np.testing.assert_allclose(found, expected, rtol=1e-12)
@@ -266,7 +262,7 @@ def test_half_a_kilogram_less_is_found_between_two_campaigns() -> None:
     change = arm.payload.changes[1]
     assert change is not None
     assert abs(change.mass + 0.5) < 4.0 * change.mass_std
-    assert "removed" in findings(arm)[0].words
+    assert re.search(r"changed between .*: -0\.\d+ ± .* kg", findings(arm)[0].words)
 
 
 def test_inertia_of_another_link_is_no_payload() -> None:
@@ -326,7 +322,7 @@ def test_the_joint_test_is_rarely_wrong_of_unchanged_arms() -> None:
     assert np.mean(np.array(p_values) < 0.5) > 0.3
 
 
-def test_campaigns_that_scatter_more_than_they_say_raise_no_alarm() -> None:
+def test_campaigns_that_scatter_much_raise_no_alarm() -> None:
     """A hose that pulls differently every time: the arm's own changes are the measure."""
     arm = model()
     campaigns = history(steady, 9, seed=3)
@@ -354,7 +350,7 @@ def test_an_axis_that_is_repaired_has_changed_twice() -> None:
     assert len(words) == 2
     assert re.search(r"joint_3 departs .*, from c07 \(2026-04-15\) to c09", words[0])
     assert re.search(r"joint_3 has returned .*, since c10", words[1])
-    assert summary(arm) == "no new change; 2 earlier ones"
+    assert summary(arm) == "no new change; 2 earlier changes"
 
 
 SPOOL = Load(3.0)
@@ -376,7 +372,7 @@ def test_a_payload_that_is_put_on_and_stated_is_no_discovery() -> None:
     assert not any(arm.payload.changed + arm.payload.other)
     statement = arm.payload.statements[2]
     assert statement is not None
-    assert (statement.before, statement.after, statement.verdict) == (None, STATED, "agrees")
+    assert (statement.before, statement.after, statement.verdict) == (None, STATED, "torques agree")
     assert any("states a payload of 3 kg instead of nothing" in f.words for f in findings(arm))
     assert {one.level for one in findings(arm)} == {"quiet"}
     np.testing.assert_allclose(arm.payload.mass, [0.0, 0.0, 3.0, 3.0], atol=0.3)
@@ -388,7 +384,7 @@ def test_a_payload_stated_later_has_not_changed() -> None:
     assert [one and one.verdict for one in arm.payload.statements] == [
         None,
         None,
-        "statement only",
+        "carried before as well",
         None,
     ]
     np.testing.assert_allclose(arm.payload.mass, 0.0, atol=0.3)
@@ -397,7 +393,7 @@ def test_a_payload_stated_later_has_not_changed() -> None:
 def test_a_payload_put_on_before_it_is_stated_is_found_once() -> None:
     arm = loaded(lambda k: k >= 1, lambda k: k >= 3, 5)
     assert np.flatnonzero(arm.payload.changed).tolist() == [1]
-    assert [one and one.verdict for one in arm.payload.statements][3] == "statement only"
+    assert [one and one.verdict for one in arm.payload.statements][3] == "carried before as well"
 
 
 def test_a_stated_payload_of_another_mass_is_reported() -> None:
@@ -410,7 +406,7 @@ def test_a_stated_payload_of_another_mass_is_reported() -> None:
 
     arm = trend_of(life, 3)
     assert [one.level for one in findings(arm)] == ["alarm", "alarm"]
-    assert "the torques do not agree" in findings(arm)[0].words
+    assert "torques disagree" in findings(arm)[0].words
     change = arm.payload.changes[2]
     assert change is not None
     assert abs(change.mass + 3.0) < 4.0 * change.mass_std
@@ -425,7 +421,7 @@ def test_without_times_campaigns_are_in_order_of_their_names() -> None:
     arm = arm_trend("arm", model(), campaigns)
     assert not arm.dated
     assert arm.time.tolist() == [1.0, 2.0, 3.0]
-    assert arm.labels == ("c1", "c9", "c10")
+    assert arm.names == ("c1", "c9", "c10")
     assert "in the order of their folders' names, from c1 to c10" in findings(arm)[-1].words
 
 
@@ -434,7 +430,7 @@ def test_a_campaign_without_a_time_among_others_is_left_out() -> None:
     campaigns[1] = replace(campaigns[1], when="")
     arm = arm_trend("arm", model(), campaigns)
     assert arm.dated
-    assert arm.labels == ("c00", "c02", "c03")
+    assert [name[:3] for name in arm.names] == ["c00", "c02", "c03"]
     assert arm.undated == ("line/c01",)
     assert "1 further campaign (c01) without a time of recording" in findings(arm)[-1].words
 
@@ -453,7 +449,7 @@ def test_axes_of_which_nothing_is_known_are_left_out() -> None:
     arm = arm_trend("arm", model(), [*campaigns, *campaigns * 3])
     assert np.isnan(arm.axes[0].friction.values).all()
     assert not any(any(axis.friction.departs) for axis in arm.axes)
-    text = render_trend_report(Trends((arm,), (), "wls", 16))
+    text = trend_page(Trends((arm,), (), "wls", 16)).decode()
     assert text.count('<span class="title">joint_1</span>') == 0
     assert text.count('<span class="title">joint_2</span>') == 2
 
@@ -461,7 +457,7 @@ def test_axes_of_which_nothing_is_known_are_left_out() -> None:
 def test_campaigns_are_put_in_order_of_time() -> None:
     campaigns = history(steady, 3, seed=2)
     arm = arm_trend("arm", model(), campaigns[::-1])
-    assert arm.labels == ("c00", "c01", "c02")
+    assert [name[:3] for name in arm.names] == ["c00", "c01", "c02"]
     assert arm.time.tolist() == [0.0, 14.0, 31.0]
 
 
@@ -478,7 +474,7 @@ BROKEN = Broken("/data/<b>torn</b>.mcap", "its footer is missing")
 
 @cache
 def page() -> str:
-    return render_trend_report(Trends((changed(), quiet()), (BROKEN,), "wls", 48))
+    return trend_page(Trends((changed(), quiet()), (BROKEN,), "wls", 48)).decode()
 
 
 def test_the_page_says_first_in_words_what_was_found() -> None:
@@ -497,11 +493,9 @@ def test_the_page_stands_alone_and_shows_all() -> None:
     assert "&lt;b&gt;torn" in page() and "<b>torn" not in page()
 
 
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_input_gives_the_same_bytes() -> None:
     trends = Trends((arm_trend("arm", model(), history(steady, 2, seed=2)),), (), "wls", 4)
-    for name in ("one", "two"):
-        write_trend_report(tmp_path / name, trends)
-    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    assert trend_page(trends) == trend_page(trends)
 
 
 @pytest.mark.slow
