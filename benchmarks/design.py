@@ -119,10 +119,10 @@ def compare(
         "pinocchio_1_khz_ms": round(one_khz, 3),
         "pinocchio_same_rate_ms": round(same_rate, 3),
         "duration_s": round(motion.duration, 3),
-        "log10_det_difference": found.log10_det - theirs[0][0],
-        "coupling_index_difference": found.coupling_index - theirs[0][1],
-        "log10_det_difference_to_1_khz": found.log10_det - theirs[1][0],
-        "coupling_index_difference_to_1_khz": found.coupling_index - theirs[1][1],
+        "log10_det_difference": found["log10_det"] - theirs[0][0],
+        "coupling_index_difference": found["coupling_index"] - theirs[0][1],
+        "log10_det_difference_to_1_khz": found["log10_det"] - theirs[1][0],
+        "coupling_index_difference_to_1_khz": found["coupling_index"] - theirs[1][1],
     }
 
 

@@ -190,12 +190,12 @@ def run(cell: Cell, case: Case, seed: int, *, workers: int, quick: bool) -> Row:
         seconds=took,
         chosen=chosen,
         goal=goal,
-        evaluated=design.evaluated,
-        infeasible=dict(design.infeasible),
+        evaluated=design.excitation.tried,
+        infeasible=dict(design.excitation.rejected),
         front=list(
             zip(
-                front.log10_det.tolist(),
-                front.coupling_index.tolist(),
+                front.measure("log10_det").tolist(),
+                front.measure("coupling_index").tolist(),
                 front.duration.tolist(),
                 strict=True,
             )
@@ -208,7 +208,7 @@ def _goal(population: Population, design: Design, chosen: Motion) -> Motion | No
     candidates = [chosen]
     front = design.front
     # By rising coupling index; what the two ways of sampling differ by is far below 0.1.
-    for index in np.flatnonzero(front.log10_det >= GOAL - 0.1).tolist():
+    for index in np.flatnonzero(front.measure("log10_det") >= GOAL - 0.1).tolist():
         trajectory, criteria = population.judged(front.genes[index], FINE)
         if criteria.log10_det >= GOAL:
             candidates.append(Motion.of(criteria, trajectory.duration))

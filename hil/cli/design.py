@@ -8,6 +8,7 @@ import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Literal
@@ -21,7 +22,7 @@ from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
-from hil.design.advice import WEAK, NoExcitationError, margins, weakest
+from hil.design.advice import WEAK, NoExcitationError, criteria_text, margins, weakest
 from hil.design.earlier import known_from
 from hil.design.result import References, references
 from hil.design.run import Designed, DesignFolder, require_same, run_design
@@ -31,31 +32,24 @@ from hil.plots import save
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.terminal_text import printable
+from identification.excitation import coupling_index_max
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
     """What was found, for a script; what is no finite number is None."""
     excitation, design = done.result.excitation, done.design
-    criteria = excitation.criteria
-
-    def finite(value: float | None) -> float | None:
-        return value if value is not None and math.isfinite(value) else None
-
+    figures = {k: v for k, v in asdict(excitation.criteria).items() if k != "n_samples"}
     return {
         "method": excitation.method,
         "seed": excitation.seed,
         "complete": design.complete,
         "exhausted": design.exhausted,
         "unchecked": list(done.result.settings.unchecked),
-        "log10_det": finite(criteria.log10_det),
-        "coupling_index": finite(criteria.coupling_index),
-        "fitness": finite(criteria.fitness),
-        "condition": finite(criteria.condition),
-        "scaled_condition": finite(criteria.scaled_condition),
+        **{k: v if v is not None and math.isfinite(v) else None for k, v in figures.items()},
         "duration": float(excitation.trajectory.duration),
         "tried": excitation.tried,
         "infeasible": dict(excitation.rejected),
-        "front": len(design.front.log10_det),
+        "front": len(design.front),
         "file": str(folder.result),
         "picture": str(folder.picture),
     }
@@ -63,12 +57,12 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
 
 def _lines(done: Designed) -> Iterator[str]:
     """What the criteria are and what limited them."""
-    result, excitation = done.result, done.result.excitation
-    sines, criteria = result.settings.sines, excitation.criteria
+    excitation, design = done.result.excitation, done.design
+    sines, criteria = done.result.settings.sines, excitation.criteria
     broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
     yield (
         f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
-        f"{len(done.design.front.log10_det)} on the front"
+        f"{len(design.front)} on the front"
     )
     raw, scaled = criteria.condition, criteria.scaled_condition
     if raw is not None and scaled is not None:
@@ -82,30 +76,28 @@ def _lines(done: Designed) -> Iterator[str]:
                 f"this motion hardly separates {names}: take more {more}, allow a longer motion, "
                 "search longer, or judge by other parameters ([objective] parameters)"
             )
-    if (origin := result.polished_from) is not None:
-        yield f"polished from log det {origin.log10_det:.2f}, I_c {origin.coupling_index:.2f}"
+    if design.chosen is None:
+        yield f"polished from {criteria_text(design.origin_criteria.measures)}"
     if sines is not None and sines.ramp == 0.0:
         yield "this motion begins and ends at full speed: no controller can run it; give it a ramp"
 
 
 def _draw(
-    folder: DesignFolder, done: Designed, cell: Cell, references: References, *, together: bool
+    folder: DesignFolder, done: Designed, cell: Cell, beside: References, *, together: bool
 ) -> None:
     """Draw the picture; without it the design is as good."""
     from hil.plots.design_picture import draw_design  # loads the arm's shapes
 
     design, excitation = done.design, done.result.excitation
-    front, origin = design.front, design.origin
+    grown = design.front.measures[design.origin].tolist()
     figure = draw_design(
         excitation,
         cell,
-        front=front,
+        front=design.front,
         chosen=design.chosen,
-        knee=None
-        if design.chosen is not None
-        else (float(front.log10_det[origin]), float(front.coupling_index[origin])),
-        references=references.measures,
-        kinematic=references.kinematic,
+        knee=None if design.chosen is not None else tuple(grown),
+        references=beside.measures,
+        kinematic=beside.kinematic,
         unchecked=done.result.settings.unchecked,
         complete=design.complete,
         together=together,
@@ -254,12 +246,11 @@ def design(
         if json:
             print_json(found)
         else:
-            excitation, n = done.result.excitation, done.result.search.n_parameters
-            criteria = excitation.criteria
+            excitation, p = done.result.excitation, done.problem.objective.n_parameters
             typer.echo(
                 printable(
-                    f"log det {criteria.log10_det:.2f}, I_c {criteria.coupling_index:.2f} of "
-                    f"{n * (n - 1) // 2}, {excitation.trajectory.duration:.2f} s: {folder.result}"
+                    f"{criteria_text(excitation.criteria.measures)} of {coupling_index_max(p):.0f},"
+                    f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
         _draw(folder, done, loaded, beside, together=known is not None)

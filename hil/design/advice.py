@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -14,17 +14,15 @@ from hil.cell import AngleFrame, Cell
 from hil.errors import UnsafeError
 from hil.motion_checks import always_so, violation_text
 from identification.excitation import (
+    CRITERIA,
     CollisionChecker,
     CurrentModel,
     NoFeasibleMotionError,
     Objective,
     Problem,
-    SearchSettings,
-    Violation,
     midpoints,
     sampled,
 )
-from identification.excitation.collision.scene import NEAR
 from identification.model.motion import Motion
 from planner import Trajectory
 
@@ -34,12 +32,17 @@ Array = NDArray[np.float64]
 
 WEAK: Final = 1e4
 """Condition number, columns of unit length, beyond which estimates are mostly noise."""
-# Farther away [m] nothing is looked for, and nearer by such steps [m].
+# Farther away [m] nothing is looked for.
 _WIDEST: Final = 0.5
-_STEP: Final = 0.005
 # Share of the largest entry of a direction that an entry has at least to be reported, and how many.
 _CONCERNED: Final = 0.3
 _MOST_NAMES: Final = 6
+
+
+def criteria_text(measures: Iterable[float], digits: int = 2) -> str:
+    """Return values of `CRITERIA` in words."""
+    named = zip(CRITERIA.values(), measures, strict=True)
+    return ", ".join(f"{one.label} {value:.{digits}f}" for one, value in named)
 
 
 def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
@@ -47,7 +50,7 @@ def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
     constraints, motion = problem.constraints, sampled(trajectory)
     parts = [] if constraints.currents is None else [_largest_current(constraints.currents, motion)]
     if constraints.checker is not None:
-        parts.append(_nearest(cell, constraints.checker, motion))
+        parts.append(_nearest(cell, motion))
     return "; ".join(parts)
 
 
@@ -80,40 +83,19 @@ def _largest_current(currents: CurrentModel, motion: Motion) -> str:
     )
 
 
-def _nearest(cell: Cell, checker: CollisionChecker, motion: Motion) -> str:
-    """Return what comes nearest to what, to some millimetres.
-
-    A checker finds what is nearer than its margin, so wider and wider ones are asked. One takes
-    what is nearer than its margin in any posture for built that way, and looks at it no more: what
-    the one before did look at, and found no contact of, is as far as that one's margin.
-    """
-    margin, known = cell.workspace.margin, _built_in(checker)
-    for wider in (*np.arange(margin + _STEP, NEAR, _STEP).tolist(), max(_WIDEST, margin)):
-        wide = CollisionChecker(
-            cell.urdf,
-            replace(cell.workspace, margin=wider),
-            limits=cell.joint_limits,
-            mesh_folders=cell.mesh_folders,
-        )
-        found = [(margin, *pair) for pair in sorted(_built_in(wide) - known)]
-        contact = wide.deepest_contact(motion.position)
-        if contact is not None:
-            found.append((contact.distance, contact.first, contact.second))
-        if found:
-            distance, first, second = min(found)
-            return f"nearest {distance:.2f} m ({first}, {second})"
-        margin = wider
-    return f"nothing nearer than {margin:g} m"
-
-
-def _built_in(checker: CollisionChecker) -> set[tuple[str, str]]:
-    """Return pairs that a checker leaves out, by the names of links and obstacles."""
-    return {(_link(pair.first), _link(pair.second)) for pair in checker.built_in}
-
-
-def _link(shape: str) -> str:
-    """Return the link of a shape, whose name has a number behind it, or an obstacle's own name."""
-    return shape.rpartition("_")[0] or shape
+def _nearest(cell: Cell, motion: Motion) -> str:
+    """Return what comes nearest to what; not of shapes that the arm's construction keeps close."""
+    margin = max(_WIDEST, cell.workspace.margin)
+    wide = CollisionChecker(
+        cell.urdf,
+        replace(cell.workspace, margin=margin),
+        limits=cell.joint_limits,
+        mesh_folders=cell.mesh_folders,
+    )
+    contact = wide.deepest_contact(motion.position)
+    if contact is None:
+        return f"nothing nearer than {margin:g} m"
+    return f"nearest {contact.distance:.2f} m ({contact.first}, {contact.second})"
 
 
 _POSTURE: Final = "let the joints swing about another posture ([sines] offset)"
@@ -156,14 +138,7 @@ def no_excitation(
     checker: CollisionChecker | None,
     settings: DesignSettings,
 ) -> NoExcitationError:
-    """Return the error for a person: what forbids every motion, and what could be changed.
-
-    Args:
-        error: of the search.
-        frame: of the angles to tell it in.
-        checker: of the search; it knows which pairs no motion can part.
-        settings: of the design.
-    """
+    """Return the error for a person: what forbids every motion, and what could be changed."""
     contact = error.nearest.get("collision")
     always = None if contact is None or checker is None else always_so(contact, checker)
     advice = "; ".join(_advice(error, settings, always))
@@ -172,26 +147,8 @@ def no_excitation(
 
 
 def forbidden(error: NoFeasibleMotionError, frame: AngleFrame) -> str:
-    """Return what forbids every motion, of the one that comes closest the worst of each kind."""
-    worst: dict[str, Violation] = {}
-    for violation in sorted(error.closest, key=lambda violation: -violation.excess):
-        worst.setdefault(violation.kind, violation)
-    return NoFeasibleMotionError(
-        error.rejected,
-        error.nearest,
-        closest=tuple(worst.values()),
-        tried=error.tried,
-        unexciting=error.unexciting,
-        stopped=error.stopped,
-    ).sentence(partial(violation_text, frame=frame))
-
-
-def exhausted(generations: int, settings: SearchSettings) -> str:
-    """Return why a search ended before its last generation, and what could be changed."""
-    return (
-        f"ended after {generations} of {settings.generations} generations: mating brought no "
-        "motion that was not there before; raise mutation, crossover or population in [search]"
-    )
+    """Return what forbids every motion, in angles of a frame."""
+    return error.sentence(partial(violation_text, frame=frame))
 
 
 def _advice(

@@ -7,11 +7,10 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -20,24 +19,20 @@ from hil.io import digest, json_digest
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (
+    CRITERIA,
     Criteria,
     Design,
     Excitation,
     Objective,
     coupling_index_max,
 )
-from planner import FourierSeries, JointLimits, PiecewiseCubic, PlanFile, PlannerError, in_child
+from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
+from planner.checked_data import DAMAGED, Whole, numbers, strict
 from planner.toml_text import Angles, from_text, to_text
 
-from .settings import RESULT_FORMAT, DesignSettings, SettingsError, settings_of
+from .settings import RESULT_FORMAT, DesignSettings, settings_of
 
 Array = NDArray[np.float64]
-
-Whole = Annotated[int, Field(ge=0)]
-Positive = Annotated[int, Field(ge=1)]
-Index = Annotated[float, Field(ge=0.0)]
-"""Of coupling."""
-Condition = Annotated[float, Field(ge=1.0)]
 
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"
@@ -50,24 +45,20 @@ _DIGITS: Final = 16
 # Planned on another machine a motion may differ in its last digits, at so many instants by no more.
 _SAME: Final = 1e-9  # rad
 _INSTANTS: Final = 9
+_LIMITS: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
 _REMEDY: Final = "design it again (`hil design`)"
 _HEAD: Final = """\
 # An excitation that `hil design` found. Names that end in _deg hold degrees, degrees/s,
 # degrees/s^2, degrees/s^3 of the URDF's angles. `hil demo --excitation` runs it. Do not change
 # anything here: the seal at the end would break.
 """
-_FRONT: Final = (
-    "Motions of which none is better than another in both, by rising coupling index, as the\n"
-    "search sampled them. "
-)
-_CHOSEN: Final = "chosen, counting from 0, is the motion of this file."
-_POLISHED: Final = (
-    "The motion of this file is none of them: a polish made it from one, see polished_from."
-)
 _COMMENTS: Final = {
     "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
     "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has none.",
     "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
+    "front": "Motions of which none is better than another in all, by rising coupling index, as "
+    "the\nsearch sampled them. chosen, counting from 0, is the motion of this file; without it a "
+    "polish\nmade the motion from one, see polished_from.",
     "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
     "criteria by\nthe millisecond.",
     "settings": "As the search was asked; `hil design --settings` takes them from this file.",
@@ -80,67 +71,6 @@ _COMMENTS: Final = {
 }
 
 
-class _Table(BaseModel):
-    """A table of the file: finite numbers, none parsed from a text."""
-
-    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
-
-
-class CriteriaTable(_Table):
-    """`[criteria]`: see :class:`identification.excitation.Criteria`."""
-
-    log10_det: float
-    coupling_index: Index
-    fitness: float
-    n_samples: Positive
-    condition: Condition | None = None
-    scaled_condition: Condition | None = None
-
-
-class SearchTable(_Table):
-    """`[search]`: how the motion was found; `parameters` is None for all of the model's."""
-
-    method: str
-    seed: Whole
-    tried: Whole
-    generations: Whole
-    n_parameters: Positive
-    parameters: list[str] | None = None
-    infeasible: dict[str, int]
-
-
-class FrontTable(_Table):
-    """`[front]`: its points, and which of them the motion is; None where it was polished."""
-
-    chosen: int | None = None
-    log10_det: list[float]
-    coupling_index: list[float]
-    duration: list[float]
-
-    @model_validator(mode="after")
-    def _alike(self) -> Self:
-        if not len(self.log10_det) == len(self.coupling_index) == len(self.duration):
-            raise ValueError("its lists are not equally long")
-        return self
-
-
-class Origin(_Table):
-    """`[polished_from]`: the point that a polish began with, and its criteria at 1 ms."""
-
-    point: Whole
-    log10_det: float
-    coupling_index: Index
-
-
-class _Figures(_Table):
-    """The tables whose figures are checked."""
-
-    criteria: CriteriaTable
-    search: SearchTable
-    front: FrontTable
-    polished_from: Origin | None = None
-
-
 def fingerprint(cell: Cell) -> dict[str, str]:
     """Return a digest of each part of a cell that a design may depend on, by the part's name.
 
@@ -148,74 +78,16 @@ def fingerprint(cell: Cell) -> dict[str, str]:
     The limits are those in URDF angles.
     """
     file, limits, home = cell.file, cell.joint_limits, cell.file.campaign
-    tables: dict[str, BaseModel | None] = {
-        "robot": file.robot,
-        "drive_train": file.drive_train,
-        "nominal": file.nominal,
-        "workspace": file.workspace,
-    }
-    documents = {k: None if v is None else v.model_dump(mode="json") for k, v in tables.items()}
     parts: dict[str, Any] = {
         "urdf": cell.urdf,
-        "robot": documents["robot"],
-        "limits": {name: getattr(limits, name).tolist() for name in _ANGLES},
+        "limits": {name: getattr(limits, name).tolist() for name in _LIMITS},
         "torque_limit": None if cell.torque_limit is None else cell.torque_limit.tolist(),
-        **documents,
         "home": None if home is None else home.home_deg,
     }
+    for name in ("robot", "drive_train", "nominal", "workspace"):
+        table = getattr(file, name)
+        parts[name] = None if table is None else table.model_dump(mode="json")
     return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
-
-
-_ANGLES: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
-
-
-def _motion_data(
-    excitation: Excitation, joint_names: Sequence[str], limits: JointLimits
-) -> dict[str, Any]:
-    """Return the table `plan` (as a plan file has it, without the motion) or `sines`."""
-    trajectory = excitation.trajectory
-    if isinstance(trajectory, FourierSeries):
-        data = {"joints": list(joint_names)} | trajectory.to_dict()
-        return {"sines": data | {name: Angles(data[name]) for name in ("offset", "amplitude")}}
-    moves, points = excitation.moves, excitation.via_points
-    if moves is None or points is None:
-        raise ValueError("a motion in pieces without its moves cannot be written down")
-    plan = PlanFile(tuple(joint_names), points[0], moves, limits=limits).to_dict()
-    plan["start"] = Angles(plan["start"])
-    plan["limits"] = {name: Angles(plan["limits"][name]) for name in _ANGLES}
-    plan["moves"] = [{**move, "target": Angles(move["target"])} for move in plan["moves"]]
-    return {"plan": plan}
-
-
-def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
-    """Return the trajectory, and what it was planned from, as arguments of an `Excitation`.
-
-    Args:
-        data: the whole file, which holds one of the two tables.
-        fly: how far corners are rounded, as the settings say.
-
-    Raises:
-        KeyError, TypeError, ValueError, PlannerError: the data are no motion.
-    """
-    if "sines" in data:
-        sines = {name: value for name, value in data["sines"].items() if name != "joints"}
-        return {"trajectory": FourierSeries.from_dict(sines)}
-    file = PlanFile.from_dict(data["plan"])
-    speed = file.moves[0].joint_speed
-    if fly is None or speed is None:
-        raise ValueError("the moves lack fly or speed")
-    points = np.array([file.start, *(move.target for move in file.moves)])
-    return {
-        "trajectory": in_child(file.plan).trajectory,  # the solver can take its process with it
-        "via_points": points,
-        "speed": np.broadcast_to(np.asarray(speed, dtype=np.float64), points[0].shape).copy(),
-        "fly": fly,
-    }
-
-
-def _motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
-    """Return what two motions share only if they are the same to the last bit."""
-    return digest(json.dumps(trajectory.to_dict()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,30 +95,19 @@ class DesignResult:
     """What `excitation.toml` says.
 
     Attributes:
-        cell_name: the cell that the motion was designed for.
-        cell_parts: digest of each part of its description.
-        joint_names: the motion's joints.
+        data: its tables, without the seal.
         settings: of the design.
         excitation: the motion and its criteria.
-        complete: whether the search came to its end.
-        search: how the motion was found.
-        front: points of which none is better than another in both criteria.
-        polished_from: the point that the motion grew from, if it is none of them.
-        versions: of the software.
-        archives: name and SHA-256 of the earlier archives it adds to.
     """
 
-    cell_name: str
-    cell_parts: Mapping[str, str]
-    joint_names: tuple[str, ...]
+    data: Mapping[str, Any]
     settings: DesignSettings
     excitation: Excitation
-    complete: bool
-    search: SearchTable
-    front: FrontTable
-    polished_from: Origin | None
-    versions: Mapping[str, str]
-    archives: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the search came to its end."""
+        return bool(self.data["complete"])
 
     @classmethod
     def of(
@@ -257,51 +118,48 @@ class DesignResult:
         objective: Objective,
         archives: tuple[tuple[str, str], ...] = (),
     ) -> Self:
-        """Return the record of a design."""
+        """Return the record of a design; `archives` are names and SHA-256 of earlier ones."""
         names, judged, front = objective.model.parameter_names, objective.parameters, design.front
         excitation, grown = design.excitation, design.origin_criteria
-        return cls(
-            cell_name=cell.name,
-            cell_parts=fingerprint(cell),
-            joint_names=cell.joint_names,
-            settings=settings,
-            excitation=excitation,
-            complete=design.complete,
-            # As it is: what could not be read back is refused where it is read.
-            search=SearchTable.model_construct(
-                method=excitation.method,
-                seed=excitation.seed,
-                tried=excitation.tried,
-                generations=len(design.history),
-                n_parameters=objective.n_parameters,
-                parameters=None if judged is None else [names[k] for k in judged],
-                infeasible={name: int(n) for name, n in excitation.rejected.items()},
-            ),
-            front=FrontTable.model_construct(
-                chosen=design.chosen,
-                log10_det=np.asarray(front.log10_det).tolist(),
-                coupling_index=np.asarray(front.coupling_index).tolist(),
-                duration=np.asarray(front.duration).tolist(),
-            ),
-            polished_from=None
-            if design.chosen is not None
-            else Origin(
-                point=design.origin,
-                log10_det=grown.log10_det,
-                coupling_index=grown.coupling_index,
-            ),
-            versions=software(),
-            archives=archives,
-        )
+        data: dict[str, Any] = {
+            "format": RESULT_FORMAT,
+            "version": VERSION,
+            "complete": design.complete,
+            "criteria": asdict(excitation.criteria)
+            | {
+                "coupling_index_max": coupling_index_max(objective.n_parameters),
+                "duration": float(excitation.trajectory.duration),
+            },
+            "search": {
+                "method": excitation.method,
+                "seed": excitation.seed,
+                "tried": excitation.tried,
+                "generations": len(design.history),
+                "n_parameters": objective.n_parameters,
+                "parameters": None if judged is None else [names[k] for k in judged],
+                "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
+            },
+            "front": {"chosen": design.chosen}
+            | {name: front.measure(name).tolist() for name in CRITERIA}
+            | {"duration": front.duration.tolist()},
+        }
+        if design.chosen is None:
+            measures = dict(zip(CRITERIA, grown.measures, strict=True))
+            data["polished_from"] = {"point": design.origin, **measures}
+        data["settings"] = settings.to_dict()
+        if archives:
+            data["earlier"] = {"archives": [list(one) for one in archives]}
+        data["cell"] = {"name": cell.name, **fingerprint(cell)}
+        data["software"] = software()
+        return cls(data | _motion_data(excitation, cell), settings, excitation)
 
-    def save(self, path: Path, cell: Cell) -> None:
+    def save(self, path: Path) -> None:
         """Write the file.
 
         Raises:
             InputError: it cannot be written.
         """
-        front = _FRONT + (_CHOSEN if self.polished_from is None else _POLISHED)
-        text = _HEAD + to_text(self._data(cell), {**_COMMENTS, "front": front})
+        text = _HEAD + to_text(self.data, _COMMENTS)
         trajectory = self.excitation.trajectory
         seal = {
             "sha256": _seal(text),
@@ -339,27 +197,18 @@ class DesignResult:
                 if data.get(key) != known:
                     raise ValueError(f"{key} is {data.get(key)!r:.60}, this reads {known!r}")
             seal = data.pop("seal")
-            digest, motion = seal["sha256"], seal["motion_sha256"]
-            positions = np.array(seal["positions"], dtype=np.float64)
-            if digest != _seal(text):
-                raise InputError(
-                    path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
-                )
-            result = cls._from_data(data)
-        except SettingsError as error:
-            raise InputError(path, str(error), remedy=_REMEDY) from error
-        except ValidationError as error:
-            first = error.errors()[0]
-            name, *inner = first["loc"] or ("front",)
-            rest = (f".{part}" if isinstance(part, str) else f"[{part}]" for part in inner)
-            problem = f"is {first['input']!r:.60}, not a figure: {first['msg'].lower()}"
+            motion, positions = seal["motion_sha256"], numbers(seal["positions"], 2)
+            unchanged = seal["sha256"] == _seal(text)
+            result = cls._from_data(data, path) if unchanged else None
+        except (PlannerError, *DAMAGED) as error:
+            why = " ".join(str(error).split())
             raise InputError(
-                path, problem, field=f"{name}{''.join(rest)}", remedy=_REMEDY
+                path, f"is not a designed excitation ({why:.200})", remedy=_REMEDY
             ) from error
-        except (PlannerError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        if result is None:
             raise InputError(
-                path, f"is not a designed excitation ({error})", remedy=_REMEDY
-            ) from error
+                path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
+            )
         if _motion_digest(result.excitation.trajectory) != motion:
             result._require_alike(path, positions)
         return result
@@ -370,12 +219,12 @@ class DesignResult:
         Raises:
             InputError: names the two cells and what differs.
         """
-        now = fingerprint(cell)
-        different = [part for part in parts if now[part] != self.cell_parts.get(part)]
+        now, then = fingerprint(cell), self.data["cell"]
+        different = [part for part in parts if now[part] != then.get(part)]
         if different:
             raise InputError(
                 path,
-                f"was designed for the cell {self.cell_name!r}, whose {' and '.join(different)} "
+                f"was designed for the cell {then['name']!r}, whose {' and '.join(different)} "
                 f"{'is' if len(different) == 1 else 'are'} not that of {cell.name!r}",
                 field="cell",
                 remedy=f"name its own cell, or {_REMEDY}",
@@ -387,7 +236,9 @@ class DesignResult:
         if positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME):
             return
         other = [
-            f"{k} {v} (here {now.get(k)})" for k, v in self.versions.items() if now.get(k) != v
+            f"{k} {v} (here {now.get(k)})"
+            for k, v in self.data["software"].items()
+            if now.get(k) != v
         ]
         raise InputError(
             path,
@@ -396,59 +247,65 @@ class DesignResult:
             + (f": {', '.join(other)}" if other else ""),
         )
 
-    def _data(self, cell: Cell) -> dict[str, Any]:
-        excitation, optional = self.excitation, dict[str, Any]()
-        if self.polished_from is not None:
-            optional["polished_from"] = self.polished_from.model_dump()
-        optional["settings"] = self.settings.to_dict()
-        if self.archives:
-            optional["earlier"] = {"archives": [list(one) for one in self.archives]}
-        bounds = {
-            "coupling_index_max": coupling_index_max(self.search.n_parameters),
-            "duration": float(excitation.trajectory.duration),
-        }
-        return {
-            "format": RESULT_FORMAT,
-            "version": VERSION,
-            "complete": self.complete,
-            "criteria": asdict(excitation.criteria) | bounds,
-            "search": self.search.model_dump(),
-            "front": self.front.model_dump(),
-            **optional,
-            "cell": {"name": self.cell_name, **self.cell_parts},
-            "software": dict(self.versions),
-            **_motion_data(excitation, self.joint_names, cell.joint_limits),
-        }
-
     @classmethod
-    def _from_data(cls, data: Mapping[str, Any]) -> Self:
-        settings = settings_of(data["settings"])
-        figures = _Figures.model_validate(
-            {name: data[name] for name in _Figures.model_fields if name in data}
-        )
-        search, via = figures.search, settings.via_points
+    def _from_data(cls, data: Mapping[str, Any], path: Path) -> Self:
+        settings, search = settings_of(data["settings"], path), data["search"]
+        via = settings.via_points
+        figures = {k: v for k, v in data["criteria"].items() if k in Criteria.__dataclass_fields__}
         excitation = Excitation(
-            criteria=Criteria(**figures.criteria.model_dump()),
-            method=search.method,
-            seed=search.seed,
-            tried=search.tried,
-            rejected=search.infeasible,
+            criteria=Criteria.from_dict(figures),
+            method=strict(str, search["method"]),
+            seed=strict(Whole, search["seed"]),
+            tried=strict(Whole, search["tried"]),
+            rejected=strict(dict[str, Whole], search["infeasible"]),
             **_motion_from_data(data, None if via is None else via.fly),
         )
-        earlier = data.get("earlier", {}).get("archives", ())
-        return cls(
-            cell_name=data["cell"]["name"],
-            cell_parts={name: part for name, part in data["cell"].items() if name != "name"},
-            joint_names=tuple(data["sines" if "sines" in data else "plan"]["joints"]),
-            settings=settings,
-            excitation=excitation,
-            complete=data["complete"],
-            search=search,
-            front=figures.front,
-            polished_from=figures.polished_from,
-            versions=data["software"],
-            archives=tuple((name, digest) for name, digest in earlier),
-        )
+        strict(bool, data["complete"])
+        strict(str, strict(dict[str, str], data["cell"])["name"])
+        return cls(data, settings, excitation)
+
+
+def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
+    """Return the table `plan` (as a plan file has it, without the motion) or `sines`."""
+    trajectory = excitation.trajectory
+    if isinstance(trajectory, FourierSeries):
+        data = {"joints": list(cell.joint_names)} | trajectory.to_dict()
+        return {"sines": data | {name: Angles(data[name]) for name in ("offset", "amplitude")}}
+    moves, points = excitation.moves, excitation.via_points
+    assert moves is not None and points is not None  # a search plans pieces from moves
+    plan = PlanFile(cell.joint_names, points[0], moves, limits=cell.joint_limits).to_dict()
+    plan["start"] = Angles(plan["start"])
+    plan["limits"] = {name: Angles(plan["limits"][name]) for name in _LIMITS}
+    plan["moves"] = [{**move, "target": Angles(move["target"])} for move in plan["moves"]]
+    return {"plan": plan}
+
+
+def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
+    """Return the trajectory, and what it was planned from, as arguments of an `Excitation`.
+
+    Args:
+        data: the whole file, which holds one of the two tables.
+        fly: how far corners are rounded, as the settings say.
+    """
+    if "sines" in data:
+        sines = {name: value for name, value in data["sines"].items() if name != "joints"}
+        return {"trajectory": FourierSeries.from_dict(sines)}
+    file = PlanFile.from_dict(data["plan"])
+    speed = file.moves[0].joint_speed
+    if fly is None or speed is None:
+        raise ValueError("the moves lack fly or speed")
+    points = np.array([file.start, *(move.target for move in file.moves)])
+    return {
+        "trajectory": in_child(file.plan).trajectory,  # the solver can take its process with it
+        "via_points": points,
+        "speed": np.broadcast_to(np.asarray(speed, dtype=np.float64), points[0].shape).copy(),
+        "fly": fly,
+    }
+
+
+def _motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
+    """Return what two motions share only if they are the same to the last bit."""
+    return digest(json.dumps(trajectory.to_dict()))
 
 
 def load_design(path: Path, cell: Cell | None = None) -> Excitation:
@@ -480,18 +337,15 @@ def _seal(text: str) -> str:
     return json_digest(data)
 
 
-# Earlier designs beside a new one
-
-
 class References(NamedTuple):
-    """Designs to compare with.
+    """Earlier designs to compare a new one with.
 
     Attributes:
-        measures: (log10 det, coupling index) of each, by name.
+        measures: `CRITERIA` of each, by name.
         kinematic: names of those that were searched without looking at everything.
     """
 
-    measures: dict[str, tuple[float, float]]
+    measures: dict[str, tuple[float, ...]]
     kinematic: frozenset[str]
 
 
@@ -517,12 +371,19 @@ def references(
             field=option,
             remedy="leave out one of the two",
         )
-    measures: dict[str, tuple[float, float]] = {}
+
+    def judged(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
+        if asked.objective.parameters == "payload":
+            return {"payload"}
+        return set(named or cell.model.parameter_names)
+
+    measures: dict[str, tuple[float, ...]] = {}
     kinematic = set()
+    ours = judged(settings, settings.objective.named)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
-        if result.archives:
+        if "earlier" in result.data:
             raise InputError(
                 path,
                 "was designed with --earlier: its numbers are of all archives together, weighted, "
@@ -530,14 +391,7 @@ def references(
                 field=option,
                 remedy="name designs made without --earlier",
             )
-        every = ["payload"], [*cell.model.parameter_names]
-        ours, theirs = (
-            set(every[0] if asked == "payload" else every[1] if named is None else named)
-            for asked, named in (
-                (settings.objective.parameters, settings.objective.named),
-                (result.settings.objective.parameters, result.search.parameters),
-            )
-        )
+        theirs = judged(result.settings, result.data["search"].get("parameters"))
         if ours != theirs:
             raise InputError(
                 path,
@@ -549,8 +403,7 @@ def references(
         method = result.excitation.method
         name = f"method {method.upper()}" if len(method) == 1 else method
         name = f"{name} ({path})" if name in measures else name
-        criteria = result.excitation.criteria
-        measures[name] = criteria.log10_det, criteria.coupling_index
+        measures[name] = result.excitation.criteria.measures
         if result.settings.unchecked:
             kinematic.add(name)
     return References(measures, frozenset(kinematic))

@@ -3,37 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final, cast
+from typing import Any, BinaryIO, cast
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
 from hil.files import exclusive_folder, write_atomically
 from hil.motion_checks import violation_text
-from hil.progress import Reporter, Task
+from hil.progress import Reporter
 from hil.reading import opened
 from identification.excitation import (
     Design,
-    ForeignJournalError,
     Journal,
     JournalError,
     NoFeasibleMotionError,
     Population,
     Problem,
     Progress,
-    SearchSettings,
     most_evaluations,
     sampled,
     search,
 )
 from planner.toml_text import to_text
 
-from .advice import exhausted, forbidden, no_excitation
+from .advice import criteria_text, forbidden, no_excitation
 from .problem import Knowledge, problem_of, search_settings
-from .result import RESULT, DesignResult
+from .result import RESULT, DesignResult, fingerprint
 from .settings import DesignSettings, SettingsError, load_settings
 
 PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
@@ -43,31 +41,19 @@ DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
 _HEAD = "# The settings of the search in this folder; `hil design --resume` goes on with them.\n"
 
 
-@dataclass(frozen=True)
 class DesignFolder:
-    """Paths below one folder."""
+    """Paths of a design's files below one folder, and who may write them.
 
-    root: Path
+    Attributes:
+        result, picture: the motion and all that it came from, and the same for the eye.
+        settings: what was asked for.
+        journal: what was scored so far.
+    """
 
-    @property
-    def result(self) -> Path:
-        """The motion, its criteria, and all that it came from."""
-        return self.root / RESULT
-
-    @property
-    def picture(self) -> Path:
-        """The same for the eye."""
-        return self.root / PICTURE
-
-    @property
-    def settings(self) -> Path:
-        """What was asked for."""
-        return self.root / SETTINGS
-
-    @property
-    def journal(self) -> Path:
-        """What was scored so far."""
-        return self.root / JOURNAL
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.result, self.picture = root / RESULT, root / PICTURE
+        self.settings, self.journal = root / SETTINGS, root / JOURNAL
 
     def held(self) -> AbstractContextManager[None]:
         """Make the folder, and keep every other search out of it until this is left."""
@@ -149,20 +135,22 @@ class DesignFolder:
             ) from error
 
 
+def _flat(settings: DesignSettings) -> dict[str, Any]:
+    """Return settings by their dotted names."""
+    return {
+        f"{name}.{key}" if key else name: entry
+        for name, table in settings.to_dict().items()
+        for key, entry in (table.items() if isinstance(table, dict) else [("", table)])
+    }
+
+
 def require_same(asked: DesignSettings, there: DesignSettings, path: Path) -> None:
     """Refuse to go on with a search under other settings than those it began with.
 
     Raises:
         SettingsError: names the first field that differs.
     """
-    ours, theirs = (
-        {
-            f"{name}.{key}" if key else name: entry
-            for name, table in settings.to_dict().items()
-            for key, entry in (table.items() if isinstance(table, dict) else [("", table)])
-        }
-        for settings in (asked, there)
-    )
+    ours, theirs = _flat(asked), _flat(there)
     for field in sorted(ours.keys() | theirs.keys()):
         if ours.get(field) != theirs.get(field):
             raise SettingsError(
@@ -171,9 +159,6 @@ def require_same(asked: DesignSettings, there: DesignSettings, path: Path) -> No
                 field=f"{field} = {ours.get(field)!r}",
                 remedy="resume it without other settings, or begin anew in another folder (-o)",
             )
-
-
-_TITLE: Final = "designing (motions)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +177,6 @@ def run_search(
     *,
     workers: int = 2,
     known: Knowledge | None = None,
-    journal: BinaryIO | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
     """Search a motion for a cell.
@@ -203,18 +187,16 @@ def run_search(
         reporter: shows how far the search is, and its best motion so far.
         workers: processes that score motions; the result does not depend on how many.
         known: an earlier estimate, to which the motion is to add.
-        journal: file that keeps what was scored, to resume from; None to keep nothing.
         stop: asked between generations; true ends the search with the best motion so far. A
             motion that hangs holds a generation up for a minute or two.
 
     Raises:
         NoExcitationError: no motion keeps every constraint: which forbids it, where, by how much.
         OperatorStopError: it was stopped before there was one.
-        InputError: the journal is of another search, or cannot be read or begun.
         SettingsError, CellError: settings and cell do not fit together.
     """
     problem = problem_of(cell, settings, known)
-    return _searched(problem, cell, settings, reporter, workers, journal, stop)
+    return _searched(problem, cell, settings, reporter, workers, stop)
 
 
 def run_design(
@@ -244,21 +226,31 @@ def run_design(
         HilError: see :func:`run_search`.
     """
     problem = problem_of(cell, settings, known)  # before anything is replaced by what cannot be
+    archives = () if known is None else known.archives
     with folder.held():
         if resume:  # another search may have been there since they were read
             require_same(settings, folder.interrupted(), folder.settings)
         else:
             folder.begin(settings, force=force)
-        with folder.opened_journal() as journal:
-            design = _searched(problem, cell, settings, reporter, workers, journal, stop)
+        repetitions = {} if known is None else {"repetitions": known.repetitions}
+        search = {
+            "settings": _flat(settings),
+            "cell": fingerprint(cell),
+            "earlier": dict(archives) | repetitions,
+        }
+        with folder.opened_journal() as file:
+            journal = _journal(file, search, reporter)
+            try:
+                design = _searched(problem, cell, settings, reporter, workers, stop, journal)
+            finally:
+                journal.close()
         trajectory = design.excitation.trajectory  # as it is going to be run
         broken = problem.constraints.violations(trajectory, sampled(trajectory))
         if broken:
             reason = violation_text(broken[0], AngleFrame.of(cell))
             raise UnsafeError(f"the motion found does not pass its last check: {reason}")
-        archives = () if known is None else known.archives
         result = DesignResult.of(cell, settings, design, problem.objective, archives)
-        result.save(folder.result, cell)
+        result.save(folder.result)
         done = Designed(problem, design, result)
         then(done)
     return done
@@ -270,28 +262,37 @@ def _searched(
     asked: DesignSettings,
     reporter: Reporter,
     workers: int,
-    journal: BinaryIO | None,
     stop: Callable[[], bool],
+    journal: Journal | None = None,
 ) -> Design:
     settings, checker = search_settings(asked), problem.constraints.checker
-    frame = AngleFrame.of(cell)
+    frame, total = AngleFrame.of(cell), most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
-    with ExitStack() as stack:
-        task = stack.enter_context(reporter.task(_TITLE, most_evaluations(settings)))
-        bar = _Bar(task, reporter)
-        population = stack.enter_context(Population(problem, workers))
-        if journal is not None:
-            bar.journal = _journal(journal, problem, settings, reporter)
-            stack.callback(bar.journal.close)
+    done, note, troubled = 0, "scoring the first motions", False
+    with reporter.task("designing (motions)", total) as task, Population(problem, workers) as found:
+        task.advance(0, note)
+
+        def scored(count: int) -> None:
+            nonlocal done
+            done += count
+            task.advance(count, note)
+
+        def entered(progress: Progress) -> None:
+            """A generation is scored, or was in the journal."""
+            nonlocal note, troubled
+            note = _note(progress)
+            scored(progress.evaluated - done)
+            if journal is not None and journal.trouble is not None and not troubled:
+                troubled = True
+                reporter.say(
+                    f"the journal cannot be written ({journal.trouble.strerror}); the search goes "
+                    "on, and writes it as soon as there is room"
+                )
+
         try:
             design = search(
-                population,
-                settings,
-                journal=bar.journal,
-                progress=bar.entered,
-                scored=bar.scored,
-                stop=stop,
+                found, settings, journal=journal, progress=entered, scored=scored, stop=stop
             )
         except NoFeasibleMotionError as error:
             if error.stopped:
@@ -300,55 +301,24 @@ def _searched(
                     f"{forbidden(error, frame)}"
                 ) from error
             raise no_excitation(error, frame, checker, asked) from error
-        bar.end(design)
-    return design
-
-
-class _Bar:
-    """Shows a search's progress on a running task, and says what a person should know."""
-
-    def __init__(self, task: Task, reporter: Reporter) -> None:
-        self.journal: Journal | None = None
-        self._task, self._reporter = task, reporter
-        self._done, self._note = 0, "scoring the first motions"
-        self._troubled = False
-        task.advance(0, self._note)
-
-    def scored(self, count: int) -> None:
-        """So many more motions of a generation are scored."""
-        self._done += count
-        self._task.advance(count, self._note)
-
-    def entered(self, progress: Progress) -> None:
-        """A generation is scored, or was in the journal."""
-        more, self._done = progress.evaluated - self._done, progress.evaluated
-        self._note = _note(progress)
-        self._task.advance(more, self._note)
-        if self.journal is not None and self.journal.trouble is not None and not self._troubled:
-            self._troubled = True
-            self._reporter.say(
-                f"the journal cannot be written ({self.journal.trouble.strerror}); the search goes "
-                "on, and writes it as soon as there is room"
-            )
-
-    def end(self, design: Design) -> None:
-        """The search has ended."""
-        journal = self.journal
-        if design.complete:  # a polish that settled, or mating that did, needed fewer
-            rest = most_evaluations(design.settings) - self._done
-            self._task.advance(rest, "done")
-        if design.exhausted:
-            self._reporter.say(exhausted(len(design.history), design.settings))
-        if journal is None:
-            return
+        if design.complete:  # a polish or a mating that found nothing new needed fewer
+            task.advance(total - done, "done")
+    if design.exhausted:
+        reporter.say(
+            f"ended after {len(design.history)} of {settings.generations} generations: mating "
+            "brought no motion that was not there before; raise mutation, crossover or population "
+            "in [search]"
+        )
+    if journal is not None:
         journal.close()
         if journal.recalled:
-            self._reporter.say(f"{journal.recalled} motions were known from the journal")
+            reporter.say(f"{journal.recalled} motions were known from the journal")
         if journal.trouble is not None:
-            self._reporter.say(
+            reporter.say(
                 f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
                 "resumed from it scores them anew"
             )
+    return design
 
 
 def _note(progress: Progress) -> str:
@@ -357,24 +327,20 @@ def _note(progress: Progress) -> str:
         "search": f"generation {progress.generation} of {progress.generations}",
         "polish": "polishing",
     }[progress.phase]
-    if math.isnan(progress.coupling_index):
+    if math.isnan(progress.best[0]):
         return f"{where}, {progress.feasible} feasible"
-    return f"{where}, log det {progress.log10_det:.1f}, I_c {progress.coupling_index:.1f}"
+    return f"{where}, {criteria_text(progress.best, 1)}"
 
 
-def _journal(
-    file: BinaryIO, problem: Problem, settings: SearchSettings, reporter: Reporter
-) -> Journal:
+def _journal(file: BinaryIO, search: Mapping[str, Any], reporter: Reporter) -> Journal:
     try:
-        journal = Journal(file, problem, settings)
-    except ForeignJournalError as error:
+        journal = Journal(file, search)
+    except JournalError as error:
         raise InputError(
             file.name,
-            f"was begun with another {error.part}: {error}",
+            str(error),
             remedy="resume with the same cell, settings and archives, or begin anew (--force)",
         ) from error
-    except JournalError as error:
-        raise InputError(file.name, str(error), remedy="begin anew (--force)") from error
     except OSError as error:
         raise InputError(
             file.name,

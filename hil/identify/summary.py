@@ -41,14 +41,11 @@ from identification import Factor, IdentificationError, RobotModel
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.shrinkage import Shrinkage, fitted_values
 from identification.excitation import (
+    Criteria,
     Excitation,
-    condition_number,
     correlation,
-    coupling_index,
     coupling_index_max,
-    fitness_eq7,
     information,
-    log10_det,
 )
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import EssentialChoice
@@ -299,15 +296,8 @@ def _excitation(
 ) -> ExcitationResult:
     """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
     lengths, most = [part.stop - part.start for part in rows], coupling_index_max(len(gram))
-    executed = CriteriaResult(
-        log10_det=log10_det(gram, sum(lengths)),
-        coupling_index=coupling_index(gram),
-        coupling_index_max=most,
-        fitness=fitness_eq7(gram, sum(lengths)),
-        n_samples=sum(lengths),
-        condition=condition_number(gram, scaled=False),
-        scaled_condition=condition_number(gram, scaled=True),
-    )
+    criteria = Criteria.of_gram(gram, sum(lengths))
+    executed = CriteriaResult.of(criteria, coupling_index_max=most)
     planned = _planned(sources)
     if planned is None:
         duration = lengths[0] * _period(training[0])

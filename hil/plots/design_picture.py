@@ -23,7 +23,13 @@ from hil.plots.joints import draw_motion
 from hil.plots.posture_strip import VIEWS, Strip, draw_strip
 from hil.report.drawing import label
 from hil.report.figures import shade_scale
-from identification.excitation import correlation, coupling_index, coupling_index_max, information
+from identification.excitation import (
+    CRITERIA,
+    correlation,
+    coupling_index,
+    coupling_index_max,
+    information,
+)
 from identification.excitation.constraints import sampled
 from identification.excitation.excitation import Excitation
 from identification.factor.factor import Factor
@@ -31,7 +37,7 @@ from identification.model.robot import RobotModel
 from planner import Trajectory
 
 Array = NDArray[np.float64]
-Measures = tuple[float, float]
+Measures = tuple[float, ...]
 """log10 det, I_c."""
 
 POSTURES: Final = 7
@@ -59,14 +65,8 @@ _TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
 class FrontPoints(Protocol):
     """The front of a search: its k motions' measures."""
 
-    @property
-    def log10_det(self) -> Array:
-        """Information (k,)."""
-        ...
-
-    @property
-    def coupling_index(self) -> Array:
-        """I_c (k,)."""
+    def measure(self, name: str) -> Array:
+        """One of `CRITERIA` (k,)."""
         ...
 
 
@@ -104,9 +104,11 @@ class FrontView:
     @property
     def line(self) -> Array:
         """Points of the front to join, by rising I_c (k, 2); none if there is only one."""
-        if self.front is None or len(self.front.coupling_index) < 2:
+        if self.front is None or len(self.front.measure("coupling_index")) < 2:
             return np.empty((0, 2))
-        points = np.column_stack((self.front.coupling_index, self.front.log10_det))
+        points = np.column_stack(
+            [self.front.measure(name) for name in ("coupling_index", "log10_det")]
+        )
         return points[np.argsort(points[:, 0], kind="stable")]
 
     @property
@@ -202,7 +204,7 @@ def _growth(axes: Axes, view: FrontView) -> None:
     """Draw an arrow from the point that the chosen motion grew from."""
     if view.knee is None or not np.all(np.isfinite((view.knee, view.chosen))):
         return
-    begin, end = view.knee[::-1], view.chosen[::-1]
+    begin, end = ((index, size) for size, index in (view.knee, view.chosen))
     if np.hypot(*(np.subtract(end, begin) / np.ptp(view.window, axis=1))) < _ARROW:
         return
     arrow = {"arrowstyle": "-|>,head_width=0.18,head_length=0.35", "color": style.LIMIT}
@@ -358,9 +360,9 @@ def draw_design(
     view = None
     if front is not None or references:
         criteria = excitation.criteria
-        measures = criteria.log10_det, criteria.coupling_index
+        measures = criteria.measures
         if front is not None and chosen is not None:  # those by which it lies on the front
-            measures = float(front.log10_det[chosen]), float(front.coupling_index[chosen])
+            measures = tuple(float(front.measure(name)[chosen]) for name in CRITERIA)
         view = FrontView(front, measures, chosen is not None, knee, references, kinematic, together)
     side = float(np.clip(_CELL * len(model.base.names), _SMALLEST, _LARGEST))
     beside = 0.0 if view is None else _FRONT + _LEGEND_LINE * (1.5 * len(view.marks) + 1)

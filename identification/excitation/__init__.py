@@ -14,6 +14,7 @@ from identification.excitation.constraints import (
     sampled,
 )
 from identification.excitation.criteria import (
+    CRITERIA,
     Criteria,
     condition_number,
     correlation,
@@ -26,7 +27,6 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import (
     CollisionModelError,
     DesignError,
-    ForeignJournalError,
     JournalError,
     MissingMeshError,
     NoFeasibleMotionError,
@@ -35,7 +35,7 @@ from identification.excitation.errors import (
 )
 from identification.excitation.excitation import DrawnMotion, Excitation
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
-from identification.excitation.objective import Measures, Objective
+from identification.excitation.objective import Objective
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import (
     Method,
@@ -55,6 +55,7 @@ from identification.excitation.validation_motions import random_validation_motio
 
 __all__ = [
     # criteria
+    "CRITERIA",
     "Criteria",
     "condition_number",
     "correlation",
@@ -63,7 +64,6 @@ __all__ = [
     "fitness_eq7",
     "information",
     "log10_det",
-    "Measures",
     "Objective",
     "SAMPLE_PERIOD",
     "midpoints",
@@ -106,7 +106,6 @@ __all__ = [
     "CollisionModelError",
     "MissingMeshError",
     "DesignError",
-    "ForeignJournalError",
     "JournalError",
     "NoFeasibleMotionError",
     "WorkspaceError",

@@ -1,4 +1,4 @@
-r"""How well a trajectory excites the parameters: the paper's two measures.
+r"""How well a trajectory excites the parameters: the paper's two measures, and what else is told.
 
 All of them read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, rows of
 all joints together (see :func:`information`). Columns have different units and sizes, so each is
@@ -6,16 +6,15 @@ first divided by its length, ``C = S^-1 Phi^T Phi S^-1`` with ``S = diag(|Phi_i|
 measures follow exactly, since S drops out of the coupling index and adds ``2 log10 |S|`` to the
 determinant, which itself would overflow.
 
-A trajectory that leaves a parameter without excitation makes the Gram matrix singular: the
-determinant's logarithm is then -inf and the coupling index inf, never an exception, so that a
-search can rank it last.
+A trajectory that leaves a parameter without excitation makes the Gram matrix singular: each
+measure is then the worst there is, never an exception, so that a search can rank it last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -31,6 +30,128 @@ def information(factor: Factor) -> Array:
     """Return the Gram matrix of the stacked regressor, no joint weighted, shape (p, p)."""
     total: Array = factor.gram.sum(axis=0)
     return total[:-1, :-1]
+
+
+class _Cholesky(NamedTuple):
+    """Column lengths (p,), and the lower factor (p, p) of the Gram with columns of unit length."""
+
+    scale: Array
+    lower: Array
+
+    @property
+    def correlation(self) -> Array:
+        """The lower triangle of the correlation matrix (p, p)."""
+        half, _ = scipy.linalg.lapack.dpotri(self.lower, lower=1)
+        deviation = np.sqrt(np.diag(half))
+        return np.asarray(np.tril(half) / deviation[:, None] / deviation)
+
+
+def _log10_det(gram: _Cholesky, n_samples: int) -> float:
+    logs = np.log10(np.diag(gram.lower)) + np.log10(gram.scale) - 0.5 * np.log10(n_samples)
+    return float(2.0 * logs.sum())
+
+
+def _coupling_index(gram: _Cholesky, _: int) -> float:
+    return float(np.abs(np.tril(gram.correlation, -1)).sum())
+
+
+class Criterion(NamedTuple):
+    """A measure that searches weigh.
+
+    Attributes:
+        score: it, of a factorised Gram matrix and N time samples.
+        label: its name in messages.
+        sense: 1 where more is better, -1 where less is.
+    """
+
+    score: Callable[[_Cholesky, int], float]
+    label: str
+    sense: float
+
+
+CRITERIA: Final[Mapping[str, Criterion]] = {
+    "log10_det": Criterion(_log10_det, "log det", 1.0),
+    "coupling_index": Criterion(_coupling_index, "I_c", -1.0),
+}
+"""What a front is made of, by the name of its field in :class:`Criteria`."""
+
+SENSE: Final = np.array([criterion.sense for criterion in CRITERIA.values()])
+
+
+def measures(gram: Array, n_samples: int) -> dict[str, float]:
+    """Return all of `CRITERIA` from one factorisation of a Gram matrix (p, p)."""
+    root = _factorised(gram)
+    return {
+        name: -one.sense * np.inf if root is None else one.score(root, n_samples)
+        for name, one in CRITERIA.items()
+    }
+
+
+def log10_det(gram: Array, n_samples: int) -> float:
+    r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix.
+
+    Args:
+        gram: the Gram matrix, shape (p, p).
+        n_samples: N, the number of time samples as in the paper's Table 1 (not of rows, of which
+            there are one per joint and sample).
+    """
+    return measures(gram, n_samples)["log10_det"]
+
+
+def coupling_index(gram: Array) -> float:
+    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
+    return measures(gram, 1)["coupling_index"]
+
+
+def coupling_index_max(p: int) -> float:
+    """Return the largest coupling index of p parameters, p (p - 1) / 2."""
+    return p * (p - 1) / 2.0
+
+
+def correlation(gram: Array) -> Array:
+    r"""Return :math:`\psi_{ij} / \sqrt{\psi_{ii}\psi_{jj}}` of the inverse Gram (p, p).
+
+    Eq. 5 and Fig. 2: the correlation of the estimates under equal, uncorrelated torque noise.
+    All entries are NaN for a singular matrix.
+    """
+    root = _factorised(gram)
+    if root is None:
+        return np.full(np.shape(gram), np.nan)
+    correlated = root.correlation
+    correlated += np.tril(correlated, -1).T
+    np.fill_diagonal(correlated, 1.0)
+    return correlated
+
+
+def fitness_eq7(
+    log10_det: float, coupling_index: float, p: int, weights: tuple[float, float] = (0.7, 0.3)
+) -> float:
+    r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
+
+    Of p parameters. The two terms differ in size by an order of magnitude, so the first one rules;
+    it is the paper's formula nonetheless. -inf for a singular matrix.
+    """
+    if not np.isfinite(log10_det) or not np.isfinite(coupling_index):
+        return -np.inf
+    coupling = np.inf if coupling_index == 0.0 else coupling_index_max(p) / coupling_index
+    return weights[0] * log10_det + weights[1] * coupling
+
+
+def condition_number(gram: Array, *, scaled: bool) -> float:
+    """Return the condition number of Phi (not of its Gram): raw, or with unit columns.
+
+    For information: the raw one depends on units. inf for a singular matrix.
+    """
+    matrix = np.asarray(gram, dtype=np.float64)
+    scale = np.sqrt(np.diag(matrix))
+    if not np.all(np.isfinite(scale) & (scale > 0.0)):
+        return np.inf
+    if scaled:
+        matrix = matrix / scale[:, None] / scale
+    values = np.linalg.eigvalsh(matrix)
+    if values[0] <= _smallest_pivot(len(matrix)) * values[-1]:
+        return np.inf
+    return float(np.sqrt(values[-1] / values[0]))
 
 
 @dataclass(frozen=True)
@@ -56,6 +177,11 @@ class Criteria:
     condition: float | None = None
     scaled_condition: float | None = None
 
+    @property
+    def measures(self) -> tuple[float, ...]:
+        """Those of `CRITERIA`, in their order."""
+        return tuple(getattr(self, name) for name in CRITERIA)
+
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Restore what `dataclasses.asdict` returned.
@@ -70,117 +196,26 @@ class Criteria:
     @classmethod
     def of_gram(cls, gram: Array, n_samples: int) -> Self:
         """Judge a motion by the Gram matrix (p, p) of N time samples."""
-        determinant, index = log10_det_and_coupling(gram, n_samples)
+        found = measures(gram, n_samples)
         return cls(
-            log10_det=determinant,
-            coupling_index=index,
-            fitness=fitness_of(determinant, index, len(gram)),
+            **found,
+            fitness=fitness_eq7(found["log10_det"], found["coupling_index"], len(gram)),
             n_samples=n_samples,
             condition=condition_number(gram, scaled=False),
             scaled_condition=condition_number(gram, scaled=True),
         )
 
 
-def log10_det(gram: Array, n_samples: int) -> float:
-    r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix.
-
-    Args:
-        gram: the Gram matrix, shape (p, p).
-        n_samples: N, the number of time samples as in the paper's Table 1 (not of rows, of which
-            there are one per joint and sample).
-    """
-    return log10_det_and_coupling(gram, n_samples)[0]
-
-
-def coupling_index(gram: Array) -> float:
-    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
-    return log10_det_and_coupling(gram, 1)[1]
-
-
-def log10_det_and_coupling(gram: Array, n_samples: int) -> tuple[float, float]:
-    """Return :func:`log10_det` and :func:`coupling_index` from one factorisation."""
-    scale, lower = _factorise(gram)
-    if lower is None:
-        return -np.inf, np.inf
-    logs = np.log10(np.diag(lower)) + np.log10(scale) - 0.5 * np.log10(n_samples)
-    coupling = np.abs(np.tril(_lower_correlation(lower), -1)).sum()
-    return float(2.0 * logs.sum()), float(coupling)
-
-
-def correlation(gram: Array) -> Array:
-    r"""Return :math:`\psi_{ij} / \sqrt{\psi_{ii}\psi_{jj}}` of the inverse Gram (p, p).
-
-    Eq. 5 and Fig. 2: the correlation of the estimates under equal, uncorrelated torque noise.
-    All entries are NaN for a singular matrix.
-    """
-    _, lower = _factorise(gram)
-    if lower is None:
-        return np.full(np.shape(gram), np.nan)
-    correlated = _lower_correlation(lower)
-    correlated += np.tril(correlated, -1).T
-    np.fill_diagonal(correlated, 1.0)
-    return correlated
-
-
-def coupling_index_max(p: int) -> float:
-    """Return the largest coupling index of p parameters, p (p - 1) / 2."""
-    return p * (p - 1) / 2.0
-
-
-def fitness_eq7(gram: Array, n_samples: int, *, weights: tuple[float, float] = (0.7, 0.3)) -> float:
-    r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
-
-    The two terms differ in size by an order of magnitude, so the first one rules; it is the
-    paper's formula nonetheless. -inf for a singular matrix.
-    """
-    determinant, index = log10_det_and_coupling(gram, n_samples)
-    return fitness_of(determinant, index, len(gram), weights=weights)
-
-
-def fitness_of(
-    determinant: float, index: float, p: int, *, weights: tuple[float, float] = (0.7, 0.3)
-) -> float:
-    """Return :func:`fitness_eq7` of p parameters from log10 det / N^p and I_c."""
-    if not np.isfinite(determinant) or not np.isfinite(index):
-        return -np.inf
-    coupling = np.inf if index == 0.0 else coupling_index_max(p) / index
-    return weights[0] * determinant + weights[1] * coupling
-
-
-def condition_number(gram: Array, *, scaled: bool) -> float:
-    """Return the condition number of Phi (not of its Gram): raw, or with unit columns.
-
-    For information: the raw one depends on units. inf for a singular matrix.
-    """
+def _factorised(gram: Array) -> _Cholesky | None:
+    """Return the factor of a Gram matrix (p, p), None for a singular one."""
     matrix = np.asarray(gram, dtype=np.float64)
     scale = np.sqrt(np.diag(matrix))
     if not np.all(np.isfinite(scale) & (scale > 0.0)):
-        return np.inf
-    if scaled:
-        matrix = matrix / scale[:, None] / scale
-    values = np.linalg.eigvalsh(matrix)
-    if values[0] <= _smallest_pivot(len(matrix)) * values[-1]:
-        return np.inf
-    return float(np.sqrt(values[-1] / values[0]))
-
-
-def _factorise(gram: Array) -> tuple[Array, Array | None]:
-    """Return column lengths, and the Cholesky factor of the scaled Gram, None if singular."""
-    matrix = np.asarray(gram, dtype=np.float64)
-    scale = np.sqrt(np.diag(matrix))
-    if not np.all(np.isfinite(scale) & (scale > 0.0)):
-        return scale, None
+        return None
     lower, info = scipy.linalg.lapack.dpotrf(matrix / scale[:, None] / scale, lower=1)
     if info != 0 or np.min(np.diag(lower)) ** 2 <= _smallest_pivot(len(matrix)):
-        return scale, None
-    return scale, lower
-
-
-def _lower_correlation(lower: Array) -> Array:
-    """Return the lower triangle of the correlation matrix from the Cholesky factor."""
-    half, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
-    deviation = np.sqrt(np.diag(half))
-    return np.asarray(np.tril(half) / deviation[:, None] / deviation)
+        return None
+    return _Cholesky(scale, lower)
 
 
 def _smallest_pivot(p: int) -> float:

@@ -8,8 +8,7 @@ IdentificationError
 ├── WorkspaceError         obstacles or a margin that mean nothing (also a ValueError)
 ├── DesignError            a setting outside its range (also a ValueError)
 ├── NoFeasibleMotionError  every motion tried breaks a constraint
-└── JournalError           a file that is not the journal of a search
-    └── ForeignJournalError    the journal of another search, or of other software
+└── JournalError           a file that is not the journal of this search
 ```
 """
 
@@ -98,37 +97,21 @@ class NoFeasibleMotionError(IdentificationError):
             f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
         ]
+        worst: dict[str, Violation] = {}
+        for violation in sorted(self.closest, key=lambda violation: -violation.excess):
+            worst.setdefault(violation.kind, violation)
         if len(self.closest) > 1:
-            all_of_it = " and ".join(map(text_of, self.closest))
-            reasons.append(f"the motion that comes closest breaks {all_of_it}")
+            breaks = " and ".join(map(text_of, worst.values()))
+            reasons.append(f"the motion that comes closest breaks {breaks}")
         if self.unexciting:
             reasons.append(
                 f"{self.unexciting} keep every constraint but leave a parameter without excitation"
             )
         if self.stopped:
             reasons.append("the search was stopped before its end")
-        if self.tried == 0:
-            return "no motion was tried: " + "; ".join(reasons)
-        return f"none of {self.tried} motions is feasible: " + "; ".join(reasons)
+        which = f"none of {self.tried} motions is feasible" if self.tried else "no motion was tried"
+        return f"{which}: {'; '.join(reasons)}"
 
 
 class JournalError(IdentificationError, ValueError):
-    """A file that is not the journal of a search."""
-
-
-class ForeignJournalError(JournalError):
-    """The journal of another search, or one that other software wrote.
-
-    Attributes:
-        part: "problem", "settings" or "versions".
-        name: what differs: a setting, a part of the problem, or a package.
-    """
-
-    def __init__(self, part: str, name: str, recorded: object, value: object) -> None:
-        self.part, self.name = part, name
-        reason = {
-            "problem": f"its {name} is not this one's",
-            "settings": f"its {name} is {recorded}, here it is {value}",
-            "versions": f"it was written with {name} {recorded}, installed is {value}",
-        }[part]
-        super().__init__(f"the journal belongs to another search: {reason}")
+    """A file that is not the journal of this search, or that other software wrote."""

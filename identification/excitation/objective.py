@@ -4,31 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.constraints import SAMPLE_PERIOD, midpoints
-from identification.excitation.criteria import Criteria, log10_det_and_coupling
+from identification.excitation.criteria import Criteria, measures
 from identification.model.motion import Motion
 from identification.model.regressor import joint_arrays
 from identification.model.robot import RobotModel
 from planner import Trajectory
 
 Array = NDArray[np.float64]
-
-
-class Measures(NamedTuple):
-    """What a search needs to know of one motion.
-
-    Attributes:
-        log10_det: log10 of det / N^p, -inf where a parameter is not excited.
-        coupling_index: I_c, inf where a parameter is not excited.
-    """
-
-    log10_det: float
-    coupling_index: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +75,9 @@ class Objective:
         """Return N of the criteria: the motion's own samples, or those of the earlier archives."""
         return motion.n_samples if self.earlier is None else self.earlier_samples
 
-    def measures(self, motion: Motion) -> Measures:
-        """Judge a sampled motion (see :meth:`information`) in one pass over its regressor."""
-        return Measures(*log10_det_and_coupling(self.information(motion), self.n_samples(motion)))
+    def measures(self, motion: Motion) -> dict[str, float]:
+        """Return `CRITERIA` of a sampled motion (see :meth:`information`), by name."""
+        return measures(self.information(motion), self.n_samples(motion))
 
     def criteria(self, trajectory: Trajectory, period: float) -> Criteria:
         """Return all criteria of a planned motion, sampled every `period` [s]."""
@@ -100,9 +87,8 @@ class Objective:
     def _gram(self, motion: Motion) -> Array:
         """Return the weighted Gram matrix (p, p) of the motion alone."""
         model = self.model
-        n, p = model.n_joints, model.n_parameters
         states = joint_arrays(
-            n,
+            model.n_joints,
             position=motion.position,
             velocity=motion.velocity,
             acceleration=motion.acceleration,
@@ -114,10 +100,10 @@ class Objective:
                 if still is not None:
                     np.copyto(block, 0.0, where=still[part, joint])
                 sums[joint] += block @ block.T
-        total = np.zeros((p, p))
-        weights = np.ones(n) if self.joint_weights is None else self.joint_weights
-        for joint, place in enumerate(self._places):
-            total[place] += weights[joint] * sums[joint]
+        total = np.zeros((model.n_parameters, model.n_parameters))
+        weights = np.ones(model.n_joints) if self.joint_weights is None else self.joint_weights
+        for weight, place, own in zip(weights, self._places, sums, strict=True):
+            total[place] += weight * own
         return total
 
     @cached_property

@@ -121,7 +121,7 @@ def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell
     assert known.gram[known.names.index("f0_6")].tolist() == [0.0] * len(known.names)
     problem = problem_of(cell, preset("b").kinematic(), known)
     genes = problem.genome.sample(np.random.default_rng(1), 3)
-    assert np.all(np.isfinite(problem.score(genes).log10_det))
+    assert np.all(np.isfinite(problem.score(genes).measures))
 
 
 def test_every_archive_is_recorded_with_its_checksum(known):

@@ -68,6 +68,11 @@ class Points:
     log10_det: np.ndarray
     coupling_index: np.ndarray
 
+    def measure(self, name: str) -> np.ndarray:
+        """One of both."""
+        found: np.ndarray = getattr(self, name)
+        return found
+
 
 @pytest.fixture(scope="module")
 def ns16() -> Cell:

@@ -72,21 +72,7 @@ def moody(**moods: Any) -> MoodyGenome:
 
 def bits(design: Design) -> dict[str, Any]:
     """Everything that a design says, arrays as bytes."""
-    front = design.front
-    return {
-        "genes": design.genes.tobytes(),
-        "excitation": design.excitation.to_dict(),
-        "front": [
-            array.tobytes()
-            for array in (front.genes, front.log10_det, front.coupling_index, front.duration)
-        ],
-        "chosen": design.chosen,
-        "origin": design.origin,
-        "origin_criteria": design.origin_criteria,
-        "history": design.history.tobytes(),
-        "evaluated": design.evaluated,
-        "infeasible": dict(design.infeasible),
-        "complete": design.complete,
-        "exhausted": design.exhausted,
-        "scale": design.scale,
-    }
+    said = vars(design) | {"genes": design.genes.tobytes(), "history": design.history.tobytes()}
+    said["excitation"] = design.excitation.to_dict()
+    said["front"] = [array.tobytes() for array in vars(design.front).values()]
+    return said

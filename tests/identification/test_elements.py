@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from identification import Factor, RobotModel, consistent_estimate, estimate
 from identification.errors import ModelError
-from identification.excitation.searches.journal import digest
 from identification.export.parameters import parameters_dict
 from identification.model.elements import (
     Anchors,
@@ -215,11 +214,6 @@ class TestElementModel:
             RobotModel.from_urdf(pendulum, elements=[spring])
         longer = replace(spring, free_length=0.3)
         assert RobotModel.from_urdf(pendulum, elements=[longer]).n_parameters > 0
-
-    def test_the_digest_of_a_search_knows_their_figures(self) -> None:
-        one = with_elements(replace(SPRING, identified=False))
-        other = with_elements(replace(SPRING, identified=False, stiffness=41.0))
-        assert len({digest(model) for model in (two_link.MODEL, one, other)}) == 3
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ import pytest
 from hil.archive import Archive, ArchiveHeader
 from hil.errors import ArchiveError
 from hil.study.records import Record, class_in, read_record, write_record
-from identification.excitation import Journal, SearchSettings
-from tests.identification.searching import problem
+from identification.excitation import Journal
 
 HEADER = {"kind": "move", "joint_names": '["a"]', "attachments": "[]"}
 
@@ -81,7 +80,7 @@ def test_a_journal_full_of_forged_frames_is_read_in_time_that_grows_as_it_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = BytesIO()
-    Journal(file, problem(), SearchSettings(population=4, generations=3))
+    Journal(file, {})
     frame = 12 + len(b"\x93NUMPY")
     count = 2_000
     for k in range(count):  # each claims all that follows
@@ -94,5 +93,5 @@ def test_a_journal_full_of_forged_frames_is_read_in_time_that_grows_as_it_does(
         return crc32(data)
 
     monkeypatch.setattr(zlib, "crc32", counted)
-    Journal(file, problem(), SearchSettings(population=4, generations=3))
+    Journal(file, {})
     assert sum(summed) < 8 * len(file.getvalue())

@@ -13,12 +13,13 @@ eigenvectors differ in their last bits with the threads that linear algebra is g
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.excitation.criteria import SENSE
 from identification.excitation.searches.population import CHUNK
 from identification.excitation.searches.scores import Scale, Scores
 
@@ -31,20 +32,8 @@ _STEP: Final = 0.03
 _SMALLEST_STEP: Final = 1e-7
 # Random numbers that are no other search's, whatever the seeds.
 _STREAM: Final = 3
-# How much the better of two gains counts where neither is a loss.
+# How much the largest gain counts where none is a loss.
 _SECOND: Final = 1e-3
-
-
-class PolishResult(NamedTuple):
-    """What a polish ended with.
-
-    Attributes:
-        genes: (n_genes,), those of the start, bit for bit, where nothing better was found.
-        scores: of this one motion, m = 1.
-    """
-
-    genes: Array
-    scores: Scores
 
 
 def polish(
@@ -56,11 +45,12 @@ def polish(
     evaluations: int,
     seed: int,
     stop: Callable[[], bool] = lambda: False,
-) -> PolishResult:
-    """Return the best motion found near a start, never a worse one than the start.
+) -> tuple[Array, Scores]:
+    """Return the best motion found near a start, its genes (n_genes,) and scores (m = 1).
 
-    "Better" is: nearer to keeping the constraints by their summed excess, then the fitness. The
-    same seed gives the same motion to the last bit, whatever else draws random numbers meanwhile.
+    Those of the start, bit for bit, where nothing better was found. "Better" is: nearer to keeping
+    the constraints by their summed excess, then the fitness. The same seed gives the same motion
+    to the last bit, whatever else draws random numbers meanwhile.
 
     Args:
         score: gives the scores of a whole generation of genes (m, n_genes) at once.
@@ -72,10 +62,10 @@ def polish(
         seed: of the random numbers.
         stop: asked before each generation; true ends the polish with the best so far.
     """
-    best = PolishResult(genes.copy(), scores)
+    best = genes.copy(), scores
     least, most = (float(each[0]) for each in _merits(scores, fitness))
     size = generation_size(len(genes))
-    strategy = _strategy(best.genes, size, seed)
+    strategy = _strategy(best[0], size, seed)
     evaluated = 0
     while evaluated + size <= evaluations and not stop():
         asked = np.array(strategy.ask())
@@ -86,7 +76,7 @@ def polish(
         index = int(np.lexsort((-values, excess))[0])
         if (excess[index], -values[index]) < (least, -most):
             least, most = float(excess[index]), float(values[index])
-            best = PolishResult(asked[index].copy(), found.take(index))
+            best = asked[index].copy(), found.take(index)
         evaluated += size
         if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
             break
@@ -96,28 +86,20 @@ def polish(
 def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
     """Return a fitness that no motion can have above 0 unless it is as good as `reference`.
 
-    The smaller of the two gains counts (an achievement function, Wierzbicki 1980); where neither
-    is a loss the other one counts a little too. Polished on this, a motion gets better in both
+    The smallest of its gains counts (an achievement function, Wierzbicki 1980); where none is a
+    loss the largest one counts a little too. Polished on this, a motion gets better in all
     measures or stays.
 
     Args:
         reference: scores of one motion, m = 1, that excites every parameter.
-        scale: units of the gains; without it one decade of the determinant is worth one step of
-            1 in the coupling index.
+        scale: units of the gains; without it those of the measures themselves.
     """
-    log10_det, coupling_index = reference.log10_det[0], reference.coupling_index[0]
-    decade, step = (
-        (1.0, 1.0) if scale is None else (scale.log10_det_spread, scale.coupling_index_spread)
-    )
+    spread = 1.0 if scale is None else np.array(scale.spread)
 
     def fitness(scores: Scores) -> Array:
-        larger = (scores.log10_det - log10_det) / decade
-        less_coupled = (coupling_index - scores.coupling_index) / step
-        smaller_gain = np.minimum(larger, less_coupled)
-        larger_gain = np.maximum(larger, less_coupled)
-        merit: Array = np.where(
-            smaller_gain < 0.0, smaller_gain, smaller_gain + _SECOND * larger_gain
-        )
+        gains = SENSE * (scores.measures - reference.measures) / spread
+        least = gains.min(axis=1)
+        merit: Array = np.where(least < 0.0, least, least + _SECOND * gains.max(axis=1))
         return merit
 
     return fitness
@@ -138,12 +120,9 @@ def _merits(scores: Scores, fitness: Fitness) -> tuple[Array, Array]:
 
 def _ranks(excess: Array, fitness: Array) -> Array:
     """Return ranks from 1 for the best (m,), alike for motions that are alike."""
-    pairs = np.stack((-fitness, excess))
-    order = np.lexsort(pairs)
-    steps = np.any(np.diff(pairs[:, order], axis=1) != 0.0, axis=0)
-    place = np.empty(len(order))
-    place[order] = np.concatenate(([0.0], np.cumsum(steps)))
-    ranks: Array = scipy.stats.rankdata(place, method="average")
+    pairs = np.stack((excess, -fitness))
+    _, place = np.unique(pairs, axis=1, return_inverse=True)
+    ranks: Array = scipy.stats.rankdata(place.ravel(), method="average")
     return ranks
 
 

@@ -79,15 +79,20 @@ class Problem:
 
         The scores of a motion do not depend on its company, to the last bit.
         """
-        rows = [self._row(trajectory) for trajectory in self.genome.motions(genes)]
+        rows = []
+        for motion in self.genome.motions(genes):
+            if isinstance(motion, PlannerError):
+                rows.append(unplanned())
+            else:
+                measures = self.objective.measures(midpoints(motion, self.period))
+                excess = excess_by_kind(self._broken(motion))
+                rows.append(np.array((*measures.values(), motion.duration, *excess)))
         return Scores.of_rows(np.array(rows))
 
     def violations(self, genes: Array) -> tuple[Violation, ...]:
         """Return what the motion of genes (n_genes,) breaks, with place and amount."""
-        (trajectory,) = self.genome.motions(genes[None])
-        if isinstance(trajectory, PlannerError):
-            return (unplannable(trajectory),)
-        return self._assessed(trajectory)[2]
+        (motion,) = self.genome.motions(genes[None])
+        return (_unplannable(motion),) if isinstance(motion, PlannerError) else self._broken(motion)
 
     def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
         """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
@@ -95,26 +100,17 @@ class Problem:
         Raises:
             PlannerError: there is no motion.
         """
-        (trajectory,) = self.genome.motions(genes[None])
-        if isinstance(trajectory, PlannerError):
-            raise trajectory
-        return trajectory, self.objective.criteria(trajectory, period)
+        (motion,) = self.genome.motions(genes[None])
+        if isinstance(motion, PlannerError):
+            raise motion
+        return motion, self.objective.criteria(motion, period)
 
-    def _row(self, trajectory: Motion | PlannerError) -> Array:
-        if isinstance(trajectory, PlannerError):
-            return unplanned()
-        log10_det, coupling_index, violations = self._assessed(trajectory)
-        excess = excess_by_kind(violations)
-        return np.array((log10_det, coupling_index, trajectory.duration, *excess))
-
-    def _assessed(self, trajectory: Motion) -> tuple[float, float, tuple[Violation, ...]]:
+    def _broken(self, motion: Motion) -> tuple[Violation, ...]:
         # Constraints are looked at where the last check before a motion is sent looks.
-        measures = self.objective.measures(midpoints(trajectory, self.period))
-        return *measures, self.constraints.violations(trajectory, sampled(trajectory, self.period))
+        return self.constraints.violations(motion, sampled(motion, self.period))
 
 
-def unplannable(error: PlannerError) -> Violation:
-    """Return how it is reported that there is no motion."""
+def _unplannable(error: PlannerError) -> Violation:
     return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)
 
 
@@ -182,9 +178,9 @@ class Population:
     def violations(self, genes: Array) -> tuple[Violation, ...]:
         """Return what the motion of genes (n_genes,) breaks, with place and amount."""
         try:
-            found: tuple[Violation, ...] = self._alone(_violations, genes)
+            found: tuple[Violation, ...] = self._alone("violations", genes)
         except (PlannerCrashed, PlanningTimedOut) as error:
-            return (unplannable(error),)
+            return (_unplannable(error),)
         return found
 
     def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
@@ -193,13 +189,13 @@ class Population:
         Raises:
             PlannerError: there is no motion, or its planning ended the process.
         """
-        found: tuple[Motion, Criteria] = self._alone(_judged, genes, period)
+        found: tuple[Motion, Criteria] = self._alone("judged", genes, period)
         return found
 
-    def _alone(self, function: Callable[..., list[Any]], *arguments: object) -> Any:
-        """Return the one result of a function of the problem; an outside kill is made good."""
+    def _alone(self, method: str, *arguments: object) -> Any:
+        """Return what a method of the problem returns; an outside kill is made good."""
         (result,) = map_in_children(
-            self._children[:1], function, [[0]], lambda _: (self._packed, *arguments)
+            self._children[:1], _called, [[0]], lambda _: (self._packed, method, *arguments)
         )
         if isinstance(result, PlannerCrashed | PlanningTimedOut):
             raise result
@@ -210,12 +206,8 @@ def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _violations(packed: bytes, genes: Array) -> list[tuple[Violation, ...]]:
-    return [_problem(packed).violations(genes)]
-
-
-def _judged(packed: bytes, genes: Array, period: float) -> list[tuple[Motion, Criteria]]:
-    return [_problem(packed).judged(genes, period)]
+def _called(packed: bytes, method: str, *arguments: Any) -> list[Any]:
+    return [getattr(_problem(packed), method)(*arguments)]
 
 
 @lru_cache(maxsize=1)

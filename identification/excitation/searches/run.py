@@ -9,7 +9,7 @@ interrupted and resumed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
@@ -25,7 +25,7 @@ from pymoo.operators.mutation.pm import PM
 from pymoo.operators.selection.tournament import TournamentSelection
 from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
-from identification.excitation.criteria import Criteria, fitness_of
+from identification.excitation.criteria import SENSE, Criteria, fitness_eq7
 from identification.excitation.errors import DesignError, NoFeasibleMotionError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.journal import Journal
@@ -48,8 +48,8 @@ class Progress(NamedTuple):
         evaluated: motions scored so far in all phases, of `total`.
         total: how many there are going to be at most.
         feasible: how many of them keep every constraint.
-        log10_det: of the best motion so far; nan before there is one.
-        coupling_index: of the same motion. With the method "front" it is the knee so far.
+        best: `CRITERIA` of the best motion so far, nan before there is one. With the method
+            "front" it is the knee so far.
     """
 
     phase: Phase
@@ -58,8 +58,7 @@ class Progress(NamedTuple):
     evaluated: int
     total: int
     feasible: int
-    log10_det: float
-    coupling_index: float
+    best: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Design:
     Attributes:
         settings: of the search.
         genes: (n_genes,) of the chosen motion.
-        excitation: the motion, with its criteria at 1 ms.
+        excitation: the motion, with its criteria at 1 ms, and how many motions were scored.
         front: the best compromises of everything that the search itself scored, with measures at
             the search's own period. A polish looks for one motion, not for compromises, and is
             left out.
@@ -78,11 +77,9 @@ class Design:
         origin_criteria: those of that motion, at 1 ms as well. The chosen motion is not worse: in
             its fitness, with the method "front" in neither measure. A polished one that is, at
             1 ms and against what the search saw at its own period, is not chosen.
-        history: (g, 3) after each generation: fitness, log10 det and coupling index of the best
-            motion so far, nan before there is one. With the method "front" the fitness is nan
-            and the measures are the best of either, of different motions.
-        evaluated: how many motions were scored.
-        infeasible: how many of them broke a constraint, by kind; one may count for several.
+        history: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion so
+            far, nan before there is one. With the method "front" the fitness is nan and the
+            measures are the best of each, of different motions.
         complete: whether the search ran to its end.
         exhausted: whether that end came before its last generation, as mating brought nothing new.
         scale: units of the balanced fitness and of the knee; None where they play no part.
@@ -96,8 +93,6 @@ class Design:
     origin: int
     origin_criteria: Criteria
     history: Array
-    evaluated: int
-    infeasible: Mapping[str, int]
     complete: bool
     exhausted: bool
     scale: Scale | None
@@ -115,10 +110,11 @@ _SCALE: Final = (5, 0)
 # Added to the excess of a motion that cannot be judged: it ranks behind all that can, however much
 # they exceed, and before those that cannot even be planned, whose excess is infinite.
 _UNEXCITING: Final = 1e6
+_ALL: Final = "all"
 
 
 class Evolution:
-    """A GA with one objective, NSGA-II with two; both rank feasible motions before all others.
+    """A GA with one objective, NSGA-II with more; both rank feasible motions before all others.
 
     Infeasible ones are ranked by the sum of their excesses, so constraints need no weights.
     Crossover is simulated binary, mutation polynomial, selection a binary tournament. Random
@@ -127,7 +123,7 @@ class Evolution:
     Args:
         settings: rates and sizes.
         first: genes (m, n_genes) of the first generation.
-        n_objectives: 1 or 2.
+        n_objectives: 1 or more.
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
@@ -145,17 +141,14 @@ class Evolution:
             mutation=PM(prob=1.0, prob_var=settings.mutation, eta=settings.mutation_eta),
             survival=survival,
         )
-        self._algorithm.setup(
-            Problem(
-                n_var=first.shape[1],
-                n_obj=n_objectives,
-                n_ieq_constr=len(KINDS) + 1,
-                xl=np.zeros(first.shape[1]),
-                xu=np.ones(first.shape[1]),
-            ),
-            termination=NoTermination(),
-            seed=[_STREAM, settings.seed],
+        problem = Problem(
+            n_var=first.shape[1],
+            n_obj=n_objectives,
+            n_ieq_constr=len(KINDS) + 1,
+            xl=np.zeros(first.shape[1]),
+            xu=np.ones(first.shape[1]),
         )
+        self._algorithm.setup(problem, termination=NoTermination(), seed=[_STREAM, settings.seed])
         self._asked: Any = None
 
     def ask(self) -> Array | None:
@@ -181,12 +174,12 @@ class Evolution:
 
 @dataclass(frozen=True)
 class Goal:
-    """Which of two motions is the better one, or that both measures count (method "front").
+    """Which of two motions is the better one, or that all measures count (method "front").
 
     Attributes:
         settings: of the search.
         p: number of parameters that are judged.
-        scale: units of the two measures; None where it plays no part.
+        scale: units of the measures; None where it plays no part.
     """
 
     settings: SearchSettings
@@ -198,60 +191,54 @@ class Goal:
         """Whether one number decides."""
         return self.settings.method != "front"
 
-    def objectives(self, scores: Scores) -> Array:
-        """Return what is to be minimised, (m, 1) or (m, 2)."""
-        if self.single:
-            return -self.fitness(scores.log10_det, scores.coupling_index)[:, None]
-        return np.stack((-scores.log10_det, scores.coupling_index), axis=1)
+    def objectives(self, measures: Array) -> Array:
+        """Return what is to be minimised, (m, 1) or (m, d), of measures (m, d)."""
+        return -self.fitness(measures)[:, None] if self.single else -SENSE * measures
 
-    def fitness(self, log10_det: Array, coupling_index: Array) -> Array:
-        """Return the one number of each motion (m,), the larger the better.
+    def fitness(self, measures: Array) -> Array:
+        """Return the one number of each motion (m,), the larger the better, of measures (m, d).
 
         -inf for a motion that leaves a parameter without excitation.
         """
-        weights = self.settings.weights
-        if self.settings.method == "a":
-            return np.where(np.isfinite(coupling_index), log10_det, -np.inf)
+        settings = self.settings
         if self.scale is not None:
-            return self.scale.fitness(log10_det, coupling_index, weights)
-        pairs = zip(log10_det.tolist(), coupling_index.tolist(), strict=True)
-        return np.array([fitness_of(*pair, self.p, weights=weights) for pair in pairs])
+            return self.scale.fitness(measures, settings.weights)
+        if settings.method == "a":
+            return np.asarray(measures[:, 0])
+        return np.array(
+            [
+                fitness_eq7(size, coupled, self.p, settings.weights)
+                for size, coupled, *_ in measures.tolist()
+            ]
+        )
 
     def choice(self, front: Front) -> int:
         """Return which motion of a front (at least one) is the winner.
 
-        No fitness gets worse when both measures get better, so its best motion is on the front.
+        No fitness gets worse when all measures get better, so its best motion is on the front.
         """
         if self.single:
-            return int(np.argmax(self.fitness(front.log10_det, front.coupling_index)))
+            return int(np.argmax(self.fitness(front.measures)))
         return front.knee(self.scale)
 
-    def best(self, front: Front) -> tuple[float, float, float]:
-        """Return fitness, log10 det and coupling index of the winner so far; nan without one.
-
-        Method "front" has no fitness (nan); its measures are the best of either on the front.
-        """
+    def best(self, front: Front) -> Array:
+        """Return fitness and measures (1 + d,) of the winner so far; nan without one."""
         if len(front) == 0:
-            return (np.nan, np.nan, np.nan)
+            return np.full(1 + len(SENSE), np.nan)
         if not self.single:
-            return (np.nan, float(np.max(front.log10_det)), float(np.min(front.coupling_index)))
+            return np.append(np.nan, SENSE * np.max(SENSE * front.measures, axis=0))
         k = self.choice(front)
-        values = self.fitness(front.log10_det, front.coupling_index)
-        return float(values[k]), float(front.log10_det[k]), float(front.coupling_index[k])
+        return np.append(self.fitness(front.measures)[k], front.measures[k])
 
     def is_worse(self, one: Criteria, other: Criteria) -> bool:
-        """Return whether a motion is worse than another, with "front" in either measure."""
-        log10_det = np.array((one.log10_det, other.log10_det))
-        coupling_index = np.array((one.coupling_index, other.coupling_index))
-        if self.single:
-            fitness = self.fitness(log10_det, coupling_index)
-            return not bool(fitness[0] >= fitness[1])
-        return not bool(log10_det[0] >= log10_det[1] and coupling_index[0] <= coupling_index[1])
+        """Return whether a motion is worse than another, with "front" in any measure."""
+        ours, theirs = self.objectives(np.array((one.measures, other.measures)))
+        return not bool(np.all(ours <= theirs))
 
     def polished_by(self, start: Scores) -> Callable[[Scores], Array]:
         """Return what a polish from a motion (scores, m = 1) makes larger."""
         if self.single:
-            return lambda scores: self.fitness(scores.log10_det, scores.coupling_index)
+            return lambda scores: self.fitness(scores.measures)
         return dominating(start, self.scale)
 
 
@@ -309,48 +296,67 @@ class _Search:
         self._stopped = self._exhausted = False
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
-        self._history: list[tuple[float, float, float]] = []
+        self._history: list[Array] = []
         self._front = Front.empty(self._genome.n_genes)
-        self._evaluated = self._feasible = 0
-        self._infeasible: Counter[str] = Counter()
+        self._tried = self._feasible = 0
+        self._rejected: Counter[str] = Counter()
         # The smallest excess but zero of each kind, and of all together, and whose it is.
         self._mildest: dict[str, tuple[float, Array]] = {}
 
     def run(self) -> Design:
+        settings = self._settings
         goal = self._goal = self._chosen_goal()
-        self._evolve(goal)
+        self._phase = "search"
+        random = np.random.default_rng((_FIRST, settings.seed))
+        first = self._genome.sample(random, settings.population)
+        evolution = Evolution(settings, first, 1 if goal.single else len(SENSE))
+        while len(self._history) < settings.generations and not self._halted():
+            asked = evolution.ask()
+            if asked is None:
+                self._exhausted = True
+                break
+            scores = self._score(asked)
+            evolution.tell(scores, goal.objectives(scores.measures))
         front = self._front
         if len(front) == 0:
             raise self._failure()
         winner = goal.choice(front)
         genes = start = front.genes[winner]
         origin = trajectory, criteria = self._population.judged(start, RESCORE_PERIOD)
-        if self._settings.polish > 0 and not self._halted():
-            genes = self._polished(goal, front, winner)
+        if settings.polish > 0 and not self._halted():
+            self._phase = "polish"
+            known = front.scores(winner)
+            genes, _ = polish(
+                self._score,
+                start,
+                known,
+                goal.polished_by(known),
+                evaluations=settings.polish,
+                seed=settings.seed,
+                stop=self._halted,
+            )
         if genes.tobytes() != start.tobytes():
             trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
             # Better only as the search samples, or other genes of the same motion.
             if criteria == origin[1] or goal.is_worse(criteria, origin[1]):
                 genes, (trajectory, criteria) = start, origin
         return Design(
-            settings=self._settings,
+            settings=settings,
             genes=genes.copy(),
             excitation=Excitation(
                 trajectory=trajectory,
                 criteria=criteria,
-                method=self._settings.method,
-                seed=self._settings.seed,
-                tried=self._evaluated,
-                rejected=dict(self._infeasible),
+                method=settings.method,
+                seed=settings.seed,
+                tried=self._tried,
+                rejected=dict(self._rejected),
                 **self._genome.recorded(genes),
             ),
             front=front,
-            chosen=winner if genes is start else None,
+            chosen=winner if genes.tobytes() == start.tobytes() else None,
             origin=winner,
             origin_criteria=origin[1],
-            history=np.array(self._history).reshape(-1, 3),
-            evaluated=self._evaluated,
-            infeasible=dict(self._infeasible),
+            history=np.array(self._history).reshape(-1, 1 + len(SENSE)),
             complete=not self._stopped,
             exhausted=self._exhausted,
             scale=goal.scale,
@@ -358,44 +364,16 @@ class _Search:
 
     def _chosen_goal(self) -> Goal:
         """Return what decides, after a look at random motions where it needs a scale."""
-        p = self._population.problem.objective.n_parameters
-        if not _needs_scale(self._settings):
-            return Goal(self._settings, p, None)
-        scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
-        try:
-            return Goal(self._settings, p, Scale.of(scores))
-        except DesignError:
-            # Random motions excite hardly anything. A front does without a scale.
-            if self._settings.method == "front":
-                return Goal(self._settings, p, None)
-            raise self._failure() from None
-
-    def _evolve(self, goal: Goal) -> None:
-        self._phase = "search"
-        random = np.random.default_rng((_FIRST, self._settings.seed))
-        first = self._genome.sample(random, self._settings.population)
-        evolution = Evolution(self._settings, first, n_objectives=1 if goal.single else 2)
-        while len(self._history) < self._settings.generations and not self._halted():
-            genes = evolution.ask()
-            if genes is None:
-                self._exhausted = True
-                return
-            scores = self._score(genes)
-            evolution.tell(scores, goal.objectives(scores))
-
-    def _polished(self, goal: Goal, front: Front, winner: int) -> Array:
-        """Return the genes of the best motion near the winner, or its own."""
-        self._phase = "polish"
-        start = front.scores(winner)
-        return polish(
-            self._score,
-            front.genes[winner],
-            start,
-            goal.polished_by(start),
-            evaluations=self._settings.polish,
-            seed=self._settings.seed,
-            stop=self._halted,
-        ).genes
+        scale, settings = None, self._settings
+        if _needs_scale(settings):
+            scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
+            try:
+                scale = Scale.of(scores)
+            except DesignError:
+                # Random motions excite hardly anything. A front does without a scale.
+                if settings.method != "front":
+                    raise self._failure() from None
+        return Goal(settings, self._population.problem.objective.n_parameters, scale)
 
     def _score(self, genes: Array) -> Scores:
         """Return the scores of genes (m, n_genes), from the journal where it has them."""
@@ -404,60 +382,59 @@ class _Search:
             scores = self._population.score(genes, self._scored)
             if self._journal is not None:
                 self._journal.record(genes, scores)
-        self._evaluated += len(genes)
+        self._tried += len(genes)
         self._feasible += int(np.count_nonzero(scores.feasible))
-        excess = dict(zip(KINDS, scores.excess.T, strict=True))
-        for kind, each in excess.items():
-            if count := int(np.count_nonzero(each)):
-                self._infeasible[kind] += count
-        for kind, each in {**excess, "all": scores.excess.sum(axis=1)}.items():
-            broken = np.flatnonzero(each)
+        sums = scores.excess.sum(axis=1)
+        for kind, excess in zip((*KINDS, _ALL), (*scores.excess.T, sums), strict=True):
+            broken = np.flatnonzero(excess)
             if len(broken) > 0:
-                index = int(broken[np.argmin(each[broken])])
-                if kind not in self._mildest or each[index] < self._mildest[kind][0]:
-                    self._mildest[kind] = float(each[index]), genes[index].copy()
+                if kind != _ALL:
+                    self._rejected[kind] += len(broken)
+                index = int(broken[np.argmin(excess[broken])])
+                if kind not in self._mildest or excess[index] < self._mildest[kind][0]:
+                    self._mildest[kind] = float(excess[index]), genes[index].copy()
         self._front = self._front.merge(Front.of(genes, scores))
         self._report()
         return scores
 
     def _report(self) -> None:
         """Extend the history and report how far the search is."""
-        goal, front, best = self._goal, self._front, (np.nan, np.nan)
+        goal, front = self._goal, self._front
         if self._phase == "search" and goal is not None:
             self._history.append(goal.best(front))
         if self._progress is None:
             return
+        best = np.full(len(SENSE), np.nan)
         if goal is not None and len(front) > 0:
-            k = goal.choice(front)
-            best = float(front.log10_det[k]), float(front.coupling_index[k])
+            best = front.measures[goal.choice(front)]
         self._progress(
             Progress(
                 self._phase,
                 len(self._history),
                 self._settings.generations,
-                self._evaluated,
+                self._tried,
                 most_evaluations(self._settings),
                 self._feasible,
-                *best,
+                tuple(best.tolist()),
             )
         )
 
     def _failure(self) -> NoFeasibleMotionError:
         """Return the error that says what forbids every motion, where, and by how much."""
-        mildest, violations = self._mildest, self._population.violations
-        closest = violations(mildest["all"][1]) if "all" in mildest else ()
+        broken = {
+            kind: self._population.violations(genes) for kind, (_, genes) in self._mildest.items()
+        }
 
         def worst(kind: str) -> Violation:
-            found = violations(mildest[kind][1])
             # Only a process that ended for other reasons breaks something else the second time.
-            alike = [violation for violation in found if violation.kind == kind]
-            return max(alike or found, key=lambda violation: violation.excess)
+            alike = [violation for violation in broken[kind] if violation.kind == kind]
+            return max(alike or broken[kind], key=lambda violation: violation.excess)
 
         return NoFeasibleMotionError(
-            self._infeasible,
-            {kind: worst(kind) for kind in sorted(self._infeasible)},
-            closest=closest,
-            tried=self._evaluated,
+            self._rejected,
+            {kind: worst(kind) for kind in sorted(self._rejected)},
+            closest=broken.get(_ALL, ()),
+            tried=self._tried,
             unexciting=self._feasible,
             stopped=self._stopped,
         )
