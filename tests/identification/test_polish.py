@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification.excitation import KINDS, Scale, Scores
-from identification.excitation.searches.polish import dominating, generation_size, polish
+from identification.excitation.searches.run import dominating, generation_size, polish
 from identification.excitation.searches.scores import unplanned
 
 N = 12
@@ -215,7 +215,7 @@ def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index,
 
 ON_ITS_OWN = """
 import numpy as np
-from identification.excitation.searches.polish import polish
+from identification.excitation.searches.run import polish
 from tests.identification.test_polish import scores_of, size_of
 
 def score(genes):
