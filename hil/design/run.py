@@ -244,6 +244,7 @@ def run_design(
                 design = _searched(problem, cell, settings, reporter, workers, stop, journal)
             finally:
                 journal.close()
+        _say_of_journal(journal, reporter)
         trajectory = design.excitation.trajectory  # as it is going to be run
         broken = problem.constraints.violations(trajectory, sampled(trajectory))
         if broken:
@@ -309,16 +310,17 @@ def _searched(
             "brought no motion that was not there before; raise mutation, crossover or population "
             "in [search]"
         )
-    if journal is not None:
-        journal.close()
-        if journal.recalled:
-            reporter.say(f"{journal.recalled} motions were known from the journal")
-        if journal.trouble is not None:
-            reporter.say(
-                f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
-                "resumed from it scores them anew"
-            )
     return design
+
+
+def _say_of_journal(journal: Journal, reporter: Reporter) -> None:
+    if journal.recalled:
+        reporter.say(f"{journal.recalled} motions were known from the journal")
+    if journal.trouble is not None:
+        reporter.say(
+            f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
+            "resumed from it scores them anew"
+        )
 
 
 def _note(progress: Progress) -> str:
