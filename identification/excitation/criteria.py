@@ -1,4 +1,4 @@
-r"""How well a trajectory excites the parameters: the paper's two measures, and what else is told.
+r"""How well a trajectory excites the parameters: the paper's two measures and condition numbers.
 
 All of them read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, rows of
 all joints together (see :func:`information`). Columns have different units and sizes, so each is
