@@ -16,7 +16,7 @@ from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import friction_in_words, friction_source
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
-from identification.export.urdf import with_comment, write_urdf
+from identification.export.urdf import write_urdf
 
 Array = NDArray[np.float64]
 
@@ -154,4 +154,4 @@ def _urdf(
             f"Not determined by the data, but nominal: {', '.join(estimate.undetermined)}."
         )
     lines += [f"{key}: {value}" for key, value in origin.items()]
-    return write_urdf(with_comment(cell.urdf, lines), model, consistent.standard, friction)
+    return write_urdf(cell.urdf, model, consistent.standard, friction, remarks=lines)

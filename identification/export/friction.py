@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,13 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
+# Directions of the sign below standstill, by what was done there.
+_ZONES = {
+    "exclude": "nothing was fitted: there sticking friction can take any value up to the Coulomb"
+    " friction, to either side.",
+    "linear": "sgn(v) is v / standstill, as fitted.",
+}
+
 
 def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     """Return the friction law and its coefficients (k,) as text, a line per joint.
@@ -21,38 +28,84 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
-    friction = model.friction
-    table = friction.table(coefficients)
+    friction, n = model.friction, model.n_joints
+    table, kinds = friction.table(coefficients), friction.kinds
     if not friction.terms:
         return "The joints have no friction.\n"
-    kinds = friction.kinds
+    names = [_line(name) for name in model.joint_names]
     # The third term of different joints may be of two kinds.
-    shared = [one.symbol for one, other in combinations(kinds, 2) if one.symbol == other.symbol]
+    shared = {symbol for symbol, count in Counter(k.symbol for k in kinds).items() if count > 1}
     lines = []
     if kinds:
         lines += [
             f"Torque that friction takes at the speed v of a joint: {_formula(kinds)}",
-            "with " + _joined([kind.words for kind in kinds]) + ".",
-            *_standstill_lines(model),
-            "",
+            f"with {_joined([kind.words for kind in kinds])}.",
+            "sgn(v) is 1 forwards, -1 backwards.",
         ]
-    for joint, (name, law) in enumerate(zip(model.joint_names, friction.laws, strict=True)):
-        revolute = bool(model.chain.revolute[joint])
-        values = _values(law, table[joint], revolute)
+        slow: dict[tuple[float, str], list[str]] = {}  # joints by standstill and zone
+        for name, law in zip(names, friction.laws, strict=True):
+            if law.symbols and law.zone in _ZONES:
+                slow.setdefault((law.standstill, law.zone), []).append(name)
+        for (speed, zone), alike in sorted(slow.items()):
+            whose = "" if len(alike) == n else f" {_joined(alike)}:"
+            lines.append(f"Slower than {speed:g} rad/s (m/s){whose} {_ZONES[zone]}")
+        lines.append("")
+    for name, law, own, revolute in zip(
+        names, friction.laws, table, model.chain.revolute.tolist(), strict=False
+    ):
+        values = _values(law, own, revolute)
         for term in law.terms:
             if term.symbol in shared:
                 values.append(f"{term.symbol} with {term.basis}")
             if term.speed_symbol:
-                speed = f"{term.speed:g} {'rad/s' if revolute else 'm/s'}"
-                values.append(f"{term.speed_symbol} = {speed}")
-        lines.append(f"{_line(name)}: " + (", ".join(values) or "no friction"))
+                unit = "rad/s" if revolute else "m/s"
+                values.append(f"{term.speed_symbol} = {term.speed:g} {unit}")
+        lines.append(f"{name}: " + (", ".join(values) or "no friction"))
     if any(law.asymmetric and law.coulomb for law in friction.laws):
         lines.append(
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
             " distinguished from the zero error of a sensor."
         )
-    lines += _motor_lines(model, table[model.n_joints :])
+    for motor, own, share in zip(friction.motors, table[n:], friction.motor_speeds(), strict=True):
+        turning = " + ".join(
+            ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({names[j]})"
+            for j in np.flatnonzero(share)
+        )
+        numbers = _values(friction.laws[motor], own, bool(friction.revolute[motor]))
+        lines.append(
+            f"motor {motor + 1}, at v = {turning}: {', '.join(numbers)}; each of these joints feels"
+            " that torque times its factor"
+        )
     return "\n".join(lines) + "\n"
+
+
+_FUNCTIONS = '''
+
+def direction(v, linear):
+    """Return the sign of a speed; slower than `linear`, v / linear."""
+    if abs(v) < linear:
+        return v / linear
+    return 1.0 if v > 0 else -1.0 if v < 0 else 0.0
+
+
+def friction(joint, v, smooth=0.0):
+    """Return {formula} of a joint (0, 1, ...) at speed v, N·m or N.
+
+    Slower than `smooth` (rad/s or m/s) the sign is linear: no jump at zero speed.
+    """
+    sign = direction(v, max(LINEAR[joint], smooth))
+    return {summands}
+
+
+def torques(speeds, smooth=0.0):
+    """Return friction of all {n} joints at their speeds, coupled motors included."""
+    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]
+    for motor, share in enumerate(MOTORS, len(JOINTS)):
+        v = sum(s * speed for s, speed in zip(share, speeds))
+        torque = friction(motor, v, smooth)
+        result = [total + s * torque for total, s in zip(result, share)]
+    return result
+'''
 
 
 def friction_source(model: RobotModel, coefficients: Array) -> str:
@@ -65,20 +118,18 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
     """
-    friction, n = model.friction, model.n_joints
+    friction, kinds = model.friction, model.friction.kinds
     laws, table = friction.all_laws, friction.table(coefficients)
-    linear = [repr(float(law.standstill) if law.zone == "linear" else 0.0) for law in laws]
+    linear = np.array([law.standstill if law.zone == "linear" else 0.0 for law in laws])
     lines = [
         '"""Identified friction of a robot\'s joints. Source: hil."""',
+        *(["", "from math import tanh"] if Tanh in kinds else []),
         "",
-        f"JOINTS = {_tuple(repr(name) for name in model.joint_names)}",
+        f"JOINTS = {_tuple(map(repr, model.joint_names))}",
         f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
         "# Of the joints, then of these motors:",
-        f"LINEAR = {_tuple(linear)}  # rad/s or m/s: slower, the sign was fitted as linear",
+        f"LINEAR = {_numbers(linear)}  # rad/s or m/s: slower, the sign was fitted as linear",
     ]
-    kinds = friction.kinds
-    if Tanh in kinds:
-        lines[1:1] = ["", "from math import tanh"]
     if any(" E " in kind.code for kind in kinds):
         lines.append(f"E = {math.e!r}")
     for kind in kinds:
@@ -92,62 +143,11 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
         if kind.speed_symbol:
             lines.append(f"{name}_SPEED = {_numbers(speeds)}  # rad/s or m/s")
-    lines += [
-        "",
-        "",
-        "def direction(v, linear):",
-        '    """Return the sign of a speed; slower than `linear`, v / linear."""',
-        "    if abs(v) < linear:",
-        "        return v / linear",
-        "    return 1.0 if v > 0 else -1.0 if v < 0 else 0.0",
-        "",
-        "",
-        "def friction(joint, v, smooth=0.0):",
-        f'    """Return {_formula(kinds) or "0"} of a joint (0, 1, ...) at speed v, N·m or N.',
-        "",
-        "    Slower than `smooth` (rad/s or m/s) the sign is linear: no jump at zero speed.",
-        '    """',
-    ]
-    if any("sign" in kind.code for kind in kinds):
-        lines.append("    sign = direction(v, max(LINEAR[joint], smooth))")
-    summands = [f"{kind.label.upper()}[joint]{kind.code}" for kind in kinds]
-    lines.append("    return " + (" + ".join(summands) or "0.0"))
-    lines += [
-        "",
-        "",
-        "def torques(speeds, smooth=0.0):",
-        f'    """Return friction of all {n} joints at their speeds, coupled motors included."""',
-        "    result = [friction(joint, v, smooth) for joint, v in enumerate(speeds)]",
-        "    for motor, share in enumerate(MOTORS, len(JOINTS)):",
-        "        v = sum(s * speed for s, speed in zip(share, speeds))",
-        "        torque = friction(motor, v, smooth)",
-        "        result = [total + s * torque for total, s in zip(result, share)]",
-        "    return result",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _standstill_lines(model: RobotModel) -> list[str]:
-    """Say what holds below standstill, for joints left out there and for those made linear."""
-    lines = ["sgn(v) is 1 forwards, -1 backwards."]
-    for zone, words in (
-        (
-            "exclude",
-            "nothing was fitted: there sticking friction can take any value up to the Coulomb"
-            " friction, to either side.",
-        ),
-        ("linear", "sgn(v) is v / standstill, as fitted."),
-    ):
-        named = {
-            name: law.standstill
-            for name, law in zip(model.joint_names, model.friction.laws, strict=True)
-            if law.zone == zone and law.symbols
-        }
-        for speed in sorted(set(named.values())):
-            alike = [_line(name) for name, own in named.items() if own == speed]
-            whose = "" if len(alike) == model.n_joints else f" {_joined(alike)}:"
-            lines.append(f"Slower than {speed:g} rad/s (m/s){whose} {words}")
-    return lines
+    summands = " + ".join(f"{kind.label.upper()}[joint]{kind.code}" for kind in kinds)
+    functions = _FUNCTIONS.format(
+        formula=_formula(kinds) or "0", summands=summands or "0.0", n=model.n_joints
+    )
+    return "\n".join(lines) + "\n" + functions
 
 
 def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool) -> list[str]:
@@ -157,21 +157,6 @@ def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool)
         for term in law.terms
         if term.symbol in coefficients
     ]
-
-
-def _motor_lines(model: RobotModel, table: Sequence[Mapping[str, float]]) -> list[str]:
-    lines, friction = [], model.friction
-    for motor, values, share in zip(friction.motors, table, friction.motor_speeds(), strict=True):
-        turning = " + ".join(
-            ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({_line(model.joint_names[j])})"
-            for j in np.flatnonzero(share)
-        )
-        numbers = _values(friction.laws[motor], values, friction.revolute[motor])
-        lines.append(
-            f"motor {motor + 1}, at v = {turning}: {', '.join(numbers)}; each of these joints feels"
-            " that torque times its factor"
-        )
-    return lines
 
 
 def _formula(kinds: Sequence[Kind]) -> str:
@@ -187,12 +172,10 @@ def _joined(parts: list[str]) -> str:
     return ", ".join(parts[:-1]) + " and " + parts[-1] if len(parts) > 1 else parts[0]
 
 
-def _number(value: float) -> str:
-    return repr(float(value)) if math.isfinite(value) else f'float("{float(value)}")'
-
-
 def _numbers(values: Array) -> str:
-    return _tuple(_number(value) for value in values)
+    return _tuple(
+        repr(value) if math.isfinite(value) else f'float("{value}")' for value in values.tolist()
+    )
 
 
 def _tuple(items: Iterable[str]) -> str:

@@ -12,11 +12,8 @@ import io
 import json
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
@@ -25,8 +22,6 @@ from identification.export.urdf import not_in_urdf
 from identification.factor.factor import Estimate
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
-
-Array = NDArray[np.float64]
 
 SCHEMA: Final = "hil-parameters-1"
 CONVENTION: Final = (
@@ -37,15 +32,15 @@ CONVENTION: Final = (
 )
 
 
-def parameters_dict(
+def parameters_json(
     model: RobotModel,
     estimate: Estimate,
     *,
     consistent: ConsistentEstimate | None = None,
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
-) -> dict[str, Any]:
-    """Return everything about an estimate, of values that `json` can write.
+) -> str:
+    """Return everything about an estimate as JSON text.
 
     Args:
         model: the robot.
@@ -57,9 +52,7 @@ def parameters_dict(
     Raises:
         IdentificationError: the estimate is of other parameters.
     """
-    if estimate.names != model.parameter_names:
-        raise IdentificationError("the estimate is not of the model's parameters")
-    return {
+    content = {
         "schema": SCHEMA,
         "provenance": dict(provenance or {}),
         "joints": list(model.joint_names),
@@ -74,13 +67,13 @@ def parameters_dict(
             }
             for one in model.elements.placed
         ],
-        "gravity": [float(x) for x in model.gravity],
+        "gravity": model.gravity.tolist(),
         "convention": CONVENTION,
         "method": estimate.method,
         "interval_factor": estimate.interval_factor,
-        "condition": _json_value(estimate.condition),
-        "noise_std": _json_value(estimate.noise_std),
-        "samples": [int(count) for count in estimate.samples],
+        "condition": estimate.condition,
+        "noise_std": estimate.noise_std.tolist(),
+        "samples": estimate.samples.tolist(),
         "undetermined": list(estimate.undetermined),
         "friction_law": friction_in_words(model, estimate.values[model.friction_part]),
         "parameters": [
@@ -88,31 +81,17 @@ def parameters_dict(
                 "name": name,
                 "expression": expression,
                 "unit": unit,
-                "value": _json_value(value),
-                "std": _json_value(std),
+                "value": value,
+                "std": std,
                 "determined": name not in estimate.undetermined,
                 "essential": None if essential is None else name in essential,
             }
             for name, expression, unit, value, std in _rows(model, estimate)
         ],
-        "covariance": _json_value(estimate.covariance),
+        "covariance": estimate.covariance.tolist(),
         "standard": None if consistent is None else _standard(model, consistent),
     }
-
-
-def parameters_json(
-    model: RobotModel,
-    estimate: Estimate,
-    *,
-    consistent: ConsistentEstimate | None = None,
-    essential: Collection[str] | None = None,
-    provenance: Mapping[str, str] | None = None,
-) -> str:
-    """Return :func:`parameters_dict` as JSON text."""
-    content = parameters_dict(
-        model, estimate, consistent=consistent, essential=essential, provenance=provenance
-    )
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def parameters_csv(
@@ -125,19 +104,13 @@ def parameters_csv(
     Raises:
         IdentificationError: the estimate is of other parameters.
     """
-    if estimate.names != model.parameter_names:
-        raise IdentificationError("the estimate is not of the model's parameters")
-    out = io.StringIO()
     remarks = {**(provenance or {}), "method": estimate.method, "convention": CONVENTION}
-    _write_remarks(out, remarks)
-    table = csv.writer(out, lineterminator="\n")
     covariances = [f"cov({name})" for name in estimate.names]
-    table.writerow(["name", "unit", "value", "std", "expression", *covariances])
-    for line, row in zip(_rows(model, estimate), estimate.covariance, strict=True):
+    rows: list[list[object]] = [["name", "unit", "value", "std", "expression", *covariances]]
+    for line, row in zip(_rows(model, estimate), estimate.covariance.tolist(), strict=True):
         name, expression, unit, value, std = line
-        numbers = (repr(float(x)) for x in row)
-        table.writerow([name, unit, repr(value), repr(std), expression, *numbers])
-    return out.getvalue()
+        rows.append([name, unit, value, std, expression, *row])
+    return _table(remarks, rows)
 
 
 def standard_csv(
@@ -150,27 +123,29 @@ def standard_csv(
 
     A name that a spreadsheet would compute has an apostrophe in front.
     """
-    out = io.StringIO()
-    _write_remarks(out, {**(provenance or {}), "convention": CONVENTION})
-    table = csv.writer(out, lineterminator="\n")
-    inertial, rotors, couplings = _parts(model, consistent)
+    layout, standard = model.layout, consistent.standard
     # In front of the table: behind it a comment would be a row of its own to some readers.
-    units = dict(zip(model.layout.names, model.layout.units, strict=True))
-    _write_remarks(out, {name: f"{value!r} {units[name]}" for name, value in couplings.items()})
-    table.writerow(["joint", *LINK_SYMBOLS, *(["Im"] if rotors else []), "margin", "reference"])
+    remarks = {**(provenance or {}), "convention": CONVENTION}
+    remarks |= {
+        layout.names[k]: f"{float(standard[k])!r} {layout.units[k]}" for k in layout.couplings
+    }
+    inertial, rotors = standard[layout.links].tolist(), standard[layout.rotors].tolist()
+    heading = ["joint", *LINK_SYMBOLS, *(["Im"] if rotors else []), "margin", "reference"]
+    rows: list[list[object]] = [[*heading]]
     for joint, name in enumerate(model.joint_names):
         numbers = [*inertial[joint], *rotors[joint : joint + 1], float(consistent.margin[joint])]
-        table.writerow(
-            [_harmless(name), *map(repr, numbers), _harmless(consistent.reference[joint])]
-        )
-    return out.getvalue()
+        rows.append([_harmless(name), *numbers, _harmless(consistent.reference[joint])])
+    return _table(remarks, rows)
 
 
-def _write_remarks(out: io.StringIO, remarks: Mapping[str, str]) -> None:
-    """Write one line that begins with # per remark, line ends within it removed."""
+def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
+    """Return CSV with a line in front that begins with # per remark, line ends in it removed."""
+    out = io.StringIO()
     for key, value in remarks.items():
         line = " ".join(f"{key}: {value}".split())
         out.write("# " + re.sub(r"(?<=[,;])[=+@-]", r"'\g<0>", line) + "\n")
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
 
 
 def _harmless(text: str) -> str:
@@ -181,23 +156,19 @@ def _harmless(text: str) -> str:
 
 def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float]]:
     """Return name, expression, unit, value and standard deviation of each parameter."""
+    if estimate.names != model.parameter_names:
+        raise IdentificationError("the estimate is not of the model's parameters")
     expressions = (*model.base.expressions(), *estimate.names[model.base.rank :])
-    return list(
-        zip(
-            estimate.names,
-            expressions,
-            estimate.units,
-            estimate.values.tolist(),
-            estimate.std.tolist(),
-            strict=True,
-        )
-    )
+    numbers = estimate.values.tolist(), estimate.std.tolist()
+    return list(zip(estimate.names, expressions, estimate.units, *numbers, strict=True))
 
 
 def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, Any]:
     """Return the consistent standard parameters and friction, joint by joint."""
-    inertial, rotors, couplings = _parts(model, consistent)
+    layout, standard = model.layout, consistent.standard
+    inertial, rotors = standard[layout.links].tolist(), standard[layout.rotors].tolist()
     terms = list(zip(model.friction.terms, consistent.friction.tolist(), strict=True))
+    elements = consistent.estimate.values[model.element_part].tolist()
     return {
         "method": consistent.estimate.method,
         "links": [
@@ -215,16 +186,10 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
             }
             for joint, name in enumerate(model.joint_names)
         ],
-        "coupling_inertia": couplings,
-        "rotor_matrix": _json_value(model.layout.rotor_matrix(consistent.standard)),
+        "coupling_inertia": {layout.names[k]: float(standard[k]) for k in layout.couplings},
+        "rotor_matrix": layout.rotor_matrix(standard).tolist(),
         "motor_friction": {term.name: value for term, value in terms if term.motor},
-        "elements": dict(
-            zip(
-                model.elements.names,
-                consistent.estimate.values[model.element_part].tolist(),
-                strict=True,
-            )
-        ),
+        "elements": dict(zip(model.elements.names, elements, strict=True)),
         "not_in_urdf": list(not_in_urdf(model)),
         "status": consistent.status,
         "relative_error": consistent.relative_error,
@@ -234,24 +199,12 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
     }
 
 
-def _parts(
-    model: RobotModel, consistent: ConsistentEstimate
-) -> tuple[list[list[float]], list[float], dict[str, float]]:
-    """Return the ten parameters of each link, the rotors, and inertias between joints by name."""
-    layout, standard = model.layout, consistent.standard
-    couplings = {layout.names[k]: float(standard[k]) for k in layout.couplings}
-    return standard[layout.links].tolist(), standard[layout.rotors].tolist(), couplings
-
-
-def _json_value(values: float | Array) -> Any:
-    """Return floats and nested lists of them, with words for what JSON cannot write."""
-    if isinstance(values, np.ndarray):
-        return (
-            [_json_value(value) for value in values.tolist()]
-            if values.ndim == 1
-            else [_json_value(row) for row in values]
-        )
-    number = float(values)
-    if math.isfinite(number):
-        return number
-    return "NaN" if math.isnan(number) else "Infinity" if number > 0.0 else "-Infinity"
+def _finite(content: Any) -> Any:
+    """Return what JSON can write: words for numbers that it has not."""
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return "NaN" if math.isnan(content) else "Infinity" if content > 0.0 else "-Infinity"
+    return content

@@ -36,11 +36,10 @@ from identification.export.urdf import (
     as_text,
     comment_text,
     rnea,
-    with_comment,
     write_urdf,
 )
 from identification.model.elements import TorsionSpring
-from identification.model.friction import Coulomb, Cubic, JointTerm, Kind, Quadratic, Tanh, Viscous
+from identification.model.friction import Coulomb, Cubic, Kind, Quadratic, Tanh, Viscous
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body
@@ -118,10 +117,9 @@ class Arm:
 
     def spring(self, joint: int) -> tuple[float, float]:
         """Stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint together."""
-        springs = [one for one in self.model.elements.placed if one.joint == joint]
         stiffness = moment = 0.0
-        for one in springs:
-            if isinstance(one.element, TorsionSpring):
+        for one in self.model.elements.placed:
+            if one.joint == joint and isinstance(one.element, TorsionSpring):
                 own = self.values[self.model.element_part][one.part]
                 k = float(own[0]) if len(own) else one.element.stiffness or 0.0
                 stiffness, moment = stiffness + k, moment + k * one.element.rest
@@ -152,96 +150,96 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     _add(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     _add(root, "option", gravity=as_text(model.gravity), timestep=as_text(_TIMESTEP),
          integrator="implicitfast")  # fmt: skip
-    places = {-1: _add(root, "worldbody")}
-    for joint, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
-        parent = int(model.chain.parents[joint])
-        place = _pose(model.chain.rotation[joint], model.chain.translation[joint])
-        _stick(places[parent], model.chain.translation[joint])
-        link = places[joint] = _add(places[parent], "body", name=arm.link(joint), **place)
+    places, motors = {-1: _add(root, "worldbody")}, Node("actuator")
+    for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
+        parent = places[int(model.chain.parents[j])]
+        rotation, translation = model.chain.rotation[j], model.chain.translation[j]
+        if np.linalg.norm(translation) > _SHORTEST:  # a stick shows the arm: no mass, no contact
+            line = as_text([0.0, 0.0, 0.0, *translation])
+            _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
+                 contype="0", conaffinity="0")  # fmt: skip
+        link = places[j] = _add(parent, "body", name=arm.link(j), **_pose(rotation, translation))
         six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        _add(
-            link,
-            "inertial",
-            pos=as_text(mass.centre),
-            mass=as_text(mass.mass),
-            fullinertia=as_text(six),
-        )
-        friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
+        _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
+             fullinertia=as_text(six))  # fmt: skip
+        friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
+        third = {term.symbol: type(term) for term in model.friction.laws[j].terms}.get("f2")
+        # Of v, v |v| and v³.
+        damping = [
+            friction.get("f1", 0.0),
+            *(friction["f2"] if third is kind else 0.0 for kind in (Quadratic, Cubic)),
+        ]
+        lower, upper, most = ranges.lower[j], ranges.upper[j], ranges.effort[j]
+        known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
+        effort = as_text([-most, most]) if math.isfinite(most) else None
         _add(
             link,
             "joint",
             name=joint_name,
-            type="hinge" if model.chain.revolute[joint] else "slide",
-            axis=as_text(model.chain.axis[joint]),
-            armature=as_text(0.0 if coupled[joint] else rotors[joint, joint]),
-            damping=as_text(_damping(arm, joint)),
+            type="hinge" if model.chain.revolute[j] else "slide",
+            axis=as_text(model.chain.axis[j]),
+            armature=as_text(0.0 if coupled[j] else rotors[j, j]),
+            damping=as_text(damping),
             frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
             solreffriction=as_text([_FRICTION_TIME, 1.0]),
-            **_if(stiffness != 0.0, stiffness=as_text(stiffness), springref=as_text(rest)),
-            **_range(ranges, joint),
-            **_effort(ranges, joint, "actuatorfrcrange"),
+            stiffness=as_text(stiffness) if stiffness else None,
+            springref=as_text(rest) if stiffness else None,
+            range=as_text([lower, upper]) if known else None,
+            actuatorfrcrange=effort,
         )
-        for frame, (rotation, translation) in arm.fixed(joint).items():
-            _add(link, "site", name=frame, **_pose(rotation, translation))
+        _add(motors, "motor", name=joint_name, joint=joint_name, ctrlrange=effort)
+        for frame, place in arm.fixed(j).items():
+            _add(link, "site", name=frame, **_pose(*place))
     _tendons(root, arm, coupled)
-    actuators = _add(root, "actuator")
-    for joint, joint_name in enumerate(model.joint_names):
-        limits = _effort(ranges, joint, "ctrlrange")
-        _add(actuators, "motor", name=joint_name, joint=joint_name, **limits)
+    root.append(motors)
     return _text(root)
 
 
 def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the arm as a model of SDF 1.9, its base fixed to the world; gravity is the world's."""
-    model, ranges = arm.model, arm.ranges
+    model = arm.model
     document = Node("sdf", version="1.9")
     _comment(document, remarks)
     root = _add(document, "model", name=name)
-    links = [arm.link(joint) for joint in range(model.n_joints)]
+    links = [arm.link(j) for j in range(model.n_joints)]
     base = next(one for one in (_BASE, "world_base", "fixed_base") if one not in links)
     _add(root, "link", name=base)
     _nested(_add(root, "joint", name=f"{base}_fixed", type="fixed"), parent="world", child=base)
-    for joint, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
-        parent = int(model.chain.parents[joint])
+    for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
+        parent = int(model.chain.parents[j])
         above = links[parent] if parent >= 0 else base
-        link = _add(root, "link", name=links[joint])
-        place = _rpy(model.chain.rotation[joint], model.chain.translation[joint])
+        link = _add(root, "link", name=links[j])
+        place = _rpy(model.chain.rotation[j], model.chain.translation[j])
         _add(link, "pose", relative_to=above).text = place
         inertial = _add(link, "inertial")
         _nested(inertial, pose=as_text([*mass.centre, 0.0, 0.0, 0.0]), mass=as_text(mass.mass))
-        tensor = {n: as_text(mass.inertia[i, j]) for n, (i, j) in TENSOR.items()}
+        tensor = {n: as_text(mass.inertia[place]) for n, place in TENSOR.items()}
         _nested(_add(inertial, "inertia"), **tensor)
-        kind = "revolute" if model.chain.revolute[joint] else "prismatic"
+        kind = "revolute" if model.chain.revolute[j] else "prismatic"
         node = _add(root, "joint", name=joint_name, type=kind)
-        _nested(node, parent=above, child=links[joint])
+        _nested(node, parent=above, child=links[j])
         axis = _add(node, "axis")
-        _nested(axis, xyz=as_text(model.chain.axis[joint]))
-        known = {key: float(value[joint]) for key, value in ranges._asdict().items()}
+        _nested(axis, xyz=as_text(model.chain.axis[j]))
+        known = {key: float(value[j]) for key, value in arm.ranges._asdict().items()}
         _nested(
             _add(axis, "limit"), **{k: as_text(v) for k, v in known.items() if math.isfinite(v)}
         )
-        friction, (stiffness, rest) = arm.friction[joint], arm.spring(joint)
-        _nested(
-            _add(axis, "dynamics"),
-            damping=as_text(friction.get("f1", 0.0)),
-            friction=as_text(max(0.0, friction.get("f0", 0.0))),
-            **_if(
-                stiffness != 0.0,
-                spring_stiffness=as_text(stiffness),
-                spring_reference=as_text(rest),
-            ),
-        )
-        for frame, (rotation, translation) in arm.fixed(joint).items():
-            fixed = _add(root, "frame", name=frame, attached_to=links[joint])
-            _add(fixed, "pose").text = _rpy(rotation, translation)
+        friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
+        dry = max(0.0, friction.get("f0", 0.0))
+        figures = {"damping": friction.get("f1", 0.0), "friction": dry}
+        if stiffness:
+            figures |= {"spring_stiffness": stiffness, "spring_reference": rest}
+        _nested(_add(axis, "dynamics"), **{k: as_text(v) for k, v in figures.items()})
+        for frame, own in arm.fixed(j).items():
+            _add(_add(root, "frame", name=frame, attached_to=links[j]), "pose").text = _rpy(*own)
     return _text(document)
 
 
 def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the URDF with the arm's bodies and friction, and its own name; see `write_urdf`."""
     del name
-    text = with_comment(arm.urdf, remarks)
-    return write_urdf(text, arm.model, arm.standard, arm.values[arm.model.friction_part])
+    friction = arm.values[arm.model.friction_part]
+    return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks)
 
 
 class Format(NamedTuple):
@@ -334,11 +332,11 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     """Return the torque (m, n) of each part of the model that a format has no place for."""
     model, q, qdd = arm.model, motion.position, motion.acceleration
     own = model.friction.kinds
-    left = {
-        kind.words: _friction(arm, motion, _is_of(kind))
-        for kind in own
-        if kind not in form.friction
-    }
+    left = {}
+    for kind in own:
+        if kind not in form.friction:
+            of_kind = [isinstance(t.term, kind) and not t.motor for t in model.friction.terms]
+            left[kind.words] = _friction(arm, motion, of_kind)
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
     rounded = model.torque(base, *motion[1:]) - _rigid(arm, motion) - qdd @ arm.rotors
@@ -348,7 +346,8 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
         diagonal = np.diag(arm.rotors)
         left["rotor inertias"] = qdd * diagonal
         left["inertia of coupled motors"] = qdd @ (arm.rotors - np.diag(diagonal))
-        left["friction of coupled motors"] = _friction(arm, motion, lambda t: t.motor)
+        motors = [term.motor for term in model.friction.terms]
+        left["friction of coupled motors"] = _friction(arm, motion, motors)
     if not form.payload:
         left["the payload"] = model.load_torque(*motion[1:4]) - model.elements.known(q)
     for one in model.elements.placed:
@@ -360,18 +359,16 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     return left
 
 
-def _is_of(kind: Kind) -> Callable[[JointTerm], bool]:
-    return lambda term: not term.motor and isinstance(term.term, kind)
-
-
 def _said(form: Format, arm: Arm, motion: Motion) -> Array:
     """Return the torque (m, n) of what a format has room for, without dry friction."""
     smooth = tuple(kind for kind in form.friction if kind not in _DRY)
     model = arm.model
     torque = _rigid(arm, motion) + motion.acceleration @ arm.rotors * form.rotors
-    torque += _friction(
-        arm, motion, lambda t: isinstance(t.term, smooth) and (form.rotors or not t.motor)
-    )
+    terms = [
+        isinstance(one.term, smooth) and (form.rotors or not one.motor)
+        for one in model.friction.terms
+    ]
+    torque += _friction(arm, motion, terms)
     if form.payload:
         known = model.elements.known(motion.position)
         torque += model.load_torque(*motion[1:4]) - known
@@ -393,11 +390,9 @@ def _rigid(arm: Arm, motion: Motion) -> Array:
     return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
 
 
-def _friction(arm: Arm, motion: Motion, which: Callable[[JointTerm], bool]) -> Array:
+def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool]) -> Array:
     """Return the torque (m, n) of some friction terms."""
-    values = np.zeros(arm.model.n_parameters)
-    part = arm.model.friction_part
-    chosen = np.array([which(term) for term in arm.model.friction.terms], dtype=np.bool_)
+    values, part = np.zeros(arm.model.n_parameters), arm.model.friction_part
     values[part] = np.where(chosen, arm.values[part], 0.0)
     return arm.model.torque(values, *motion[1:])
 
@@ -405,7 +400,8 @@ def _friction(arm: Arm, motion: Motion, which: Callable[[JointTerm], bool]) -> A
 def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
     """Return the torque (m, n) of dry friction, as it is or as one that jumps at zero speed."""
     if not jumps:
-        return _friction(arm, motion, lambda term: isinstance(term.term, _DRY))
+        terms = arm.model.friction.terms
+        return _friction(arm, motion, [isinstance(one.term, _DRY) for one in terms])
     friction, n = arm.model.friction, arm.model.n_joints
     f0 = np.array([row.get("f0", 0.0) for row in arm.friction])
     shares = friction.motor_speeds()
@@ -424,37 +420,31 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
     """Torques of the bodies, damping and springs of an SDF model, which this reads anew."""
     root = ElementTree.fromstring(text).find("model")
     assert root is not None
-    model, places = pin.Model(), {}
+    model, places = pin.Model(), dict[str | None, int]()
     model.gravity.linear = arm.model.gravity
     links = {link.get("name"): link for link in root.iter("link")}
-    damping: list[float] = []
-    stiffness: list[float] = []
-    rest: list[float] = []
+    dynamics = []
     for joint in root.iter("joint"):
         child, parent = joint.findtext("child"), joint.findtext("parent")
         if joint.get("type") == "fixed":
             places[child] = 0
             continue
-        axis = _figures(joint, "axis/xyz")
         kind = "Revolute" if joint.get("type") == "revolute" else "Prismatic"
-        kind_of = getattr(pin, f"JointModel{kind}Unaligned")
+        own = getattr(pin, f"JointModel{kind}Unaligned")(_figures(joint, "axis/xyz"))
         x, y, z, *rpy = _figures(links[child], "pose")
         place = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
-        places[child] = model.addJoint(places[parent], kind_of(axis), place, joint.get("name"))
-        tensor = [float(_figures(links[child], f"inertial/inertia/{n}")[0]) for n in TENSOR]
-        matrix = np.zeros((3, 3))
-        for (i, j), value in zip(TENSOR.values(), tensor, strict=True):
-            matrix[i, j] = matrix[j, i] = value
+        places[child] = model.addJoint(places[parent], own, place, joint.get("name"))
+        tensor = np.zeros((3, 3))
+        for name, (i, j) in TENSOR.items():
+            tensor[i, j] = tensor[j, i] = _figures(links[child], f"inertial/inertia/{name}")[0]
         centre = _figures(links[child], "inertial/pose")[:3]
-        mass = float(_figures(links[child], "inertial/mass")[0])
-        model.appendBodyToJoint(
-            places[child], pin.Inertia(mass, centre, matrix), pin.SE3.Identity()
-        )
-        for figures, tag in ((damping, "damping"), (stiffness, "spring_stiffness"),
-                             (rest, "spring_reference")):  # fmt: skip
-            figures.append(float(joint.findtext(f"axis/dynamics/{tag}") or 0.0))
-    torque = rnea(model, *motion[1:4]) + np.array(damping) * motion.velocity
-    return np.asarray(torque + np.array(stiffness) * (motion.position - np.array(rest)))
+        inertia = pin.Inertia(_figures(links[child], "inertial/mass")[0], centre, tensor)
+        model.appendBodyToJoint(places[child], inertia, pin.SE3.Identity())
+        tags = ("damping", "spring_stiffness", "spring_reference")
+        dynamics.append([float(joint.findtext(f"axis/dynamics/{tag}") or 0.0) for tag in tags])
+    damping, stiffness, rest = np.array(dynamics).T
+    torque = rnea(model, *motion[1:4]) + damping * motion.velocity
+    return np.asarray(torque + stiffness * (motion.position - rest))
 
 
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
@@ -510,47 +500,33 @@ FORMATS: Final[Mapping[str, Format]] = {
 """Formats by name."""
 
 
-def _damping(arm: Arm, joint: int) -> list[float]:
-    """Return the coefficients of v, v |v| and v³."""
-    friction = arm.friction[joint]
-    third = {term.symbol: type(term) for term in arm.model.friction.laws[joint].terms}.get("f2")
-    square, cube = (friction["f2"] if third is kind else 0.0 for kind in (Quadratic, Cubic))
-    return [friction.get("f1", 0.0), square, cube]
-
-
 def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
     """Add inertia and friction of coupled motors, which act on weighted sums of joints."""
     names, friction = arm.model.joint_names, arm.model.friction
-    rows: list[tuple[str, Array, dict[str, str]]] = []
-    if coupled.any():
-        inertia, directions = np.linalg.eigh(arm.rotors[np.ix_(coupled, coupled)])
-        for k, (own, direction) in enumerate(zip(inertia, directions.T, strict=True)):
-            share = np.zeros(len(names))
-            share[coupled] = direction
-            rows.append((f"rotors_{k + 1}", share, {"armature": as_text(max(0.0, float(own)))}))
-    own_friction = arm.friction[len(names) :]
-    for motor, share, row in zip(
-        friction.motors, friction.motor_speeds(), own_friction, strict=True
-    ):
-        loss, slope = max(0.0, row.get("f0", 0.0)), row.get("f1", 0.0)
-        figures = {"damping": as_text(slope), "frictionloss": as_text(loss)}
-        figures["solreffriction"] = as_text([_FRICTION_TIME, 1.0])
-        rows.append((f"motor_{motor + 1}", share, figures))
-    if not rows:
-        return
-    tendons = _add(root, "tendon")
-    for name, share, figures in rows:
+    tendons = Node("tendon")
+
+    def add(name: str, share: Array, **figures: str) -> None:
         tendon = _add(tendons, "fixed", name=name, **figures)
         for joint in np.flatnonzero(share):
             _add(tendon, "joint", joint=names[joint], coef=as_text(share[joint]))
 
-
-def _stick(parent: Node, end: Array) -> None:
-    """Add a stick to a body that shows where its next joint is: no mass, no contact."""
-    if np.linalg.norm(end) > _SHORTEST:
-        line = as_text([0.0, 0.0, 0.0, *end])
-        _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
-             contype="0", conaffinity="0")  # fmt: skip
+    if coupled.any():
+        inertia, directions = np.linalg.eigh(arm.rotors[np.ix_(coupled, coupled)])
+        shares = np.zeros((len(inertia), len(names)))
+        shares[:, coupled] = directions.T
+        for k, (own, share) in enumerate(zip(inertia, shares, strict=True)):
+            add(f"rotors_{k + 1}", share, armature=as_text(max(0.0, float(own))))
+    table = arm.friction[len(names) :]
+    for motor, share, row in zip(friction.motors, friction.motor_speeds(), table, strict=True):
+        add(
+            f"motor_{motor + 1}",
+            share,
+            damping=as_text(row.get("f1", 0.0)),
+            frictionloss=as_text(max(0.0, row.get("f0", 0.0))),
+            solreffriction=as_text([_FRICTION_TIME, 1.0]),
+        )
+    if len(tendons):
+        root.append(tendons)
 
 
 def _pose(rotation: Array, translation: Array) -> dict[str, str]:
@@ -564,29 +540,15 @@ def _rpy(rotation: Array, translation: Array) -> str:
     return as_text([*translation, *pin.rpy.matrixToRpy(rotation)])
 
 
-def _range(ranges: Ranges, joint: int) -> dict[str, str]:
-    lower, upper = float(ranges.lower[joint]), float(ranges.upper[joint])
-    known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
-    return _if(known, range=as_text([lower, upper]))
-
-
-def _effort(ranges: Ranges, joint: int, name: str) -> dict[str, str]:
-    most = float(ranges.effort[joint])
-    return _if(math.isfinite(most), **{name: as_text([-most, most])})
-
-
-def _if(there: bool, **attributes: str) -> dict[str, str]:
-    return attributes if there else {}
-
-
 def _comment(node: Node, remarks: Sequence[str]) -> None:
     if remarks:
         lines = "".join(f"  {comment_text(line)}\n" for line in remarks)
         node.append(ElementTree.Comment(f"\n{lines}"))
 
 
-def _add(parent: Node, tag: str, /, **attributes: str) -> Node:
-    return ElementTree.SubElement(parent, tag, attributes)
+def _add(parent: Node, tag: str, /, **attributes: str | None) -> Node:
+    known = {key: value for key, value in attributes.items() if value is not None}
+    return ElementTree.SubElement(parent, tag, known)
 
 
 def _nested(node: Node, /, **texts: str) -> None:

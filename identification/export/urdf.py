@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 from xml.parsers import expat
@@ -39,19 +39,37 @@ from identification.model.kinematics import (
     pinocchio_model,
 )
 from identification.model.pseudo_inertia import Body, body, margin
-from identification.model.regressor import LINK_SYMBOLS, RegressorPlan
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
+from identification.model.urdf_text import urdf_tree
 
 Array = NDArray[np.float64]
+
+TENSOR: Final = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
+_DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
+_STATES: Final = 50
+_SEED: Final = 20140902
+# Of the largest torque of a joint: what going through centre of mass and decimal text may cost.
+_ROUNDING: Final = 1e-8
+
+
+class NotConsistentError(IdentificationError):
+    """Parameters that no machine can have are not written into a robot description."""
+
+
+class WriteBackError(IdentificationError):
+    """The description cannot take the parameters, or does not give them back when read again."""
 
 
 # An XML library that writes a tree again loses comments, the order and spacing of attributes, and
 # line ends. Here only the bytes of what changes are replaced.
-
-
-def comment_text(text: str) -> str:
-    """Return text that may stand inside a comment, which two dashes in a row would end."""
-    return re.sub("-(?=-)", "- ", text)
 
 
 @dataclass(eq=False)
@@ -78,6 +96,10 @@ class Element:
         """Return the first child of that name."""
         return next((child for child in self.children if child.name == name), None)
 
+    def named(self, name: str) -> dict[str, Element]:
+        """Return the children of that tag by their attribute `name`."""
+        return {e.attributes.get("name", ""): e for e in self.children if e.name == name}
+
 
 class Edit(NamedTuple):
     """Replace the bytes from `start` to `end` (nothing, if equal) with `text`."""
@@ -101,23 +123,34 @@ class XmlSource:
     """
 
     def __init__(self, text: str) -> None:
-        self._bytes = text.encode("utf-8")
-        self.root = self._parse()
+        self._bytes = data = text.encode("utf-8")
+        self._newline = "\r\n" if b"\r\n" in data else "\n"
+        parser = expat.ParserCreate("utf-8")
+        # Values may contain '>'.
+        tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+        open_elements = [Element("", {}, 0, 0)]
 
-    def opening(self, element: Element) -> str:
-        """Return the opening tag, as written."""
-        return self._bytes[element.start : element.inside].decode("utf-8")
+        def opened(name: str, attributes: dict[str, str]) -> None:
+            start = parser.CurrentByteIndex
+            found = tag.match(data, start)
+            assert found is not None, "the parser has seen a whole tag here"
+            element = Element(name, attributes, start, found.end())
+            open_elements[-1].children.append(element)
+            open_elements.append(element)
 
-    def indentation(self, element: Element) -> str:
-        """Return the white space in front of an element that begins its line, else nothing."""
-        before = self._bytes[: element.start].decode("utf-8")
-        line = before[before.rfind("\n") + 1 :]
-        return line if not line.strip() else ""
+        def closed(_: str) -> None:
+            element = open_elements.pop()
+            empty = data[element.inside - 2 : element.inside] == b"/>"
+            behind = data.find(b">", parser.CurrentByteIndex) + 1
+            element.end = element.inside if empty else behind
 
-    @property
-    def newline(self) -> str:
-        """The text's line end."""
-        return "\r\n" if b"\r\n" in self._bytes else "\n"
+        parser.StartElementHandler = opened
+        parser.EndElementHandler = closed
+        try:
+            parser.Parse(data, True)
+        except expat.ExpatError as error:
+            raise ModelError(f"the robot description is no XML: {error}") from error
+        self.root = open_elements[0].children[0]
 
     def edited(self, edits: Iterable[Edit]) -> str:
         """Return the text with edits applied, which must not overlap."""
@@ -126,165 +159,55 @@ class XmlSource:
             data = data[: edit.start] + edit.text.encode("utf-8") + data[edit.end :]
         return data.decode("utf-8")
 
-    def with_attributes(self, element: Element, values: dict[str, str]) -> Edit:
+    def with_attributes(self, element: Element, values: Mapping[str, str]) -> Edit:
         """Return the edit that sets attributes; others, and their order, stay."""
-        tag = self.opening(element)
+        tag = self._bytes[element.start : element.inside].decode("utf-8")
         for name, value in values.items():
             written = f'"{escape(value, {chr(34): "&quot;"})}"'
             pattern = re.compile(rf"(\s{re.escape(name)}\s*=\s*)(\"[^\"]*\"|'[^']*')")
             if found := pattern.search(tag):
                 tag = tag[: found.start(2)] + written + tag[found.end() :]
             else:
-                at = re.search(r"\s*/?>$", tag)
-                assert at is not None, "an opening tag ends so"
-                tag = f"{tag[: at.start()]} {name}={written}{tag[at.start() :]}"
+                tag = re.sub(r"\s*/?>$", lambda end, new=f" {name}={written}": new + end[0], tag)
         return Edit(element.start, element.inside, tag)
 
-    def with_first_child(self, element: Element, lines: list[str]) -> Edit:
+    def with_first_child(self, element: Element, lines: Iterable[str]) -> Edit:
         """Return the edit that puts lines of XML directly behind the opening tag."""
-        outer = self.indentation(element)
-        children = [self.indentation(child) for child in element.children]
+        outer = self._indentation(element)
+        children = [self._indentation(child) for child in element.children]
         inner = next((indent for indent in children if indent), outer + "  ")
-        block = "".join(f"{self.newline}{inner}{line}" for line in lines)
-        tag = self.opening(element)
+        block = "".join(f"{self._newline}{inner}{line}" for line in lines)
+        tag = self._bytes[element.start : element.inside].decode("utf-8")
         if tag.endswith("/>"):
-            opened = tag[:-2].rstrip() + ">"
-            closing = f"{self.newline}{outer}</{element.name}>"
-            return Edit(element.start, element.end, opened + block + closing)
+            closing = f"{self._newline}{outer}</{element.name}>"
+            return Edit(element.start, element.end, f"{tag[:-2].rstrip()}>{block}{closing}")
         return Edit(element.inside, element.inside, block)
 
-    def _parse(self) -> Element:
-        parser = expat.ParserCreate("utf-8")
-        open_elements: list[Element] = []
-        roots: list[Element] = []
+    def with_comment(self, lines: Iterable[str]) -> Edit:
+        """Return the edit that puts a comment of these lines in front of the outermost element."""
+        inside = comment_text(self._newline.join(f"  {line}" for line in lines))
+        at = self.root.start
+        return Edit(at, at, self._newline.join(["<!--", inside, "-->", ""]))
 
-        def opened(name: str, attributes: dict[str, str]) -> None:
-            start = parser.CurrentByteIndex
-            element = Element(name, attributes, start, self._behind_tag(start))
-            (open_elements[-1].children if open_elements else roots).append(element)
-            open_elements.append(element)
-
-        def closed(_: str) -> None:
-            element = open_elements.pop()
-            if self._bytes[element.inside - 2 : element.inside] == b"/>":
-                element.end = element.inside
-            else:
-                element.end = self._bytes.index(b">", parser.CurrentByteIndex) + 1
-
-        parser.StartElementHandler = opened
-        parser.EndElementHandler = closed
-        try:
-            parser.Parse(self._bytes, True)
-        except expat.ExpatError as error:
-            raise ModelError(f"the robot description is no XML: {error}") from error
-        return roots[0]
-
-    def _behind_tag(self, start: int) -> int:
-        """Return the first byte behind the tag that begins at `start`; values may contain '>'."""
-        tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>").match(self._bytes, start)
-        assert tag is not None, "the parser has seen a whole tag here"
-        return tag.end()
+    def _indentation(self, element: Element) -> str:
+        """Return the white space in front of an element that begins its line, else nothing."""
+        before = self._bytes[: element.start].decode("utf-8")
+        line = before[before.rfind("\n") + 1 :]
+        return line if not line.strip() else ""
 
 
-def with_comment(text: str, lines: Sequence[str]) -> str:
-    """Return an XML text with a comment of these lines in front of its first element.
-
-    Raises:
-        ModelError: the text is not well-formed XML.
-    """
-    source = XmlSource(text)
-    inside = comment_text(source.newline.join(f"  {line}" for line in lines))
-    comment = f"<!--{source.newline}{inside}{source.newline}-->{source.newline}"
-    at = source.root.start
-    return source.edited([Edit(at, at, comment)])
+def comment_text(text: str) -> str:
+    """Return text that may stand inside a comment, which two dashes in a row would end."""
+    return re.sub("-(?=-)", "- ", text)
 
 
-class LockedBody(NamedTuple):
-    """Nominal inertia of what one locked joint carries, up to the next moving or locked joint.
-
-    Attributes:
-        joint: name of the locked joint.
-        carrier: index of the joint of the model that moves it, -1 for the base.
-        inertial: the ten parameters about the carrier's frame, in its axes (10,).
-    """
-
-    joint: str
-    carrier: int
-    inertial: Array
-
-
-def locked_bodies(urdf: str, model: RobotModel) -> tuple[LockedBody, ...]:
-    """Return what the locked joints of a model carry, at the positions where they are locked."""
-    if not model.locked:
-        return ()
-    arm = pin.buildModelFromXML(urdf)
-    data = arm.createData()
-    pin.forwardKinematics(arm, data, locked_posture(arm, model.locked))
-    found = []
-    for name in model.locked:
-        own = arm.getJointId(name)
-        before = own
-        while before > 0 and arm.names[before] in model.locked:
-            before = arm.parents[before]
-        body = (data.oMi[before].inverse() * data.oMi[own]).act(arm.inertias[own])
-        inertial = body.toDynamicParameters()[list(FROM_PINOCCHIO)]
-        carrier = model.joint_names.index(arm.names[before]) if before > 0 else -1
-        found.append(LockedBody(name, carrier, inertial))
-    return tuple(found)
-
-
-def without_locked(inertial: Array, locked: tuple[LockedBody, ...]) -> tuple[Array, frozenset[str]]:
-    """Take what locked joints carry out of the links (n, 10), where a possible body is left.
-
-    Returns:
-        The links (n, 10), and the locked joints that keep what they carry: those of the base too.
-    """
-    left = inertial.copy()
-    removed: set[str] = set()
-    for carrier in {one.carrier for one in locked}:
-        carried = [one for one in locked if one.carrier == carrier]
-        if carrier >= 0:
-            rest = left[carrier] - sum(one.inertial for one in carried)
-            if not margin(rest) > 0.0:
-                continue
-            left[carrier] = rest
-        removed.update(one.joint for one in carried)
-    return left, frozenset(removed)
-
-
-_N_LINK: Final = len(LINK_SYMBOLS)
-TENSOR: Final = {
-    "ixx": (0, 0),
-    "ixy": (0, 1),
-    "ixz": (0, 2),
-    "iyy": (1, 1),
-    "iyz": (1, 2),
-    "izz": (2, 2),
-}
-_DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
-_STATES: Final = 50
-_SEED: Final = 20140902
-# Of the largest torque of a joint: what going through centre of mass and decimal text may cost.
-_ROUNDING: Final = 1e-8
-
-
-class NotConsistentError(IdentificationError):
-    """Parameters that no machine can have are not written into a robot description.
-
-    Attributes:
-        joint: whose link, rotor or friction it is.
-    """
-
-    def __init__(self, message: str, *, joint: str) -> None:
-        super().__init__(message)
-        self.joint = joint
-
-
-class WriteBackError(IdentificationError):
-    """The description cannot take the parameters, or does not give them back when read again."""
-
-
-def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | None = None) -> str:
+def write_urdf(
+    urdf: str,
+    model: RobotModel,
+    standard: Array,
+    friction: Array | None = None,
+    remarks: Sequence[str] = (),
+) -> str:
     """Return the URDF text with other inertial parameters, and friction if given.
 
     Args:
@@ -293,6 +216,7 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
         standard: all standard parameters (s,), as in `model.standard_names`.
         friction: coefficients (k,), see `RobotModel.friction_part`; none leaves
             ``<dynamics>`` as it is, NaN leaves that figure.
+        remarks: lines of a comment in front of the robot.
 
     Raises:
         NotConsistentError: a link, a rotor or friction is not physically possible.
@@ -302,16 +226,24 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
     """
     standard = model.layout.checked(standard)
     inertial = standard[model.layout.links]
-    coefficients: dict[str, dict[str, float]] = {}
+    terms: list[dict[str, float]] = [{} for _ in model.joint_names]
     if friction is not None:
-        coefficients = dict(zip(model.joint_names, model.friction.table(friction), strict=False))
-    _refuse_impossible(model, standard, inertial, coefficients)
-    bodies, removed = without_locked(inertial, locked_bodies(urdf, model))
+        terms = [*model.friction.table(friction)][: model.n_joints]
+    dynamics = [
+        {
+            attribute: own[symbol]
+            for symbol, attribute in _DYNAMICS.items()
+            if math.isfinite(own.get(symbol, math.nan))
+        }
+        for own in terms
+    ]
+    _refuse_impossible(model, standard, inertial, dynamics)
+    bodies, removed = _without_locked(urdf, model, inertial)
     source = XmlSource(urdf)
     tree = _Tree(source.root, model, removed)
-    edits: list[Edit] = []
-    for joint, parameters in zip(model.joint_names, bodies, strict=True):
-        link = tree.link_of(joint)
+    edits = [source.with_comment(remarks)] if remarks else []
+    for joint, parameters, values in zip(model.joint_names, bodies, dynamics, strict=True):
+        link = tree.end(tree.joints[joint], "child")
         edits += _inertia_edits(source, link, body(parameters))
         for merged in tree.fixed_to(link):
             if (element := merged.child("inertial")) is not None:
@@ -319,9 +251,11 @@ def write_urdf(urdf: str, model: RobotModel, standard: Array, friction: Array | 
                 name = comment_text(link.attributes["name"])
                 note = f"<!-- inertia is contained in {name} -->"
                 edits.append(Edit(element.start, element.end, note))
-        edits += _friction_edits(source, tree.joints[joint], coefficients.get(joint, {}))
+        if values:
+            figures = {attribute: as_text(value) for attribute, value in values.items()}
+            edits += _set(source, tree.joints[joint], {"dynamics": figures})
     text = source.edited(edits)
-    _compare(text, model, inertial, coefficients)
+    _compare(text, model, inertial, dynamics)
     return text
 
 
@@ -338,13 +272,44 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     return tuple(words for words, there in absent.items() if there)
 
 
+def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Array, frozenset[str]]:
+    """Subtract what locked joints carry from the links (n, 10), where a possible body is left.
+
+    Nominal inertia, at the positions where they are locked.
+
+    Returns:
+        The links (n, 10), and the locked joints that keep what they carry: those of the base too.
+    """
+    if not model.locked:
+        return inertial, frozenset()
+    arm = pin.buildModelFromXML(urdf)
+    data = arm.createData()
+    pin.forwardKinematics(arm, data, locked_posture(arm, model.locked))
+    carried: dict[int, dict[str, Array]] = {}  # by the moving joint, -1 for the base
+    for name in model.locked:
+        own = before = arm.getJointId(name)
+        while before > 0 and arm.names[before] in model.locked:
+            before = arm.parents[before]
+        moved = (data.oMi[before].inverse() * data.oMi[own]).act(arm.inertias[own])
+        carrier = model.joint_names.index(arm.names[before]) if before > 0 else -1
+        about = moved.toDynamicParameters()[list(FROM_PINOCCHIO)]
+        carried.setdefault(carrier, {})[name] = about
+    left, removed = inertial.copy(), list(carried.get(-1, {}))
+    for carrier, bodies in carried.items():
+        if carrier >= 0:
+            rest = left[carrier] - sum(bodies.values())
+            if margin(rest) > 0.0:
+                left[carrier] = rest
+                removed += bodies
+    return left, frozenset(removed)
+
+
 class _Tree:
     """Links and joints of a description by name; locked joints not in `removed` count as fixed."""
 
     def __init__(self, root: Element, model: RobotModel, removed: Collection[str]) -> None:
-        self.links = {e.attributes.get("name", ""): e for e in root.children if e.name == "link"}
         # Not every <joint> is one: a transmission has elements of that name, deeper down.
-        self.joints = {e.attributes.get("name", ""): e for e in root.children if e.name == "joint"}
+        self.links, self.joints = root.named("link"), root.named("joint")
         self._rigid: list[Element] = []
         missing = [name for name in model.joint_names if name not in self.joints]
         if missing:
@@ -360,19 +325,16 @@ class _Tree:
                     " of its payload is not known by itself"
                 )
 
-    def link_of(self, joint: str) -> Element:
-        """Return the link that a joint moves."""
-        return self._end(self.joints[joint], "child")
-
     def fixed_to(self, link: Element) -> Iterator[Element]:
         """Yield the links that fixed joints carry on from a link, all the way."""
         for joint in self._rigid:
-            if self._end(joint, "parent") is link:
-                carried = self._end(joint, "child")
+            if self.end(joint, "parent") is link:
+                carried = self.end(joint, "child")
                 yield carried
                 yield from self.fixed_to(carried)
 
-    def _end(self, joint: Element, end: str) -> Element:
+    def end(self, joint: Element, end: str) -> Element:
+        """Return the link at an end of a joint, "parent" or "child"."""
         named = joint.child(end)
         name = named.attributes.get("link", "") if named else ""
         if name not in self.links:
@@ -385,57 +347,38 @@ class _Tree:
 def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]:
     """Set, or put in, the inertial element of a link."""
     element = link.child("inertial")
-    if element is None:
-        parts = {
-            "origin": {"xyz": as_text(of.centre), "rpy": "0 0 0"},
-            "mass": {"value": as_text(of.mass)},
-            "inertia": _tensor_attributes(of.inertia),
-        }
-        tags = [f"  {_tag(name, values)}" for name, values in parts.items()]
-        lines = ["<inertial>", *tags, "</inertial>"]
-        yield source.with_first_child(link, lines)
-        return
-    origin, mass, tensor = (element.child(name) for name in ("origin", "mass", "inertia"))
+    origin = element and element.child("origin")
     turn = _rotation(origin.attributes.get("rpy", "")) if origin else np.eye(3)
     turned = turn.T @ of.inertia @ turn
+    parts = {
+        "origin": {"xyz": as_text(of.centre)},
+        "mass": {"value": as_text(of.mass)},
+        "inertia": {name: as_text(turned[place]) for name, place in TENSOR.items()},
+    }
+    if element is not None:
+        yield from _set(source, element, parts)
+        return
+    parts["origin"]["rpy"] = "0 0 0"
+    tags = [f"  {_tag(name, values)}" for name, values in parts.items()]
+    yield source.with_first_child(link, ["<inertial>", *tags, "</inertial>"])
+
+
+def _set(
+    source: XmlSource, parent: Element, parts: Mapping[str, Mapping[str, str]]
+) -> Iterator[Edit]:
+    """Set attributes of an element's children, and put in those that it has not."""
     missing = []
-    for name, child, values in (
-        ("origin", origin, {"xyz": as_text(of.centre)}),
-        ("mass", mass, {"value": as_text(of.mass)}),
-        ("inertia", tensor, _tensor_attributes(turned)),
-    ):
-        if child is None:
+    for name, values in parts.items():
+        if (child := parent.child(name)) is None:
             missing.append(_tag(name, values))
         else:
             yield source.with_attributes(child, values)
     if missing:
-        yield source.with_first_child(element, missing)
+        yield source.with_first_child(parent, missing)
 
 
-def _friction_edits(
-    source: XmlSource, joint: Element, coefficients: dict[str, float]
-) -> Iterator[Edit]:
-    """Set, or put in, damping and dry friction of a joint."""
-    values = {
-        attribute: as_text(coefficients[symbol])
-        for symbol, attribute in _DYNAMICS.items()
-        if math.isfinite(coefficients.get(symbol, math.nan))
-    }
-    if not values:
-        return
-    element = joint.child("dynamics")
-    if element is None:
-        yield source.with_first_child(joint, [_tag("dynamics", values)])
-    else:
-        yield source.with_attributes(element, values)
-
-
-def _tag(name: str, values: dict[str, str]) -> str:
+def _tag(name: str, values: Mapping[str, str]) -> str:
     return f"<{name} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
-
-
-def _tensor_attributes(tensor: Array) -> dict[str, str]:
-    return {name: as_text(tensor[place]) for name, place in TENSOR.items()}
 
 
 def as_text(values: float | Sequence[float] | Array) -> str:
@@ -446,95 +389,76 @@ def as_text(values: float | Sequence[float] | Array) -> str:
 
 def _rotation(rpy: str) -> Array:
     """Return the rotation of a URDF's roll, pitch and yaw, about fixed axes; none is none."""
-    if not rpy.strip():
-        return np.eye(3)
-    return np.asarray(pin.rpy.rpyToMatrix(np.array([float(angle) for angle in rpy.split()])))
+    angles = [float(angle) for angle in rpy.split()] or [0.0] * 3
+    return np.asarray(pin.rpy.rpyToMatrix(np.array(angles)))
 
 
 def _refuse_impossible(
-    model: RobotModel,
-    standard: Array,
-    inertial: Array,
-    coefficients: dict[str, dict[str, float]],
+    model: RobotModel, standard: Array, inertial: Array, dynamics: Sequence[Mapping[str, float]]
 ) -> None:
     """Raise `NotConsistentError` for what no machine can have."""
-    joint_values, n = model.layout.width, model.n_joints
-    for place, (name, value) in enumerate(zip(model.standard_names, standard, strict=True)):
-        if not math.isfinite(value):
-            between = place - n * joint_values
-            own = place // joint_values if between < 0 else model.layout.pairs[between][0]
-            joint = model.joint_names[own]
-            raise NotConsistentError(
-                f"parameter {name} of joint {joint!r} is no number", joint=joint
-            )
-    for joint, smallest in zip(model.joint_names, margin(inertial), strict=True):
-        if not smallest > 0.0:
-            raise NotConsistentError(
-                f"the link of joint {joint!r} is no possible body: its pseudo-inertia has the"
-                f" eigenvalue {smallest:.3g}; write the physically consistent estimate",
-                joint=joint,
-            )
+    for place in np.flatnonzero(~np.isfinite(standard)):
+        raise NotConsistentError(f"parameter {model.standard_names[place]} is no number")
+    _refuse_links(model, inertial, "write the physically consistent estimate")
     rotors = model.layout.rotor_matrix(standard)
     for joint, rotor in zip(model.joint_names, np.diag(rotors), strict=True):
         if not rotor >= 0.0:
-            raise NotConsistentError(f"the rotor of joint {joint!r} is negative", joint=joint)
+            raise NotConsistentError(f"the rotor of joint {joint!r} is negative")
     smallest, directions = np.linalg.eigh(rotors)
     if smallest[0] < -_ROUNDING * np.abs(rotors).max(initial=0.0):
         joint = model.joint_names[int(np.argmax(np.abs(directions[:, 0])))]
         raise NotConsistentError(
-            f"the coupling inertias of joint {joint!r} are too large for its rotors", joint=joint
+            f"the coupling inertias of joint {joint!r} are too large for its rotors"
         )
-    for joint, terms in coefficients.items():
-        for symbol, attribute in _DYNAMICS.items():
-            if terms.get(symbol, 0.0) < 0.0:
+    for joint, values in zip(model.joint_names, dynamics, strict=True):
+        for attribute, value in values.items():
+            if value < 0.0:
                 raise NotConsistentError(
-                    f"{attribute} of joint {joint!r} is {terms[symbol]:.3g}; friction takes"
-                    " energy, it is never negative",
-                    joint=joint,
+                    f"{attribute} of joint {joint!r} is {value:.3g}; friction takes energy, it is"
+                    " never negative"
                 )
 
 
+def _refuse_links(model: RobotModel, inertial: Array, remedy: str) -> None:
+    for joint, smallest in zip(model.joint_names, margin(inertial), strict=True):
+        if not smallest > 0.0:
+            raise NotConsistentError(
+                f"the link of joint {joint!r} is no possible body: its pseudo-inertia has the"
+                f" eigenvalue {smallest:.3g}; {remedy}"
+            )
+
+
 def _compare(
-    text: str, model: RobotModel, inertial: Array, coefficients: dict[str, dict[str, float]]
+    text: str, model: RobotModel, inertial: Array, dynamics: Sequence[Mapping[str, float]]
 ) -> None:
     """Raise `WriteBackError` unless the text is read back as the robot that was meant."""
     chain = chain_from_urdf(text, model.locked)
     if chain.joint_names != model.joint_names:
         raise WriteBackError("the description is of another robot: its joints are not the model's")
-    n = model.n_joints
-    q, qd, qdd = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, n))
+    motion = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
-    expected = plan.torque(inertial.reshape(-1), q, qd, qdd)
+    expected = plan.torque(inertial.reshape(-1), *motion)
     arm = pinocchio_model(text, model.locked)
     arm.gravity.linear = model.gravity
-    error = np.abs(rnea(arm, q, qd, qdd) - expected).max(axis=0)
+    error = np.abs(rnea(arm, *motion) - expected).max(axis=0)
     # Links of very different mass share the rounding of the largest.
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
-    wrong = np.flatnonzero(~(error <= allowed))
-    if len(wrong):
-        joint = model.joint_names[int(wrong[0])]
+    for joint in np.flatnonzero(~(error <= allowed)):
         raise WriteBackError(
-            f"the written description gives other torques: joint {joint!r} by {error.max():.3g}"
+            "the written description gives other torques: joint"
+            f" {model.joint_names[joint]!r} by {error.max():.3g}"
         )
     if not np.allclose(chain.inertial, inertial, rtol=0.0, atol=_ROUNDING * np.abs(inertial).max()):
         raise WriteBackError("the written description gives other inertial parameters")
-    for joint, smallest in zip(model.joint_names, margin(chain.inertial), strict=True):
-        if not smallest > 0.0:
-            raise NotConsistentError(
-                f"the link of joint {joint!r} is so close to the edge of what is possible that"
-                " rounding takes it beyond",
-                joint=joint,
-            )
-    elements = XmlSource(text).root.children
-    joints = {e.attributes.get("name"): e for e in elements if e.name == "joint"}
-    for joint, values in coefficients.items():
-        dynamics = joints[joint].child("dynamics")
-        for symbol, attribute in _DYNAMICS.items():
-            wanted = values.get(symbol, math.nan)
-            if math.isfinite(wanted) and (
-                dynamics is None or float(dynamics.attributes[attribute]) != wanted
-            ):
-                raise WriteBackError(f"{attribute} of joint {joint!r} was not written")
+    _refuse_links(model, chain.inertial, "rounding makes it that")
+    written = {
+        joint.get("name"): joint.find("dynamics") for joint in urdf_tree(text).findall("joint")
+    }
+    for name, values in zip(model.joint_names, dynamics, strict=True):
+        for attribute, value in values.items():
+            found = written[name]
+            if found is None or float(found.get(attribute, "nan")) != value:
+                raise WriteBackError(f"{attribute} of joint {name!r} was not written")
 
 
 def rnea(arm: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:

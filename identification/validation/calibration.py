@@ -54,54 +54,36 @@ class TorqueMeans:
     """Means of [W | y] over B blocks of time of `BLOCK` seconds, rows at rest included.
 
     Attributes:
-        rows: per joint j over its columns and, last, the torque (B, c_j + 1); NaN where less than
-            half of the block is known of the joint.
-        columns: per joint the parameter index of each of its columns (c_j,).
+        rows: (B, n, p + 1), last the torque; NaN where less than half of the block is known of the
+            joint.
         block: place of each block since the origin of its motion (B,).
         count: samples that were averaged (B, n).
     """
 
-    rows: tuple[Array, ...]
-    columns: tuple[NDArray[np.intp], ...]
+    rows: Array
     block: NDArray[np.intp]
     count: NDArray[np.intp]
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> TorqueMeans:
         """Blocks of recordings one after the other."""
-        parts = [_means(model, samples) for samples in recordings if len(samples.torque)]
-        columns = model.plan.columns
-        empty = cls(
-            tuple(np.zeros((0, len(own) + 1)) for own in columns),
-            columns,
+        n, p = model.n_joints, model.n_parameters
+        empty = (
+            np.zeros((0, n, p + 1)),
             np.zeros(0, dtype=np.intp),
-            np.zeros((0, model.n_joints), dtype=np.intp),
+            np.zeros((0, n), dtype=np.intp),
         )
-        every = [empty, *parts]
-        return cls(
-            tuple(np.concatenate(own) for own in zip(*(one.rows for one in every), strict=True)),
-            columns,
-            np.concatenate([one.block for one in every]),
-            np.concatenate([one.count for one in every]),
-        )
+        parts = [_means(model, samples) for samples in recordings if len(samples.torque)]
+        return cls(*map(np.concatenate, zip(empty, *parts, strict=True)))
 
     def errors(self, values: Array) -> Array:
         """Mean torque measured less predicted by parameters (p,), (B, n) [N·m or N]."""
-        return np.column_stack(
-            [
-                own @ np.append(-values[used], 1.0)
-                for own, used in zip(self.rows, self.columns, strict=True)
-            ]
-        )
+        return np.asarray(self.rows @ np.append(-values, 1.0))
 
     def variance(self, covariance: Array) -> Array:
         """What a covariance of the parameters (p, p) does to the predicted means (B, n)."""
-        return np.column_stack(
-            [
-                np.einsum("bi,ik,bk->b", own[:, :-1], covariance[np.ix_(used, used)], own[:, :-1])
-                for own, used in zip(self.rows, self.columns, strict=True)
-            ]
-        )
+        rows = self.rows[:, :, :-1]
+        return np.asarray(((rows @ covariance) * rows).sum(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,25 +97,27 @@ class Calibration:
         blocks: held-out means that were compared with their interval.
         inside: share of them that lie inside.
         half_width: median of half the interval [N·m or N].
-        spread: s, root mean square of the means' errors in inner folds [N·m or N].
         white_inside: share inside the intervals that white residuals would have.
     """
 
     blocks: NDArray[np.intp]
     inside: Array
     half_width: Array
-    spread: Array
     white_inside: Array
 
     @property
     def overall(self) -> float:
         """Share inside of all joints; NaN where no interval is known."""
-        return _pooled(self.inside, self.blocks)
+        return self._pooled(self.inside)
 
     @property
     def white_overall(self) -> float:
         """Share inside with white residuals, of the same means."""
-        return _pooled(self.white_inside, self.blocks)
+        return self._pooled(self.white_inside)
+
+    def _pooled(self, shares: Array) -> float:
+        total = int(self.blocks.sum())
+        return float(np.nansum(shares * self.blocks) / total) if total else float("nan")
 
 
 def calibrate(
@@ -171,23 +155,17 @@ def calibrate(
     white_half = np.sqrt(by_parameters + normal_limit(0.025) ** 2 * white)
     judged = ~np.isnan(errors) & np.isfinite(spread)
     blocks = np.count_nonzero(judged, axis=0)
-
-    def share(limits: Array) -> Array:
-        inside = np.count_nonzero(judged & (errors <= limits), axis=0)
-        return np.where(blocks > 0, inside / np.maximum(blocks, 1), np.nan)
-
-    return Calibration(
-        blocks=blocks,
-        inside=share(half),
-        half_width=np.array(
-            [
-                np.median(own[counts]) if counts.any() else np.nan
-                for own, counts in zip(half.T, judged.T, strict=True)
-            ]
-        ),
-        spread=spread,
-        white_inside=share(white_half),
+    inside, white_inside = (
+        np.where(
+            blocks > 0,
+            np.count_nonzero(judged & (errors <= limits), axis=0) / np.maximum(blocks, 1),
+            np.nan,
+        )
+        for limits in (half, white_half)
     )
+    widths = [own[rows] for own, rows in zip(half.T, judged.T, strict=True)]
+    half_width = np.array([np.median(own) if own.size else np.nan for own in widths])
+    return Calibration(blocks, inside, half_width, white_inside)
 
 
 def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
@@ -195,11 +173,6 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
 
     Stretches have equally many rows, and are cut at equal times of all recordings. NaN where the
     mean is not known, infinite where the other stretches have no row of the joint.
-
-    Args:
-        phase: the rows that are fitted.
-        means: of the same recordings.
-        refit: the estimator.
 
     Raises:
         IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be
@@ -224,25 +197,20 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
     return found
 
 
-def _means(model: RobotModel, samples: Samples) -> TorqueMeans:
-    """Blocks of one recording, which has rows."""
+def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Fields of :class:`TorqueMeans` of one recording, which has rows."""
     known = np.ones(samples.torque.shape, dtype=np.bool_)
     if samples.mask is not None:
         for reason in (TORN, SATURATED):
             known &= ~samples.mask.reasons[reason]
-    index = block_index(samples)
+    index, p = block_index(samples), model.n_parameters
     present = np.unique(index)
     count = samples_by_cell(index, known)[present]
-    sums = [np.zeros((int(index[-1]) + 1, len(own) + 1)) for own in model.plan.columns]
+    places = [np.append(own, p) for own in model.plan.columns]
+    sums = np.zeros((int(index[-1]) + 1, model.n_joints, p + 1))
     for part, chunk in augmented_rows(model, replace(samples, usable=known)):
         for block, at in block_runs(index[part]):
-            for total, own in zip(sums, chunk, strict=True):
-                total[block] += own[:, at].sum(axis=1)
+            for joint, own in enumerate(chunk):
+                sums[block, joint, places[joint]] += own[:, at].sum(axis=1)
     divisor = np.where(count > 0.5 * np.bincount(index).max(), count, np.nan)
-    rows = tuple(total[present] / divisor[:, j, None] for j, total in enumerate(sums))
-    return TorqueMeans(rows, model.plan.columns, present, count)
-
-
-def _pooled(shares: Array, blocks: NDArray[np.intp]) -> float:
-    total = int(blocks.sum())
-    return float(np.nansum(shares * blocks) / total) if total else float("nan")
+    return sums[present] / divisor[:, :, None], present, count

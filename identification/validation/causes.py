@@ -14,7 +14,7 @@ blocks are therefore made once, and a candidate costs a few small solutions.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple
 
@@ -59,14 +59,12 @@ _FEWEST_BLOCKS: Final = 2
 # Share of each column's own information: keeps what a motion hardly determines small.
 _RIDGE: Final = 1e-6
 _LOAD: Final = len(LINK_SYMBOLS)
-# Which coefficient of a fault of several is its size.
-_SIZE: Final[dict[Kind, int]] = {"payload": LINK_SYMBOLS.index("m")}
+_MASS: Final = LINK_SYMBOLS.index("m")  # of the coefficients of a payload the one that is its size
 _OF_MOTION: Final = ("axis sign", "position order", "joint order")
 _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """Some of the blocks of the fitted recordings.
 
     Attributes:
@@ -78,8 +76,7 @@ class Part:
     blocks: tuple[bool, ...]
 
 
-@dataclass(frozen=True)
-class Fault:
+class Fault(NamedTuple):
     """What may be wrong with recordings.
 
     Attributes:
@@ -98,8 +95,7 @@ class Fault:
         return self.kind in (*_OF_MOTION, *_OF_TORQUE)
 
 
-@dataclass(frozen=True)
-class Cause:
+class Cause(NamedTuple):
     """A fault that explains errors.
 
     Attributes:
@@ -116,8 +112,7 @@ class Cause:
     std: float
 
 
-@dataclass(frozen=True)
-class Causes:
+class Causes(NamedTuple):
     """Faults that were looked for in what was fitted.
 
     Attributes:
@@ -143,21 +138,18 @@ def find_causes(
         names: of the recordings.
     """
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
-    state = _State(model, tuple(recordings), values, words)
-    first = trials = state.trials()
+    search = _Search(model, recordings, values, words)
+    first = trials = search.trials()
     found: list[Cause] = []
-    while len(found) < _MOST_CAUSES:
-        trial = _best(trials)
-        if trial is None:
-            break
+    while len(found) < _MOST_CAUSES and (trial := _best(trials)) is not None:
         found.append(trial.cause)
         if trial.cause.fault.kind == "changed arm":
             break  # with all parameters apart, nothing is left to compare
-        state = state.mended(trial.cause.fault)
-        trials = state.trials()
+        search.mend(trial.cause.fault)
+        trials = search.trials()
     return Causes(
         tuple(found),
-        min(first, key=lambda one: one.cause.ratio).cause if first and not found else None,
+        min((one.cause for one in first), key=lambda one: one.ratio) if not found else None,
         tuple(
             one.cause.fault.joints[0]
             for one in first
@@ -193,147 +185,129 @@ class _Trial(NamedTuple):
         Then neither is sure: of a wrist that is predicted badly many nonsensical orders predict a
         little more. Signs of two joints may well be the same arm mirrored.
         """
-        mine, its = self.cause, other.cause
+        mine, its = self.cause.fault, other.cause.fault
         return (
-            mine.fault.discrete
-            and its.fault.discrete
-            and not (mine.fault.kind.endswith("sign") and its.fault.kind.endswith("sign"))
-            and mine.fault.joints != its.fault.joints
-            and (1.0 - LEAST_GAIN) * its.ratio < mine.ratio
+            mine.discrete
+            and its.discrete
+            and not (mine.kind.endswith("sign") and its.kind.endswith("sign"))
+            and mine.joints != its.joints
+            and (1.0 - LEAST_GAIN) * other.cause.ratio < self.cause.ratio
         )
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """The trial of least error among those that are better beyond chance, simple ones first."""
     better = [trial for trial in trials if trial.better]
-    if not better:
-        return None
-    least = min(trial.cause.ratio for trial in better)
+    least = min((trial.cause.ratio for trial in better), default=0.0)
     alike = [trial for trial in better if trial.cause.ratio <= _ALIKE * least]
-    best = min(alike, key=lambda trial: (trial.coefficients, trial.cause.ratio))
-    return None if any(best.rivalled_by(trial) for trial in better) else best
+    best = min(alike, key=lambda one: (one.coefficients, one.cause.ratio), default=None)
+    return best if best and not any(best.rivalled_by(trial) for trial in better) else None
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
+class _Search:
     """Recordings with the faults mended that were found so far.
 
-    Faults of signs and orders are mended in the recordings; `found` are those of the other kinds,
-    whose columns stay in the fit.
+    Faults of signs and orders are mended in the recordings; those of the other kinds have columns
+    that stay in the fit.
     """
 
-    model: RobotModel
-    recordings: tuple[Samples, ...]
-    values: Array
-    names: tuple[str, ...]
-    found: tuple[Fault, ...] = ()
-    _moved: dict[Fault, _Tables] = field(default_factory=dict)
+    def __init__(
+        self, model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str]
+    ) -> None:
+        self._model, self._values, self._names = model, values, names
+        self._recordings = recordings
+        self._known: list[Fault] = []
+        self._moved: dict[Fault, _Tables] = {}  # of faults of the motion, the same in every search
 
-    def mended(self, fault: Fault) -> _State:
-        """The state with one fault less."""
+    def mend(self, fault: Fault) -> None:
+        """Go on without a fault."""
         if fault.discrete:
-            moved = tuple(_mended(self.model, one, fault) for one in self.recordings)
-            return replace(self, recordings=moved, _moved={})
-        return replace(self, found=(*self.found, fault))
+            self._recordings = [_mended(self._model, one, fault) for one in self._recordings]
+            self._moved.clear()
+        else:
+            self._known.append(fault)
 
     def trials(self) -> list[_Trial]:
         """Every fault mended in its turn."""
-        model, p = self.model, self.model.n_parameters
-        tables = _Tables.of(model, self.recordings, self.values)
-        n, width = model.n_joints, tables.gram.shape[-1]
-        target = np.eye(n, width, width - n)
+        model, values, p = self._model, self._values, self._model.n_parameters
+        tables = _Tables.of(model, self._recordings, values)
+        target = np.eye(model.n_joints, tables.width, tables.width - model.n_joints)
         none = np.zeros((*tables.gram.shape[:3], 0))
-        known = [_columns_of(tables, model, self.values, one) for one in self.found]
+        known = [_columns_of(tables, model, values, one) for one in self._known]
         before = np.concatenate([none, *known], axis=3)
         usual = _score(tables, p, before, target)
         trials = []
         for fault in self._faults(tables):
-            own, measured, seen = none, target, tables
+            own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
             if fault.kind in _OF_MOTION:
-                seen = self._tables_of(fault)
+                if fault not in self._moved:
+                    moved = [_mended(model, one, fault) for one in self._recordings]
+                    self._moved[fault] = _Tables.of(model, moved, values)
+                seen = self._moved[fault]
             elif fault.kind == "torque sign":
-                measured = target.copy()
-                measured[list(fault.joints)] *= -1.0
+                measured[joints] *= -1.0
             elif fault.kind == "torque order":
-                measured = target.copy()
-                measured[list(fault.joints)] = target[list(fault.joints[::-1])]
+                measured[joints] = target[joints[::-1]]
             else:
-                own = _columns_of(tables, model, self.values, fault)
+                own = _columns_of(tables, model, values, fault)
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
             ratio, highest = score.against(usual)
             size, std = _size(fault, score, tables, own)
             torque = np.einsum("jq,bjqr,jr->j", measured, seen.gram, measured)
             left = np.sqrt(score.squares.sum(axis=0) / np.maximum(torque, np.finfo(float).tiny))
-            worst = float(left[list(fault.joints)].max(initial=0.0))
+            worst = float(left[joints].max(initial=0.0))
             trials.append(_Trial(Cause(fault, ratio, size, std), highest, own.shape[3], worst))
         return trials
 
-    def _tables_of(self, fault: Fault) -> _Tables:
-        """Tables with a fault of the motion mended; the same in every search."""
-        if fault not in self._moved:
-            moved = [_mended(self.model, one, fault) for one in self.recordings]
-            self._moved[fault] = _Tables.of(self.model, moved, self.values)
-        return self._moved[fault]
-
     def _faults(self, tables: _Tables) -> Iterator[Fault]:
-        n = self.model.n_joints
+        n = self._model.n_joints
         kinds: tuple[Kind, ...] = ("delay", "gain", "torque sign", "axis sign")
         orders: tuple[Kind, ...] = ("torque order", "position order", "joint order")
         yield Fault("delay")
+        changes = [Fault("payload"), Fault("changed arm")]
         for j in range(n):
             yield from (Fault(kind, (j,)) for kind in kinds)
             yield from (Fault(kind, (k, j)) for k in range(j) for kind in orders)
-        changes = [Fault("payload"), Fault("changed arm")]
-        for j in range(n):
             changes += [Fault("changed gain", (j,)), Fault("changed friction", (j,))]
         for part in self._later_parts(tables):
-            yield from (replace(fault, part=part) for fault in changes)
-        if len(self.recordings) > 2:
+            yield from (fault._replace(part=part) for fault in changes)
+        if len(self._recordings) > 2:
             for fault in changes:
-                yield replace(fault, part=self._other_recordings(tables, fault))
+                yield fault._replace(part=self._other_recordings(tables, fault))
 
     def _other_recordings(self, tables: _Tables, fault: Fault) -> Part:
         """The recordings in which a fault is largest, if each has its own size of it.
 
         They are those beyond the widest gap between the sizes, the fewer ones.
         """
-        alike = fault if fault.kind != "changed arm" else Fault("payload")
-        each = [self._of(tables, k) for k in range(len(self.recordings))]
-        columns = [
-            _columns_of(tables, self.model, self.values, replace(alike, part=part))
-            for part in each[1:]
-        ]
-        n, width = self.model.n_joints, tables.gram.shape[-1]
-        score = _score(
-            tables,
-            self.model.n_parameters,
-            np.concatenate(columns, axis=3),
-            np.eye(n, width, width - n),
-        )
-        sizes = score.added.mean(axis=0).reshape(len(columns), -1)[:, _SIZE.get(alike.kind, 0)]
-        sizes = np.append(0.0, sizes)
+        model, alike, columns = self._model, fault, []
+        if fault.kind == "changed arm":
+            alike = Fault("payload")
+        for k in range(1, len(self._recordings)):
+            own = Part(self._names[k], tuple((tables.recording == k).tolist()))
+            columns.append(_columns_of(tables, model, self._values, alike._replace(part=own)))
+        target = np.eye(model.n_joints, tables.width, tables.width - model.n_joints)
+        score = _score(tables, model.n_parameters, np.concatenate(columns, axis=3), target)
+        sizes = score.added.mean(axis=0).reshape(len(columns), -1)
+        sizes = np.append(0.0, sizes[:, _MASS if alike.kind == "payload" else 0])
         order = np.argsort(sizes)
         cut = int(np.argmax(np.diff(sizes[order]))) + 1
         those = sorted(min(order[cut:], order[:cut], key=len).tolist())
         blocks = np.isin(tables.recording, those)
-        return Part(", ".join(self.names[k] for k in those), tuple(blocks.tolist()))
-
-    def _of(self, tables: _Tables, recording: int) -> Part:
-        return Part(self.names[recording], tuple((tables.recording == recording).tolist()))
+        return Part(", ".join(self._names[k] for k in those), tuple(blocks.tolist()))
 
     def _later_parts(self, tables: _Tables) -> Iterator[Part]:
         """All that comes after each moment."""
-        blocks, recordings = len(tables.recording), len(self.recordings)
+        blocks = len(tables.recording)
         for first in range(_FEWEST_BLOCKS, blocks - _FEWEST_BLOCKS + 1):
             k, start = int(tables.recording[first]), tables.start[first]
-            words = f"{self.names[k]} from {start:.3g} s on" if start > 0.0 else self.names[k]
-            if k < recordings - 1:
+            words = f"{self._names[k]} from {start:.3g} s on" if start > 0.0 else self._names[k]
+            if k < len(self._recordings) - 1:
                 words += " and what follows it"
             yield Part(words, tuple((np.arange(blocks) >= first).tolist()))
 
 
-@dataclass(frozen=True, eq=False)
-class _Tables:
+class _Tables(NamedTuple):
     """Sums over the rows of B blocks of products of columns, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, torques of all joints (n).
@@ -349,6 +323,11 @@ class _Tables:
     rows: NDArray[np.intp]
     recording: NDArray[np.intp]
     start: Array
+
+    @property
+    def width(self) -> int:
+        """Number q of columns."""
+        return int(self.gram.shape[-1])
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> _Tables:
@@ -400,26 +379,16 @@ def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.i
     Without the jumps of dry friction: it has the direction that it has in between.
     """
     after, before = np.minimum(some + 1, len(samples.torque) - 1), np.maximum(some - 1, 0)
-    now = samples.motion.rows(some)
+    now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
     direction = now.direction
     if direction is None:
         direction = model.friction.direction(*now[:3])
-    torque, time = [], []
-    for rows in (before, after):
-        motion = samples.motion.rows(rows)
-        torque.append(model.torque(values, *motion[1:4], direction))
-        time.append(motion.time)
-    return np.asarray((torque[1] - torque[0]) / np.maximum(time[1] - time[0], 1e-9)[:, None])
+    low, high = (model.torque(values, *one[1:4], direction) for one in (first, last))
+    return np.asarray((high - low) / np.maximum(last.time - first.time, 1e-9)[:, None])
 
 
 class _Score(NamedTuple):
-    """Errors of predicted blocks.
-
-    Attributes:
-        squares: sums of each block (B, n).
-        values: parameters without each fold (F, p).
-        added: coefficients of added columns (F, r).
-    """
+    """Squared errors of predicted blocks (B, n); parameters and added coefficients by fold."""
 
     squares: Array
     values: Array
@@ -456,13 +425,17 @@ def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
     wide = np.concatenate([added, column], axis=3)
     moved = tables.gram @ wide
-    width = p + wide.shape[3]
-    gram = np.empty((blocks, n, width, width))
-    gram[..., :p, :p] = tables.gram[..., :p, :p]
-    gram[..., :p, p:] = moved[..., :p, :]
-    gram[..., p:, :p] = np.swapaxes(moved[..., :p, :], 2, 3)
-    gram[..., p:, p:] = np.swapaxes(wide, 2, 3) @ moved
-    weights, floor = _weights(gram.sum(axis=0), tables.rows.sum(axis=0))
+    gram = np.block(
+        [
+            [tables.gram[..., :p, :p], moved[..., :p, :]],
+            [np.swapaxes(moved[..., :p, :], 2, 3), np.swapaxes(wide, 2, 3) @ moved],
+        ]
+    )
+    # Weighted by the inverse variances of an ordinary fit; rounding leaves the floor.
+    whole = gram.sum(axis=0)
+    floor = 1e-12 * whole[:, -1, -1] + np.finfo(np.float64).tiny
+    usual = np.maximum(_squares(whole, _solved(whole.sum(axis=0))), floor)
+    weights = np.maximum(tables.rows.sum(axis=0), 1) / usual
     weighted = np.einsum("j,bjst->bst", weights, gram)
     total = weighted.sum(axis=0)
     squares, coefficients = np.zeros((blocks, n)), []
@@ -474,13 +447,6 @@ def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
     found = np.array(coefficients)
     return _Score(squares, found[:, :p], found[:, p:])
-
-
-def _weights(gram: Array, rows: Array) -> tuple[Array, Array]:
-    """Inverse variances of the residuals (n,) of an ordinary fit, and what rounding leaves."""
-    squares = _squares(gram, _solved(gram.sum(axis=0)))
-    floor = 1e-12 * gram[:, -1, -1] + np.finfo(np.float64).tiny
-    return np.maximum(rows, 1) / np.maximum(squares, floor), floor
 
 
 def _squares(gram: Array, values: Array) -> Array:
@@ -500,18 +466,11 @@ def _solved(gram: Array) -> Array:
 
 
 def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[float | None, float]:
-    """How large a fault is, and the standard deviation of that by the jackknife over folds.
-
-    Args:
-        fault: which.
-        score: with its columns.
-        tables: of the recordings.
-        own: its columns (B, n, q, r).
-    """
+    """How large a fault of columns (B, n, q, r) is, and its standard deviation by the jackknife."""
     if fault.discrete or fault.kind == "changed arm":
         return None, 0.0
     p = score.values.shape[1]
-    sizes = score.added[:, _SIZE.get(fault.kind, 0)]
+    sizes = score.added[:, _MASS if fault.kind == "payload" else 0]
     if fault.kind in ("gain", "changed gain", "changed friction"):
         # Its column has the pooled parameters; what it multiplies is what the fit finds beside it.
         columns = own[..., :p, 0].reshape(-1, p)

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 _EDGE: Final = 0.01
 # Standard deviations by which a parameter must have been moved for that to be no chance.
 _MOVED: Final = 3.0
-_SHOWN_LINKS: Final = 2
+_SHOWN_BOUNDS: Final = 4
 # Rise of the held-out torque error over all joints, as a fraction of the torque, and of one joint,
 # as a fraction of its own, above which consistency costs something; and above which no machine has
 # such parameters. Simulated NS 16 campaigns without a fault: below 0.0001 over all joints. With the
@@ -60,7 +60,6 @@ class ConsistencyCheck:
         moved: names of the parameters that were moved by more than three standard deviations.
         bounds: what the unconstrained estimate asks for and no machine has, in words, that of the
             joint with the largest rise first.
-        joint_names: (n,).
         judged_on: "held-out", or "in-sample" where that motion was fitted after all.
     """
 
@@ -71,7 +70,6 @@ class ConsistencyCheck:
     room: Array
     moved: tuple[str, ...]
     bounds: tuple[str, ...]
-    joint_names: tuple[str, ...]
     judged_on: str = "held-out"
 
     @property
@@ -96,39 +94,18 @@ class ConsistencyCheck:
     @property
     def sentence(self) -> str:
         """What was found, in words."""
-        points = round(100.0 * self.cost, 2)  # without sign and figure where that is nothing
-        error = f"{self.judged_on} torque error"
-        error += f" {points:+.2f} points" if points else " unchanged"
+        points = round(100.0 * self.cost, 2) + 0.0
+        error = f"{self.judged_on} torque error {points:+.2f} points"
         if not self.costly:
-            if self.cost < -_COSTLY[0]:
-                return f"a possible machine predicts better ({error})"
-            text = f"a possible machine predicts as well ({error})"
-            if self.moved:
-                text += f", although the parameter{'s' if len(self.moved) > 1 else ''}"
-                text += f" {', '.join(self.moved)} had to move by more than three standard"
-                text += " deviations"
-            return text
-        if np.any(self.held_out_rise > 0.0):
-            worst = int(np.nanargmax(self.held_out_rise))
-            error += f", {self.joint_names[worst]} {100.0 * self.held_out_rise[worst]:+.1f}"
-        # The links in one part of the sentence, those of the worst joints by name.
-        link_of = {_link_words(name): name for name in self.joint_names}
-        links = [link_of[bound] for bound in self.bounds if bound in link_of]
-        words = [error, *(bound for bound in self.bounds if bound not in link_of)]
-        if len(links) == 1:
-            words.append(_link_words(links[0]))
-        elif links:
-            words.append(
-                f"the links of {joined(links, _SHOWN_LINKS)} would need a negative mass or moment"
-                " of inertia"
-            )
+            better = self.cost < -_COSTLY[0]
+            return f"a possible machine predicts {'better' if better else 'as well'} ({error})"
         start = (
             "no machine fits these parameters"
             if self.impossible
             else "the parameters are not those of a possible machine, and the nearest one predicts"
             " worse"
         )
-        return f"{start}: {'; '.join(words)}"
+        return f"{start} ({error}): {joined(self.bounds, _SHOWN_BOUNDS)}".removesuffix(": ")
 
 
 def check_consistency(
@@ -155,18 +132,25 @@ def check_consistency(
     """
     found = consistent_estimate(model, training, unconstrained, weights=weights, options=options)
     ours, free = found.estimate.values, unconstrained.values
-    shift, rise = np.abs(found.shift), held_out.relative_errors(ours)
-    rise = rise - held_out.relative_errors(free)
-    links = model.layout.links
+    shift, links = np.abs(found.shift), model.layout.links
+    rise = held_out.relative_errors(ours) - held_out.relative_errors(free)
     # In axes in which the pseudo-inertia of the reference is the unit matrix.
     frames = reference_bodies(options.of(model)[links], model.chain.translation).frames
     inner = np.linalg.solve(frames, pseudo_inertia(found.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
     room = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
     bounds: list[str] = []
+    single = np.count_nonzero(model.base.grouping, axis=1) == 1
     for joint in np.argsort(-np.nan_to_num(rise), kind="stable").tolist():
-        bounds += _negative(model, unconstrained, joint)
-        bounds += [_link_words(model.joint_names[joint])] if room[joint] < _EDGE else []
+        name = model.joint_names[joint]
+        for pattern, what in _NEGATIVE.items():
+            if (parameter := pattern.format(joint + 1)) in unconstrained.names:
+                k = unconstrained.names.index(parameter)
+                alone = k >= model.base.rank or bool(single[k])
+                if alone and free[k] < -_MOVED * unconstrained.std[k]:
+                    bounds.append(f"{what} of {name} would be negative ({free[k]:.3g})")
+        if room[joint] < _EDGE:
+            bounds.append(f"the link of {name} would need a negative mass or moment of inertia")
     return ConsistencyCheck(
         consistent=found,
         held_out=held_out.relative_error(ours),
@@ -177,23 +161,4 @@ def check_consistency(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > _MOVED
         ),
         bounds=tuple(bounds),
-        joint_names=model.joint_names,
     )
-
-
-def _link_words(joint: str) -> str:
-    return f"the link of {joint} would need a negative mass or moment of inertia"
-
-
-def _negative(model: RobotModel, free: Estimate, joint: int) -> list[str]:
-    """Rotor inertia and friction of a joint that an estimate has below zero, in words."""
-    found, single = [], np.count_nonzero(model.base.grouping, axis=1) == 1
-    for pattern, what in _NEGATIVE.items():
-        if (parameter := pattern.format(joint + 1)) not in free.names:
-            continue
-        k = free.names.index(parameter)
-        alone = k >= model.base.rank or bool(single[k])
-        if alone and free.values[k] < -_MOVED * free.std[k]:
-            name, value = model.joint_names[joint], free.values[k]
-            found.append(f"{what} of {name} would be negative ({value:.3g})")
-    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -41,8 +41,18 @@ from identification.validation.residuals import ResidualChecks, check_residuals
 
 Array = NDArray[np.float64]
 
+# Bandwidth in which a rigid arm makes its torque [Hz]; ripple and current noise lie above it,
+# every error of sign, coupling or constant below.
+SLOW: Final = 10.0
+SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
+# A joint's error is beyond that of the fit if its power is this many times larger.
+_GROWN: Final = 4.0
+_POSTURES: Final = 40
+# A few recordings of each kind decide on gravity and load as well as all.
+_MOST_RECORDINGS: Final = 3
+_PLAUSIBLE: Final = Implausible((), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +73,6 @@ class GravityDirection:
     best: Array
     ratio: float
 
-    def off(self, ratio: float, degrees: float) -> bool:
-        """Whether the declared direction is wrong: less error elsewhere, and not just beside it."""
-        return self.ratio < ratio and float(np.degrees(self.angle)) > degrees
-
     @property
     def angle(self) -> float:
         """Between the two [rad]; zero where none is declared."""
@@ -83,9 +89,29 @@ def find_gravity(
 
     The best of six directions along the base's axes and the declared one is refined.
     """
+
+    def fitted(gravity: Array) -> tuple[Array, Array]:
+        """Parameters, each joint weighted by its own residual, and the squared errors (n,)."""
+        gram, rows = training.under(gravity), training.rows
+        floor = 1e-12 * gram[:, -1, -1] + 1e-300
+        errors, values = gram[:, -1, -1], np.empty(0)
+        for _ in range(_PASSES):
+            values = solve(gram, np.where(rows > 0, rows / np.maximum(errors, floor), 0))
+            errors = squared_errors(gram, values)
+        return values, np.maximum(errors, floor)
+
+    def misfit(gravity: Array) -> float:
+        """Twice the negative logarithm of the likelihood, noise variances concentrated out."""
+        return float(training.rows @ np.log(fitted(gravity)[1]))
+
+    def unseen(gravity: Array) -> Array:
+        gram = held_out.under(gravity)
+        errors = squared_errors(gram, fitted(gravity)[0])
+        return np.maximum(np.maximum(errors, 1e-12 * gram[:, -1, -1]), 1e-300)
+
     size = float(np.linalg.norm(model.gravity)) or _STANDARD
     starts = [model.gravity, *(size * sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]
-    first = min(starts, key=lambda gravity: _misfit(training, gravity))
+    first = min(starts, key=misfit)
     if not np.any(first):
         return GravityDirection(model.gravity, model.gravity, 1.0)
     across = np.linalg.svd(first[None, :])[2][1:]
@@ -94,82 +120,32 @@ def find_gravity(
         direction = first / size + tilt @ across
         return np.asarray(size * direction / np.linalg.norm(direction))
 
+    simplex = [[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]]
     found = scipy.optimize.minimize(
-        lambda tilt: _misfit(training, pulled(tilt)),
+        lambda tilt: misfit(pulled(tilt)),
         np.zeros(2),
         method="Nelder-Mead",
-        options={
-            "initial_simplex": [[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]],
-            "xatol": 1e-3,
-            "fatol": 1e-3,
-            "maxfev": 80,
-        },
+        options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-3, "maxfev": 80},
     )
-    best = pulled(found.x)
-    as_is, other = (_unseen(training, held_out, gravity) for gravity in (model.gravity, best))
-    counts = held_out.rows > 0
-    change = np.log(np.maximum(other, 1e-300)) - np.log(np.maximum(as_is, 1e-300))
+    best, counts = pulled(found.x), held_out.rows > 0
+    change = np.log(unseen(best)) - np.log(unseen(model.gravity))
     ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
     return GravityDirection(model.gravity, best, ratio)
 
 
-def _fitted(gram: Array, rows: Array) -> Array:
-    """Parameters under one gravity, each joint weighted by its own residual."""
-    errors = gram[:, -1, -1]
-    values = np.zeros(gram.shape[1] - 1)
-    for _ in range(_PASSES):
-        weights = np.where(rows > 0, rows / np.maximum(errors, 1e-12 * gram[:, -1, -1] + 1e-300), 0)
-        values = solve(gram, weights)
-        errors = squared_errors(gram, values)
-    return values
+def repetition_noise(
+    model: RobotModel, values: Array, recordings: Iterable[Samples], bandwidth: float | None = None
+) -> Array:
+    """Standard deviation of the residual between repetitions at equal times (n,) [N·m or N].
 
-
-def _misfit(training: StandardGram, gravity: Array) -> float:
-    """Twice the negative logarithm of the likelihood, noise variances concentrated out."""
-    gram = training.under(gravity)
-    errors = squared_errors(gram, _fitted(gram, training.rows))
-    floor = 1e-12 * gram[:, -1, -1] + 1e-300
-    return float(training.rows @ np.log(np.maximum(errors, floor)))
-
-
-def _unseen(training: StandardGram, held_out: StandardGram, gravity: Array) -> Array:
-    values = _fitted(training.under(gravity), training.rows)
-    gram = held_out.under(gravity)
-    return np.maximum(squared_errors(gram, values), 1e-12 * gram[:, -1, -1])
-
-
-@dataclass(frozen=True, eq=False)
-class Repeatability:
-    """Residual of R repetitions of one motion, split in two.
-
-    Attributes:
-        noise: standard deviation between repetitions at equal times (n,) [N·m or N]: no model
-            can predict it. NaN for a joint that never moves twice at the same time.
-        systematic: root mean square of what all repetitions have in common (n,) [N·m or N]: what
-            the model gets wrong. Zero where noise can explain it.
-        repetitions: R.
-    """
-
-    noise: Array
-    systematic: Array
-    repetitions: int
-
-
-def repeatability(
-    model: RobotModel,
-    values: Array,
-    recordings: Iterable[Samples],
-    bandwidth: float | None = None,
-) -> Repeatability:
-    """Split the residual of repetitions of one motion; samples are read once, one at a time.
-
-    Times are compared to the nearest sampling interval since each recording's origin; on a
-    controller's clock that is exact.
+    No model can predict it. NaN for a joint that never moves twice at the same time. Times are
+    compared to the nearest sampling interval since each recording's origin; on a controller's clock
+    that is exact.
 
     Args:
         model: the robot.
         values: parameters (p,).
-        recordings: two repetitions or more.
+        recordings: repetitions of one motion, read once, one at a time.
         bandwidth: of a low-pass on the residual [Hz]; None for none.
 
     Raises:
@@ -188,37 +164,26 @@ def repeatability(
         own[index, joints] = left
     count = np.count_nonzero(~np.isnan(table), axis=0)
     shared = count >= 2
-    rows = np.count_nonzero(shared, axis=0)
-    if len(parts) < 2 or not rows.any():
+    if not shared.any():
         raise IdentificationError(
             "what repeats cannot be distinguished from noise: it takes two repetitions in which"
-            f" joints move at the same times, here are {len(parts)} with {rows.tolist()} common"
-            " rows per joint"
+            f" joints move at the same times, here are {len(parts)}"
         )
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)
-    spread = np.nansum((table - mean) ** 2, axis=0)
-    divisor = np.where(rows > 0, rows, np.nan)  # of a joint without common rows nothing is known
-    freedom = np.where(rows > 0, np.where(shared, count - 1.0, 0.0).sum(axis=0), np.nan)
-    noise = np.where(shared, spread, 0.0).sum(axis=0) / freedom
-    # The mean over repetitions still holds its share of the noise.
-    common = np.where(shared, mean**2 - noise / np.maximum(count, 1), 0.0).sum(axis=0) / divisor
-    return Repeatability(np.sqrt(noise), np.sqrt(np.maximum(common, 0.0)), len(parts))
+    spread = np.where(shared, np.nansum((table - mean) ** 2, axis=0), 0.0).sum(axis=0)
+    freedom = np.where(shared, count - 1.0, 0.0).sum(axis=0)
+    return np.asarray(np.sqrt(spread / np.where(freedom > 0.0, freedom, np.nan)))
 
 
-# A joint's error is beyond that of the fit if its power is this many times larger.
-_GROWN: Final = 4.0
-
-
-@dataclass(frozen=True)
-class CarriedLoad:
+class CarriedLoad(NamedTuple):
     """A body on the last link that the unseen motion asks for and the fitted one does not.
 
     Attributes:
         mass: how much more the arm carried there [kg].
-        half_interval: of that, 95 % [kg]; infinite where nobody computed it, or nothing determines
-            it.
         explained: share of the error on unseen motion, beyond that of the fit, that it explains.
         axes: number of joints whose error is far beyond that of the fit.
+        half_interval: of the mass, 95 % [kg]; infinite where the body explains little, or nothing
+            determines it.
     """
 
     mass: float
@@ -227,10 +192,41 @@ class CarriedLoad:
     half_interval: float = np.inf
 
 
-def weigh_load(
-    model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples], found: CarriedLoad
+def find_load(
+    model: RobotModel,
+    training: Sequence[Samples],
+    held_out: Sequence[Samples],
+    fitted: StandardGram,
+    predicted: StandardGram,
 ) -> CarriedLoad:
-    """The load with its interval: fitted again with friction that drifts between recordings."""
+    """Fit the training motion, and then ten more parameters of the last link to the unseen one.
+
+    Where these explain the error, the load is fitted again with friction that drifts between
+    recordings, for its interval.
+    """
+    seen, unseen = fitted.under(model.gravity), predicted.under(model.gravity)
+    values = solve(seen, fitted.rows / np.maximum(seen[:, -1, -1], 1e-300))
+    # The error of the fit in as many rows as were predicted.
+    floor = 1e-12 * unseen[:, -1, -1] + 1e-300
+    usual = squared_errors(seen, values) * predicted.rows / np.maximum(fitted.rows, 1.0)
+    weights = predicted.rows / np.maximum(usual, floor)
+    before = squared_errors(unseen, values)
+    last = model.layout.links[-1]
+    # Of [last link | what the fit leaves over].
+    change = np.zeros((unseen.shape[1], len(last) + 1))
+    change[last, range(len(last))] = 1.0
+    change[:, -1] = np.append(-values, 1.0)
+    gram = change.T @ unseen @ change
+    body = solve(gram, weights)
+    after = squared_errors(gram, body)
+    beyond = weights @ np.maximum(before - usual, 0.0)
+    found = CarriedLoad(
+        mass=float(body[LINK_SYMBOLS.index("m")]),
+        explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
+        axes=int(np.count_nonzero(before > _GROWN * np.maximum(usual, floor))),
+    )
+    if found.explained <= Thresholds().load:
+        return found
     try:
         runs = [
             Run.of(str(k), model, samples, None, loaded=loaded)
@@ -240,46 +236,7 @@ def weigh_load(
         mass, _, high = mass_difference(model, runs)
     except IdentificationError:
         return found
-    return replace(found, mass=mass, half_interval=high - mass) if np.isfinite(high) else found
-
-
-def find_load(model: RobotModel, training: StandardGram, held_out: StandardGram) -> CarriedLoad:
-    """Fit the training motion, and then ten more parameters of the last link to the unseen one."""
-    seen, unseen = training.under(model.gravity), held_out.under(model.gravity)
-    power = np.maximum(seen[:, -1, -1], 1e-300)
-    values = solve(seen, training.rows / power)
-    # The error of the fit in as many rows as were predicted.
-    floor = 1e-12 * unseen[:, -1, -1] + 1e-300
-    share = held_out.rows / np.maximum(training.rows, 1.0)
-    usual = squared_errors(seen, values) * share
-    weights = held_out.rows / np.maximum(usual, floor)
-    before = squared_errors(unseen, values)
-    last = model.layout.links[-1]
-    n, k = len(unseen), len(last)
-    # Of [last link | what the fit leaves over].
-    gram = np.empty((n, k + 1, k + 1))
-    gram[:, :k, :k] = unseen[:, last[:, None], last[None, :]]
-    gram[:, :k, k] = unseen[:, last, -1] - unseen[:, last, :-1] @ values
-    gram[:, k, :k] = gram[:, :k, k]
-    gram[:, k, k] = before
-    body = solve(gram, weights)
-    after = squared_errors(gram, body)
-    beyond = weights @ np.maximum(before - usual, 0.0)
-    return CarriedLoad(
-        mass=float(body[LINK_SYMBOLS.index("m")]),
-        explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
-        axes=int(np.count_nonzero(before > _GROWN * np.maximum(usual, floor))),
-    )
-
-
-# Bandwidth in which a rigid arm makes its torque [Hz]; ripple and current noise lie above it,
-# every error of sign, coupling or constant below.
-SLOW: Final = 10.0
-SIGMAS: Final = 3.0
-_POSTURES: Final = 40
-# A few recordings of each kind decide on gravity and load as well as all.
-_MOST_RECORDINGS: Final = 3
-_PLAUSIBLE: Final = Implausible((), ())
+    return found._replace(mass=mass, half_interval=high - mass) if np.isfinite(high) else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,10 +249,10 @@ class Surroundings:
         motor_from_joint: motor angle per joint angle (n, n).
         controller: error of the controller's own dynamic model on the unseen motion.
         delays: of the torque behind the position, as the recordings have them.
+        assumed_delay: what the fit took that delay to be, of all axes or of each (n,) [s].
         nominal_scale: measured torque over that of the nominal inertias, axis by axis.
         jumps: steps of the measured positions that no arm makes.
         controller_inertia: the controller's own diagonal inertia over the model's.
-        assumed_delay: what the fit took that delay to be, of all axes or of each (n,) [s].
         mended: what was wrong with the recordings and is made good in what was fitted.
     """
 
@@ -311,64 +268,45 @@ class Surroundings:
     mended: tuple[Finding, ...] = ()
 
 
-@dataclass(frozen=True)
-class CouplingIndex:
-    """How far the estimates of the parameters move together (paper, eq. 5).
-
-    Attributes:
-        index: I_c of the fitted rows, infinite where they leave a parameter undetermined.
-        largest: I_c,max of as many parameters.
-    """
-
-    index: float
-    largest: float
-
-
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a verdict is given on.
+    """What a verdict is given on; None is what was not measured or looked for.
 
     Attributes:
         estimate: the result.
         held_out: its error on motion that was not used for fitting.
         training: its error on the motion it was fitted to.
-        held_out_slow: as `held_out`, with the error low-passed and apart from a change of
-            friction; None where there are no repetitions to tell noise from error.
-        held_out_apart: the same apart from all change of friction, not only from what warm gears
-            excuse; None likewise.
+        systematic: error on unseen motion below 10 Hz that neither noise nor what warm gears
+            excuse explains, as a share of the torque (n,); NaN for a joint that was not tested,
+            None without repetitions, which tell noise from error.
+        systematic_apart: the same apart from all change of friction.
         friction_change: share by which friction was higher on an unseen motion than estimated,
             of all motions the one with the largest change, per joint (n,); None likewise.
-        slow: what repeats and what does not of the low-passed residual; None likewise.
         noise_floor: what no model can predict of the torque (n,) [N·m or N]: the residual above
-            the band of the motion, and what differs between repetitions; None if not measured.
-        estimation_noise: standard deviation of the predicted torque on the unseen motion because
-            the parameters come from noisy data, from the scatter over the repetitions (n,)
-            [N·m or N]; None likewise.
+            the band of the motion, and what differs between repetitions.
         disagreement: of the repetitions' own estimates with the pooled one, the worst of them,
             as a share of each axis's torque (n,); None without repetitions.
-        causes: faults that explain errors of the fit, None if they were not looked for.
-        gravity: the direction of gravity that fits best, None if it was not looked for.
-        load: a body that the arm seems to carry on unseen motion only, None likewise.
-        loaded: joints that gravity can load (n,), None if that was not looked at.
-        nominal: error of the nominal (CAD) model on the same unseen motion, None without one.
+        causes: faults that explain errors of the fit.
+        gravity: the direction of gravity that fits best.
+        load: a body that the arm seems to carry on unseen motion only.
+        loaded: joints that gravity can load (n,).
+        nominal: error of the nominal (CAD) model on the same unseen motion.
         implausible: what is physically impossible about the estimate.
-        residuals: what is left over, looked at from all sides; None if it was not.
-        coupling: of the parameters' estimates; None if it was not computed.
+        residuals: what is left over, and what it follows.
+        coupling: index I_c of how far the parameters' estimates move together (paper, eq. 5),
+            infinite where a parameter is undetermined, and I_c,max of as many parameters.
         surroundings: limits, saturation and the controller's own model.
         prismatic: indices of the joints that slide.
-        tested_on: what the unseen motion was, in words.
         in_sample: whether nothing was held out, so that all errors are those of the fit.
     """
 
     estimate: Estimate
     held_out: PredictionError
     training: PredictionError
-    held_out_slow: PredictionError | None = None
-    held_out_apart: PredictionError | None = None
+    systematic: Array | None = None
+    systematic_apart: Array | None = None
     friction_change: Array | None = None
-    slow: Repeatability | None = None
     noise_floor: Array | None = None
-    estimation_noise: Array | None = None
     disagreement: Array | None = None
     causes: Causes | None = None
     gravity: GravityDirection | None = None
@@ -377,10 +315,9 @@ class Evidence:
     nominal: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE
     residuals: ResidualChecks | None = None
-    coupling: CouplingIndex | None = None
+    coupling: tuple[float, float] | None = None
     surroundings: Surroundings = Surroundings()
     prismatic: tuple[int, ...] = ()
-    tested_on: str = "unseen motion"
     in_sample: bool = False
 
     def revolute(self, joint: int) -> bool:
@@ -388,50 +325,12 @@ class Evidence:
         return joint not in self.prismatic
 
     @property
-    def systematic(self) -> Array | None:
-        """Slow error on unseen motion that no noise explains, as a share of the torque (n,).
-
-        Explained are the torque noise and, up to two standard deviations, what it has done to
-        the parameters. NaN for a joint that was not tested.
-        """
-        return self._beyond_noise(self.held_out_slow)
-
-    def spoilt_by_friction(self, limit: float) -> NDArray[np.bool_]:
-        """Joints (n,) whose systematic error is beyond a limit, and only by change of friction."""
-        share = self.systematic
-        if share is None:
-            return np.zeros(len(self.held_out.rows), dtype=np.bool_)
-        return np.asarray((np.nan_to_num(share) > limit) & ~self.beyond_friction(limit))
-
-    def beyond_friction(self, limit: float) -> NDArray[np.bool_]:
-        """Joints (n,) whose systematic error is beyond a limit whatever friction did."""
-        share = self._beyond_noise(self.held_out_apart)
-        if share is None:
-            share = self.systematic
-        if share is None:
-            return np.zeros(len(self.held_out.rows), dtype=np.bool_)
-        return np.asarray(np.nan_to_num(share) > limit)
-
-    def _beyond_noise(self, slow_error: PredictionError | None) -> Array | None:
-        if slow_error is None or self.slow is None or self.estimation_noise is None:
-            return None
-        explained = self.slow.noise**2 + (2.0 * self.estimation_noise) ** 2
-        excess = np.maximum(slow_error.rms**2 - explained, 0.0)
-        tested = self.held_out.rows > 0
-        return np.where(
-            tested,
-            np.sqrt(excess) / np.where(tested, self.held_out.torque_rms, 1),
-            np.nan,
-        )
-
-    @property
     def floor(self) -> float | None:
         """Noise floor over all axes, as a share of the held-out torque; None if not measured."""
         if self.noise_floor is None:
             return None
-        error = self.held_out
-        power = float(error.torque_squared.sum())
-        noise = float((np.nan_to_num(self.noise_floor) ** 2 * error.rows).sum())
+        power = float(self.held_out.torque_squared.sum())
+        noise = float((np.nan_to_num(self.noise_floor) ** 2 * self.held_out.rows).sum())
         return float(np.sqrt(noise / power)) if power > 0.0 else None
 
     @property
@@ -459,9 +358,9 @@ def gather(
         model: the robot.
         result: from the training recordings.
         training: as many recordings as the result has.
+        held_out: motions that were not used for fitting.
         same_motion: whether these are repetitions of one motion; only then can what repeats be
             distinguished from noise.
-        held_out: motions that were not used for fitting.
         nominal: parameters (p,) of the nominal model.
         surroundings: what is known of the cell beside its model.
         in_sample: whether the held-out motions are those of the training after all.
@@ -473,38 +372,24 @@ def gather(
     if not held_out:
         raise IdentificationError("there is no motion left that was not used for fitting")
     values = result.pooled.values
-    repeated = same_motion and len(result.repetitions) > 1
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])
+    postures = position[:: max(1, len(position) // _POSTURES)]
     unseen = total([Factor.of(model, run) for run in held_out])
     error = over_all(prediction_error(model, values, held_out))
-    grams = [StandardGram.of(model, some[:_MOST_RECORDINGS]) for some in (training, held_out)]
-    carried = find_load(model, *grams)
-    if carried.explained > Thresholds().load:
-        few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
-        carried = weigh_load(model, few, unseen_few, carried)
-    steady = repeatability(model, values, training, SLOW) if repeated else None
-    slow_errors = [slow_error(model, values, run, SLOW) for run in held_out if repeated]
-    change = None  # of each joint the largest
-    if slow_errors:
-        changes = np.array([one.friction_change for one in slow_errors])
-        change = np.take_along_axis(changes, np.abs(changes).argmax(axis=0)[None], axis=0)[0]
+    few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
+    grams = StandardGram.of(model, few), StandardGram.of(model, unseen_few)
+    repeated = same_motion and len(result.repetitions) > 1
+    noise = repetition_noise(model, values, training, SLOW) if repeated else None
     gram = information(result.factor)
-    postures = position[:: max(1, len(position) // _POSTURES)]
-    return Evidence(
+    evidence = Evidence(
         estimate=result.pooled,
         held_out=error,
         training=over_all(prediction_error(model, values, training)),
-        held_out_slow=over_all(one.error for one in slow_errors) if repeated else None,
-        held_out_apart=over_all(one.apart for one in slow_errors) if repeated else None,
-        friction_change=change,
-        slow=steady,
-        noise_floor=_noise_floor(model, values, training[:_MOST_RECORDINGS], SLOW, steady),
-        estimation_noise=_estimation_noise(result, unseen) if repeated else None,
-        disagreement=_disagreement(result) if repeated else None,
+        noise_floor=_noise_floor(model, values, few, noise),
         causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
-        load=carried,
+        load=find_load(model, few, unseen_few, *grams),
         loaded=gravity_loads(model, postures),
         nominal=None if nominal is None else over_all(prediction_error(model, nominal, held_out)),
         implausible=implausibilities(
@@ -523,19 +408,35 @@ def gather(
             same_motion=same_motion,
             motor_from_joint=surroundings.motor_from_joint,
         ),
-        coupling=CouplingIndex(float(coupling_index(gram)), coupling_index_max(len(gram))),
+        coupling=(float(coupling_index(gram)), coupling_index_max(len(gram))),
         surroundings=surroundings,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
     )
+    if noise is None:
+        return evidence
+    slow = [slow_error(model, values, run, SLOW) for run in held_out]
+    changes = np.array([one.friction_change for one in slow])
+    largest = np.abs(changes).argmax(axis=0)[None]
+    # Up to two deviations of what torque noise has done to the parameters are no error.
+    explained = noise**2 + (2.0 * _estimation_noise(result, unseen)) ** 2
+    tested = error.rows > 0
+
+    def beyond_noise(errors: Iterable[PredictionError]) -> Array:
+        excess = np.sqrt(np.maximum(over_all(errors).rms ** 2 - explained, 0.0))
+        return np.where(tested, excess / np.where(tested, error.torque_rms, 1.0), np.nan)
+
+    return replace(
+        evidence,
+        systematic=beyond_noise(one.error for one in slow),
+        systematic_apart=beyond_noise(one.apart for one in slow),
+        friction_change=np.take_along_axis(changes, largest, axis=0)[0],
+        disagreement=_disagreement(result),
+    )
 
 
 def _noise_floor(
-    model: RobotModel,
-    values: Array,
-    recordings: Sequence[Samples],
-    bandwidth: float,
-    steady: Repeatability | None,
+    model: RobotModel, values: Array, recordings: Sequence[Samples], repeated: Array | None
 ) -> Array | None:
     """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows.
 
@@ -543,17 +444,17 @@ def _noise_floor(
     repetitions below it. None where a low-pass has left no noise to measure.
     """
     first = recordings[0]
-    if steady is None and noiseless_above(first.motion.time, first.torque, first.segments):
+    if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
         return None
     squares, rows = np.zeros((2, model.n_joints))
     for samples in recordings:
-        fast = residual(model, values, samples) - residual(model, values, samples, bandwidth)
+        fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
         nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
-        share = max(1.0 - bandwidth / nyquist, 0.5)  # of white noise that is above
+        share = max(1.0 - SLOW / nyquist, 0.5)  # of white noise that is above
         squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
         rows += np.count_nonzero(samples.usable, axis=0)
     white = squares / np.where(rows > 0.0, rows, np.nan)
-    return np.sqrt(white if steady is None else white + np.nan_to_num(steady.noise) ** 2)
+    return np.sqrt(white if repeated is None else white + np.nan_to_num(repeated) ** 2)
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:
@@ -565,10 +466,9 @@ def _disagreement(result: RepeatedEstimate) -> Array:
 
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
-    """Standard deviation of the pooled estimate's predictions, by the scatter of R estimates."""
-    repetitions = len(result.repetitions)
+    """Standard deviation (n,) of the pooled estimate's predictions, by the scatter of estimates."""
     values = np.array([one.values for one in result.repetitions])
-    differences = values - values.mean(axis=0)
+    differences, count = values - values.mean(axis=0), len(values)
     torque = np.einsum("ri,jik,rk->j", differences, held_out.gram[:, :-1, :-1], differences)
-    variance = torque / (repetitions * (repetitions - 1)) / np.maximum(held_out.samples, 1)
+    variance = torque / (count * (count - 1)) / np.maximum(held_out.samples, 1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -1,4 +1,4 @@
-"""One thing that was checked, what came out, and what to do about it."""
+"""One check of a verdict and what came out; the limits that a good result keeps to."""
 
 from __future__ import annotations
 
@@ -37,9 +37,6 @@ def joined(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
-# What a good result keeps to.
-
-
 @dataclass(frozen=True)
 class Thresholds:
     """What a good result keeps to. Shares are of the axis's measured torque, both as RMS.
@@ -49,40 +46,34 @@ class Thresholds:
     campaigns without a fault, unmodelled effects off and on.
 
     Attributes:
-        overall: relative torque error over all axes. Fits of real arms that people publish with
-            pride lie between 4 and 9 %.
+        overall: relative torque error over all axes. Published fits of real arms: 4 to 9 %.
         axis: relative torque error of one axis, noise included. Wrist axes of real arms, whose
-            torque is mostly friction, reach 20 %; 35 % is not a model of an axis.
-        explained: share of an axis's torque variance that must be explained (R²). A model that
-            does not beat the mean torque of the axis has learned nothing about it.
-        little_explained: share below which an axis is doubtful: half of what varies is missed.
+            torque is mostly friction, reach 20 %.
+        explained: share of an axis's torque variance (R²) that must be explained: a model that
+            does not beat the mean torque has learned nothing about the axis.
+        little_explained: share below which an axis is doubtful.
         systematic: slow error of one axis that neither noise nor a change of friction explains.
             Right models: below 0.1 % without, 1.9 % with ripple, drifting friction, elasticity
             and delay. One turned sign: 4.2 % and more on some axis.
+        noticeable: the same, worth a word. Torque constants of wrist axes that are wrong by 30 %
+            show as 1 to 3 %.
         cause: error of predicted blocks of the fit with a fault mended, over that as it is, below
-            which the fault is a reason to say no; above, it is doubtful, but for signs and orders,
-            which are right or wrong. See :mod:`identification.validation.causes`.
+            which the fault is a reason to say no; signs and orders always are.
         unexplained: error over all axes that may stay without a cause however small the noise is,
             and
         multiple: of the noise floor up to which an error may be larger than that.
-        inconsistency: difference between the torque that one repetition's own estimate and the
-            pooled one predict on the training motion, as a share of the torque. Noise of the
-            size that `axis` allows makes 2 %.
+        inconsistency: difference of torque between one repetition's own estimate and the pooled
+            one. Noise of the size that `axis` allows makes 2 %.
         friction: change of friction between training and unseen motion that is worth a word. Up
             to 10 % are forgiven before `systematic` is looked at; a larger change is a reason to
             say no where it alone takes an axis beyond `systematic`.
         drift: change of an axis's friction in the course of the recordings, as a share of its
-            torque, that is worth more than being mentioned.
-        generalisation: error on unseen motion over the error on the training motion, per axis:
-            what is above is doubtful, and where the axis also misses by more than half of `axis`
-            it is not good.
-        nominal: by how much the overall error may exceed the nominal model's, or that of the
-            controller's own. A model that predicts worse is not worth using.
-        rows: samples of unseen motion that an axis must have moved for; with fewer it was not
-            tested.
-        noticeable: systematic error that is worth a word: what right models with ripple, drifting
-            friction, elasticity and delay reach. Torque constants of wrist axes that are wrong by
-            30 % show as 1 to 3 %, of which the smaller half cannot be distinguished from those.
+            torque, that is more than information.
+        generalisation: error on unseen motion over that on the training motion, per axis: above,
+            it is doubtful, and wrong where the axis also misses by more than half of `axis`.
+        nominal: by how much the overall error may exceed that of the nominal model, or of the
+            controller's own.
+        rows: samples of unseen motion that an axis must have moved for.
         gravity: squared error on unseen motion with gravity pulling the way that fits best, over
             that as declared, and
         gravity_angle: degrees between the two, to call gravity wrong. NS 16: 0.06 at most with
@@ -90,25 +81,21 @@ class Thresholds:
         load: share of what the error on unseen motion exceeds that of the fit by that a body on
             the last link must explain. A body that was there: 0.99 and more. Friction, turned
             axes, wrong constants: 0.7 at most.
-        outliers: share of an axis's samples up to which those far outside are single ones; more
-            are a property of the residual.
+        outliers: share of an axis's samples up to which those far outside are single ones.
         outlying_power: share of the squared residual they must make. Planted spikes: more than
             0.9. The heavy tails of a sound recording (UR10, its last wrist axis): 0.5.
         pattern: share of the torque that a pattern of the residual (over speed, position or
-            motor angle) must make, besides exceeding the noise, to be worth a word.
-        ripple: torque ripple, as a share of the axis's torque, that is worth more than being
-            mentioned. Healthy drives have 1 to 2 %.
-        pattern_of_residual: share of the residual's RMS that it must make as well: what is a
-            tenth of the error's power or less is not what to mend first.
+            motor angle) must make, besides exceeding the noise, to be worth a word, and
+        pattern_of_residual: share of the residual: a tenth of its power is not what to mend first.
+        ripple: torque ripple that is more than information. Healthy drives have 1 to 2 %.
         rows_per_parameter: independent samples per parameter below which a record is short, the
             usual rule of thumb of regression.
         saturated: share of an axis's samples at the limit that is worth a word.
         delay: difference between the delay found and the one assumed [cycles of the clock] that
             is worth a word, if three standard errors leave it as well. The estimate is good to
             0.2 cycles in closed loop; half a cycle changes the torque by less than 0.3 %.
-        condition: condition number of the regressor, weighted, with columns of unit length, above
-            which parameters are known only in combination. Designed motions of the NS 16 have
-            about 30; beyond 100 errors of 1 % in the data may become 100 % in a parameter.
+        condition: condition number of the weighted regressor with columns of unit length, above
+            which parameters are known only in combination. Designed motions of the NS 16: 30.
     """
 
     overall: float = 0.12
@@ -116,24 +103,24 @@ class Thresholds:
     explained: float = 0.0
     little_explained: float = 0.5
     systematic: float = 0.03
+    noticeable: float = 0.02
     cause: float = 0.7
     unexplained: float = 0.06
     multiple: float = 5.0
     inconsistency: float = 0.10
     friction: float = 0.03
+    drift: float = 0.03
     generalisation: float = 2.5
     nominal: float = 0.005
     rows: int = 100
-    noticeable: float = 0.02
     gravity: float = 0.5
     gravity_angle: float = 1.0
     load: float = 0.8
     outliers: float = 0.05
     outlying_power: float = 0.8
-    drift: float = 0.03
-    ripple: float = 0.03
     pattern: float = 0.005
     pattern_of_residual: float = 0.3
+    ripple: float = 0.03
     rows_per_parameter: float = 10.0
     saturated: float = 0.001
     delay: float = 0.6

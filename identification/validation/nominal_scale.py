@@ -9,7 +9,6 @@ of per cent, and so are rotor inertias of which nobody knows.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,9 +19,9 @@ from identification.errors import IdentificationError
 from identification.estimators.prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
+from identification.validation.plausibility import inertia_matrices
 
 Array = NDArray[np.float64]
-
 
 _BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the standard deviation
 # What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
@@ -36,8 +35,7 @@ _SURE: Final = 2.0  # standard deviations
 _OTHER_UNIT: Final = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class NominalScale:
+class NominalScale(NamedTuple):
     """Measured over nominal torque, n axes.
 
     Attributes:
@@ -50,13 +48,11 @@ class NominalScale:
     tolerance: Array
 
     @property
-    def off(self) -> NDArray[np.intp]:
-        """Axes whose scale is a wonder."""
+    def off(self) -> NDArray[np.bool_]:
+        """Whether the scale of each axis is a wonder (n,)."""
         # Of a factor that may as well be zero, the nominal torque is not part of what was measured.
         known = (self.tolerance < _WIDEST) & (np.abs(self.scale) > self.tolerance)
-        return np.flatnonzero(
-            known & (np.abs(np.where(known, self.scale, 1.0) - 1.0) > self.tolerance)
-        )
+        return known & (np.abs(self.scale - 1.0) > self.tolerance)
 
     @property
     def common(self) -> float:
@@ -86,7 +82,7 @@ class NominalScale:
         """The same with nothing said of some axes."""
         scale = self.scale.copy()
         scale[sorted(set(joints))] = np.nan
-        return NominalScale(scale, self.tolerance)
+        return self._replace(scale=scale)
 
 
 def nominal_scale(
@@ -111,33 +107,23 @@ def nominal_scale(
     """
     if not runs:
         raise IdentificationError("there is no recording to compare with the nominal model")
-    rank = model.base.rank
-    scale, tolerance = np.full(model.n_joints, np.nan), np.full(model.n_joints, np.inf)
-    regressors = [run.regressor(model) for run in runs]
+    found, regressors = [], [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
-        columns = regressors[0].columns[joint]
-        inertial = columns < rank
+        columns, turning = regressors[0].columns[joint], [joint]
+        inertial = columns < model.base.rank
+        if model.coupling is not None:  # coupled motors feel other joints' accelerations, too
+            turns = model.coupling.motor_from_joint
+            turning = sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
         tables, torques = [], []
         for run, (blocks, _) in zip(runs, regressors, strict=True):
             rows, block = run.usable[:, joint], blocks[joint]
             table = [block[:, inertial] @ nominal[columns[inertial]], block[:, ~inertial]]
             if not rotors_known:
-                turning = run.motion.acceleration[:, _turning(model, joint)]
-                table.append(run.as_measured(joint, turning))
+                table.append(run.as_measured(joint, run.motion.acceleration[:, turning]))
             tables.append(np.column_stack(table)[rows])
             torques.append(run.torque[rows, joint])
-        scale[joint], tolerance[joint] = _scale(
-            np.concatenate(tables), np.concatenate(torques), share
-        )
-    return NominalScale(scale, tolerance)
-
-
-def _turning(model: RobotModel, joint: int) -> list[int]:
-    """Joints whose acceleration the motors of a joint feel: its own, and coupled ones."""
-    if model.coupling is None:
-        return [joint]
-    turns = model.coupling.motor_from_joint
-    return sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
+        found.append(_scale(np.concatenate(tables), np.concatenate(torques), share))
+    return NominalScale(*np.array(found).T)
 
 
 def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
@@ -154,17 +140,11 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
         return np.nan, np.inf
     scale = float(alone @ torque) / power
     friction = basis @ (basis.T @ (torque - scale * rigid))
-    left = torque - scale * rigid - friction
-    scores = [
-        float(part @ rest)
-        for part, rest in zip(
-            np.array_split(alone, _BLOCKS), np.array_split(left, _BLOCKS), strict=True
-        )
-    ]
-    std = np.sqrt(np.sum(np.square(scores)) * _BLOCKS / (_BLOCKS - 1)) / power
-    size_alone = np.sqrt(power)
-    lost = (np.linalg.norm(rigid) / size_alone) ** 2 - 1.0
-    misfit = _FRICTION_SHARE * np.linalg.norm(friction) / size_alone
+    left = np.array_split(alone * (torque - scale * rigid - friction), _BLOCKS)
+    scatter = np.square([part.sum() for part in left]).sum()
+    std = np.sqrt(scatter * _BLOCKS / (_BLOCKS - 1)) / power
+    lost = float(rigid @ rigid) / power - 1.0
+    misfit = _FRICTION_SHARE * np.linalg.norm(friction) / np.sqrt(power)
     wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
     tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
     # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
@@ -185,25 +165,6 @@ class InertiaRatio(NamedTuple):
     spread: Array
 
 
-def diagonal_inertia(model: RobotModel, values: Array, position: Array) -> Array:
-    """Diagonal of the inertia matrix, rotors included, at positions (m, n): (m, n) [kg·m² or kg].
-
-    From the base parameters (p,): the torque that one joint's acceleration alone takes, which is
-    the same for all standard parameters behind them.
-    """
-    n = model.n_joints
-    rigid = values.copy()
-    rigid[model.base.rank :] = 0.0
-    still = np.zeros_like(position)
-    rest = model.torque(rigid, position, still, still)
-    result = np.empty_like(position)
-    for joint in range(n):
-        acceleration = still.copy()
-        acceleration[:, joint] = 1.0
-        result[:, joint] = (model.torque(rigid, position, still, acceleration) - rest)[:, joint]
-    return result
-
-
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
@@ -220,11 +181,11 @@ def inertia_ratio(
     """
     if not np.any(theirs):
         return None
-    ours = diagonal_inertia(model, values, position)
+    ours = np.diagonal(inertia_matrices(model, values, position), axis1=1, axis2=2)
     known = (ours > 0.0) & (theirs > 0.0)
     ratio = np.where(known, theirs, np.nan) / np.where(known, ours, 1.0)
     whole = known.mean(axis=0) > 0.9
-    median, spread = np.full(model.n_joints, np.nan), np.full(model.n_joints, np.nan)
+    median, spread = np.full((2, model.n_joints), np.nan)
     median[whole] = np.nanmedian(ratio[:, whole], axis=0)
     spread[whole] = np.nanstd(ratio[:, whole], axis=0)
     return InertiaRatio(median, spread)

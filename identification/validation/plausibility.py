@@ -1,14 +1,15 @@
 """Whether estimated parameters can belong to a machine at all.
 
 Signs that nature does not make: friction that drives, negative masses, an arm that could be
-accelerated at a gain of energy. Each is asked for with the estimate's own uncertainty, so that
+accelerated at a gain of energy. Each is judged with the estimate's own uncertainty, so that
 a parameter that is merely not known is no offence.
 """
 
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,11 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
-# More standard deviations for what was searched for among many directions and postures.
-_SEARCHED = 2.0
-
+_SIGMAS: Final = 3.0  # standard deviations beyond which a wrong sign counts
+# More of them for what was searched for among many directions and postures.
+_SEARCHED: Final = 2.0
 # Never negative, whatever the axes: masses, rotor inertias, moments of inertia about an axis.
-_NEVER_NEGATIVE = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
+_NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
 
 class Implausible(NamedTuple):
@@ -38,11 +39,6 @@ class Implausible(NamedTuple):
     doubtful: tuple[str, ...]
 
 
-class _Offence(NamedTuple):
-    words: str
-    torque: Array  # (n,) RMS torque of the offending terms
-
-
 def implausibilities(
     model: RobotModel,
     estimate: Estimate,
@@ -51,7 +47,6 @@ def implausibilities(
     *,
     position: Array,
     speed: Array,
-    sigmas: float = 3.0,
 ) -> Implausible:
     """Say in words what about an estimate is physically impossible.
 
@@ -62,25 +57,19 @@ def implausibilities(
         error_rms: of those predictions (n,).
         position: postures to look at the inertia matrix in (k, n).
         speed: highest measured speed per joint (n,): friction is looked at up to there.
-        sigmas: standard deviations beyond which a wrong sign counts.
     """
-    offences = [
-        *_friction(model, estimate, motion, speed, sigmas),
-        *_inertial(model, estimate, motion, sigmas),
-    ]
-    matters = [bool(np.any(offence.torque > error_rms)) for offence in offences]
-    return Implausible(
-        impossible=(
-            *(o.words for o, serious in zip(offences, matters, strict=True) if serious),
-            *_inertia_matrix(model, estimate, position, sigmas),
-        ),
-        doubtful=tuple(
-            o.words for o, serious in zip(offences, matters, strict=True) if not serious
-        ),
-    )
+    impossible: list[str] = []
+    doubtful: list[str] = []
+    for words, part in _offences(model, estimate, speed):
+        own = np.where(part, estimate.values, 0.0)
+        squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
+        torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
+        (impossible if np.any(torque > error_rms) else doubtful).append(words)
+    impossible += _inertia_matrix(model, estimate, position)
+    return Implausible(tuple(impossible), tuple(doubtful))
 
 
-def _is_negative(estimate: Estimate, direction: Array, sigmas: float) -> bool:
+def _is_negative(estimate: Estimate, direction: Array, sigmas: float = _SIGMAS) -> bool:
     """Whether direction · parameters is below zero significantly."""
     known = np.isfinite(np.diag(estimate.covariance))
     if np.any(direction[~known]):
@@ -90,99 +79,67 @@ def _is_negative(estimate: Estimate, direction: Array, sigmas: float) -> bool:
     return float(direction @ estimate.values) < -sigmas * float(np.sqrt(variance))
 
 
-def _torque_rms(motion: Factor, values: Array) -> Array:
-    """RMS torque (n,) that parameter values (p,) make on a motion."""
-    squares = np.einsum("i,jik,k->j", values, motion.gram[:, :-1, :-1], values)
-    return np.asarray(np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1)))
-
-
-def _friction(
-    model: RobotModel, estimate: Estimate, motion: Factor, speed: Array, sigmas: float
-) -> list[_Offence]:
-    """Coulomb friction below zero, and friction at top speed below half of Coulomb's.
+def _offences(
+    model: RobotModel, estimate: Estimate, speed: Array
+) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Wrong signs in words, and the parameters (p,) whose torque they are.
 
     Friction may fall with speed (Stribeck) before it rises, by a quarter perhaps; at top speed
-    that is over, and less than half is a viscous coefficient with the wrong sign.
+    that is over, and less than half of Coulomb's is a viscous coefficient with the wrong sign.
     """
-    found = []
-    first = model.base.rank
+    values, first, count = estimate.values, model.base.rank, len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         one = speed[joint : joint + 1]
-        top, coulomb = np.zeros((2, len(estimate.values)))
+        top, coulomb = np.zeros((2, count))
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
-            if motor or owner != joint or not term.is_friction:
-                continue
-            top[k] = term.column(one, law.sign(one))[0]
-            coulomb[k] = isinstance(term, Coulomb)
-        torque = _torque_rms(motion, np.where(top != 0.0, estimate.values, 0.0))
-        if _is_negative(estimate, coulomb, sigmas):
+            if owner == joint and not motor and term.is_friction:
+                top[k] = term.column(one, law.sign(one))[0]
+                coulomb[k] = isinstance(term, Coulomb)
+        if _is_negative(estimate, coulomb):
             words = (
-                f"Coulomb friction of {name} is negative ({coulomb @ estimate.values:.3g}): a"
-                " torque or a direction has the wrong sign"
+                f"Coulomb friction of {name} is negative ({coulomb @ values:.3g}): a torque or a"
+                " direction has the wrong sign"
             )
-            found.append(_Offence(words, torque))
-        elif _is_negative(estimate, top - 0.5 * coulomb, sigmas):
+            yield words, top != 0.0
+        elif _is_negative(estimate, top - 0.5 * coulomb):
             words = (
-                f"friction of {name} is {top @ estimate.values:.3g} at its top speed of"
-                f" {speed[joint]:.3g}, less than half of its Coulomb friction"
-                f" {coulomb @ estimate.values:.3g}"
+                f"friction of {name} is {top @ values:.3g} at its top speed of {speed[joint]:.3g},"
+                f" less than half of its Coulomb friction {coulomb @ values:.3g}"
             )
-            found.append(_Offence(words, torque))
-    return found + _motor_friction(model, estimate, motion, sigmas)
+            yield words, top != 0.0
+    alone = {  # what a single parameter stands for
+        k: (
+            f"friction {term.name} of motor {term.owner + 1}",
+            "; a coupling ratio or a direction may have the wrong sign",
+        )
+        for k, term in enumerate(model.friction.terms, start=first)
+        if term.motor
+    }
+    for k, (name, row) in enumerate(zip(model.base.names, model.base.grouping, strict=True)):
+        if np.count_nonzero(row) <= 1 and _NEVER_NEGATIVE.fullmatch(name):
+            alone[k] = name, ""
+    for k, (name, why) in alone.items():
+        direction = np.arange(count) == k
+        if _is_negative(estimate, direction.astype(np.float64)):
+            figures = f"{values[k]:.3g} ± {estimate.std[k]:.2g} {estimate.units[k]}"
+            yield f"{name} is negative: {figures}{why}", direction
 
 
-def _motor_friction(
-    model: RobotModel, estimate: Estimate, motion: Factor, sigmas: float
-) -> list[_Offence]:
-    """Coulomb or viscous friction below zero of a motor that several joints turn."""
-    found = []
-    for k, term in enumerate(model.friction.terms, start=model.base.rank):
-        if not term.motor:
-            continue
-        direction = np.zeros(len(estimate.values))
-        direction[k] = 1.0
-        if _is_negative(estimate, direction, sigmas):
-            words = (
-                f"friction {term.name} of motor {term.owner + 1} is negative:"
-                f" {estimate.values[k]:.3g} ± {estimate.std[k]:.2g} {term.unit}; a coupling ratio"
-                " or a direction may have the wrong sign"
-            )
-            found.append(_Offence(words, _torque_rms(motion, direction * estimate.values)))
-    return found
-
-
-def _inertial(
-    model: RobotModel, estimate: Estimate, motion: Factor, sigmas: float
-) -> list[_Offence]:
-    """Base parameters that stand for one standard parameter alone and have its wrong sign."""
-    found = []
-    for index, row in enumerate(model.base.grouping):
-        name = model.base.names[index]
-        if np.count_nonzero(row) > 1 or not _NEVER_NEGATIVE.fullmatch(name):
-            continue
-        direction = np.zeros(len(estimate.values))
-        direction[index] = 1.0
-        if _is_negative(estimate, direction, sigmas):
-            words = (
-                f"{name} is negative: {estimate.values[index]:.3g} ± {estimate.std[index]:.2g}"
-                f" {estimate.units[index]}"
-            )
-            found.append(_Offence(words, _torque_rms(motion, direction * estimate.values)))
-    return found
-
-
-def _inertia_matrix(
-    model: RobotModel, estimate: Estimate, position: Array, sigmas: float
-) -> list[str]:
+def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> list[str]:
     """A posture in which the inertia matrix has a negative direction."""
-    columns = _inertia_columns(model, position)  # (k, n, n, p)
-    matrices = columns @ estimate.values
-    matrices = 0.5 * (matrices + matrices.transpose(0, 2, 1))
-    eigenvalues, vectors = np.linalg.eigh(matrices)
+    matrices = inertia_matrices(model, estimate.values, position)
+    eigenvalues, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
     worst = int(np.argmin(eigenvalues[:, 0]))
-    along = vectors[worst, :, 0]
-    direction = np.einsum("i,ijp,j->p", along, columns[worst], along)
-    if not _is_negative(estimate, direction, sigmas + _SEARCHED):
+    posture, along, still = (
+        position[worst][None],
+        vectors[worst, :, 0],
+        np.zeros((1, model.n_joints)),
+    )
+    moved, rest = (
+        model.regressor(posture, still, one).dense(model.n_parameters)[0]
+        for one in (along[None], still)
+    )
+    if not _is_negative(estimate, along @ (moved - rest), _SIGMAS + _SEARCHED):
         return []
     joint = model.joint_names[int(np.argmax(np.abs(along)))]
     return [
@@ -191,15 +148,16 @@ def _inertia_matrix(
     ]
 
 
-def _inertia_columns(model: RobotModel, position: Array) -> Array:
-    """Inertia matrix as a linear map of the parameters: (k, n, n, p)."""
-    k, n = position.shape
-    zero = np.zeros((k, n))
-    p = model.n_parameters
-    gravity = model.regressor(position, zero, zero).dense(p)
-    columns = np.empty((k, n, n, p))
-    for joint in range(n):
-        unit = zero.copy()
-        unit[:, joint] = 1.0
-        columns[:, :, joint] = model.regressor(position, zero, unit).dense(p) - gravity
-    return columns
+def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
+    """Inertia matrices (k, n, n), rotors included, of parameters (p,) at positions (k, n).
+
+    From the torque that one joint's acceleration alone takes, which is the same for all standard
+    parameters behind the base parameters.
+    """
+    still = np.zeros_like(position)
+    rest = model.torque(values, position, still, still)
+    columns = [
+        model.torque(values, position, still, still + axis) - rest
+        for axis in np.eye(model.n_joints)
+    ]
+    return np.stack(columns, axis=2)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from identification.signals.recording import GAP_STEPS, Recording
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.bool_]
 
 # Robust standard deviations that a step must depart by.
 _STANDS_OUT: Final = 15.0
@@ -34,6 +33,7 @@ _BESIDE: Final = 4  # steps to either side
 _SHOWS: Final = 5.0
 # Departures of whole steps of motion are sought to this share of one.
 _WHOLE: Final = 0.15
+_NORMAL: Final = 1.4826  # a standard deviation over the median of absolute ones
 
 
 @dataclass(frozen=True)
@@ -61,31 +61,32 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
             :func:`identification.signals.clock.true_times` decided on.
         name: by which the jumps say where they are.
     """
+    time, position = recording.time, recording.position
     parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
     if not parts:
         return []
-    pieces = [_departures(recording.time[part], recording.position[part]) for part in parts]
+    pieces = [_departures(time[part], position[part]) for part in parts]
     departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
-    steps = np.concatenate([np.diff(recording.time[part]) for part in parts])[:, None]
+    steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
     after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
     departure, shown = _without_clock(departure, speed, steps)
     size = np.abs(departure)
-    spread = 1.4826 * np.median(size, axis=0)
+    spread = _NORMAL * np.median(size, axis=0)
     usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
     least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
-    suspect = (size - 0.5 * change > least) & (
-        shown | ~_whole_steps(departure, speed * steps, least)
-    )
-    return [
-        PositionJump(
-            name,
-            recording.joint_names[joint],
-            float(recording.time[after[k]] - recording.time[0]),
-            float(departure[k, joint]),
-        )
-        for joint, k in np.argwhere(suspect.T)
-        if _lasts(departure[:, joint], k)
-    ]
+    # Missing or repeated rows make departures of whole steps of the motion.
+    one = speed * steps
+    count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
+    whole = np.abs(departure - count * one) < np.maximum(least, _WHOLE * np.abs(one))
+    suspect = (size - 0.5 * change > least) & (shown | ~whole)
+    found = []
+    for joint, k in np.argwhere(suspect.T):
+        around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
+        if np.abs(around.sum()) > 0.5 * size[k, joint]:  # or the steps beside it take it back
+            since = float(time[after[k]] - time[0])
+            jump = float(departure[k, joint])
+            found.append(PositionJump(name, recording.joint_names[joint], since, jump))
+    return found
 
 
 def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
@@ -104,7 +105,7 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
     return (speed - usual) * steps, usual, np.abs(after - before) * steps
 
 
-def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, Rows]:
+def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Departures (m, n) without the error of the time that the other joints show.
 
     Returns:
@@ -114,24 +115,12 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     # A joint at rest shows nothing: what does not depart is no measure of its noise.
     size = np.abs(departure)
     noise = np.array(
-        [1.4826 * np.median(some) if (some := d[d > 0.0]).size else np.inf for d in size.T]
+        [_NORMAL * np.median(some) if (some := one[one > 0.0]).size else np.inf for one in size.T]
     )
-    way, rate = departure / noise, speed / noise
+    off, rate = departure / noise, speed / noise
     weight = (rate**2).sum(axis=1, keepdims=True) - rate**2
-    # The others' error of the time, drawn to zero by as much as one step is likely.
-    error = ((rate * way).sum(axis=1, keepdims=True) - rate * way) / (weight + steps**-2)
+    # The others' error of the time, pulled to zero by as much as one step is likely.
+    error = ((rate * off).sum(axis=1, keepdims=True) - rate * off) / (weight + steps**-2)
     without = departure - speed * error
     less = np.where(np.abs(without) < size, without, departure)
     return less, weight * steps**2 > _SHOWS**2
-
-
-def _whole_steps(departure: Array, one: Array, least: Array) -> Rows:
-    """Where missing or repeated rows explain a departure (m, n) at the motion of `one` step."""
-    count = np.clip(np.rint(departure / np.where(one == 0.0, np.inf, one)), -1.0, GAP_STEPS)
-    return np.asarray(np.abs(departure - count * one) < np.maximum(least, _WHOLE * np.abs(one)))
-
-
-def _lasts(departure: Array, at: int) -> bool:
-    """Whether the steps that follow and precede do not take it back."""
-    around = departure[max(0, at - _BESIDE) : at + _BESIDE + 1]
-    return bool(np.abs(around.sum()) > 0.5 * np.abs(departure[at]))

@@ -56,15 +56,9 @@ class PredictionError:
         if measured.shape != predicted.shape:
             raise ShapeError("predicted", predicted.shape, f"{measured.shape}, as measured")
         counts = np.ones(measured.shape, dtype=np.bool_) if usable is None else usable
-        error = np.where(counts, measured - predicted, 0.0)
-        return cls(
-            rows=np.count_nonzero(counts, axis=0),
-            absolute=np.abs(error).sum(axis=0),
-            signed=error.sum(axis=0),
-            squared=(error**2).sum(axis=0),
-            torque_sum=np.where(counts, measured, 0.0).sum(axis=0),
-            torque_squared=(np.where(counts, measured, 0.0) ** 2).sum(axis=0),
-        )
+        error, torque = (np.where(counts, one, 0.0) for one in (measured - predicted, measured))
+        sums = (np.abs(error), error, error**2, torque, torque**2)
+        return cls(np.count_nonzero(counts, axis=0), *(one.sum(axis=0) for one in sums))
 
     def __add__(self, other: PredictionError) -> PredictionError:
         """Error over both sets of rows."""
@@ -95,17 +89,15 @@ class PredictionError:
     def relative(self) -> Array:
         """||e|| / ||tau|| of each joint (n,); NaN for a joint without a row or without torque."""
         known = (self.rows > 0) & (self.torque_squared > 0.0)
-        return np.where(
-            known, np.sqrt(self.squared / np.where(known, self.torque_squared, 1.0)), np.nan
-        )
+        share = self.squared / np.where(known, self.torque_squared, 1.0)
+        return np.where(known, np.sqrt(share), np.nan)
 
     @property
     def explained(self) -> Array:
         """Share of each joint's torque variance that the prediction explains (n,), R².
 
-        One less the squared error over that of the best constant, the mean torque of these very
-        rows: zero or less is no better than a constant. NaN for a joint without rows or whose
-        torque does not vary.
+        Zero or less is no better than a constant, the mean torque of these very rows. NaN for a
+        joint without rows or whose torque does not vary.
         """
         varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
         known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
@@ -121,13 +113,9 @@ class PredictionError:
 def residual(
     model: RobotModel, values: Array, samples: Samples, bandwidth: float | None = None
 ) -> Array:
-    """Torque measured less predicted (m, n), zero where a row is not usable.
+    """Torque measured less predicted (m, n) by parameters (p,), zero in rows that do not count.
 
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        samples: one recording.
-        bandwidth: of a zero-phase low-pass on the result [Hz]; None for none.
+    Then through a zero-phase low-pass of a bandwidth [Hz], if there is one.
     """
     return _usable_part(
         samples, samples.torque - samples.predicted_torque(model, values), bandwidth
@@ -135,7 +123,6 @@ def residual(
 
 
 def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Array:
-    """Torque (m, n) with zero for the rows that are not usable, then low-passed."""
     torque = np.where(samples.usable, torque, 0.0)
     if bandwidth is None:
         return torque
@@ -162,18 +149,11 @@ class SlowError(NamedTuple):
 
 
 def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
-    """Low-passed error of a prediction, apart from a change of friction since the fit.
+    """Error of parameters (p,) below a bandwidth [Hz], apart from a change of friction.
 
     Friction follows the temperature of the gears: between training and validation it may differ
     by some per cent without anything being wrong with the model. Each joint's whole friction
-    torque may therefore be scaled, by one number within `FRICTION_CHANGE`, before the error is
-    computed.
-
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        samples: one run.
-        bandwidth: of the low-pass [Hz].
+    torque may therefore be scaled, by one number within `FRICTION_CHANGE`.
     """
     error = residual(model, values, samples, bandwidth)
     friction = samples.predicted_torque(model, np.where(model.friction_columns, values, 0.0))
@@ -191,12 +171,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
 
 
 def prediction_error(
-    model: RobotModel,
-    values: Array,
-    runs: Iterable[Samples],
-    *,
-    bandwidth: float | None = None,
-    all_rows: bool = False,
+    model: RobotModel, values: Array, runs: Iterable[Samples], *, all_rows: bool = False
 ) -> tuple[PredictionError, ...]:
     """Prediction error of parameters (p,) on each of several runs.
 
@@ -204,17 +179,12 @@ def prediction_error(
         model: the robot.
         values: parameters (p,).
         runs: motions that were not used to estimate the values, if the error is to mean much.
-        bandwidth: of a low-pass on the error [Hz], but not on the torque it is related to.
         all_rows: count rows at standstill and near ends as well, where no model of sliding
-            friction can be right; without `bandwidth` only.
+            friction can be right.
     """
-    if all_rows:
-        return tuple(
-            PredictionError.between(run.torque, run.predicted_torque(model, values)) for run in runs
-        )
     return tuple(
         PredictionError.between(
-            run.torque, run.torque - residual(model, values, run, bandwidth), run.usable
+            run.torque, run.predicted_torque(model, values), None if all_rows else run.usable
         )
         for run in runs
     )
@@ -232,6 +202,6 @@ def over_all(runs: Iterable[PredictionError]) -> PredictionError:
     return sum(errors[1:], errors[0])
 
 
-def for_figure(time: Array, torque: Array, bandwidth: float = FIGURE_BANDWIDTH) -> Array:
-    """Torque (m, n) through a zero-phase low-pass, as the paper draws it (Fig. 4)."""
-    return low_pass(time, torque, bandwidth)
+def for_figure(time: Array, torque: Array) -> Array:
+    """Torque (m, n) through a zero-phase low-pass, as the paper shows it (Fig. 4)."""
+    return low_pass(time, torque, FIGURE_BANDWIDTH)

@@ -5,9 +5,8 @@ a long recording the smallest error is significant, and of a short one a large o
 
 What a torque model leaves over is correlated over tenths of a second: a thousand samples of one
 move say about as much as one number. Means are therefore judged by how much they differ from
-block to block of time, not from sample to sample (cluster-robust, Liang and Zeger 1986), which
-assumes nothing about what happens inside a block. Repetitions of one motion share their blocks:
-an error that repeats with the motion is not confirmed by being repeated.
+block to block of time (cluster-robust, Liang and Zeger 1986). Repetitions of one motion share
+their blocks: an error that repeats with the motion is not confirmed by being repeated.
 """
 
 from __future__ import annotations
@@ -41,13 +40,12 @@ CHANCE: Final = 0.001
 HARMONICS: Final = (1, 2, 3, 4, 6)
 # Of the worst of five: about one chance in a thousand, with an amplitude of two components.
 _SIGMAS: Final = 4.1
-# A trend through fewer points is none.
-FEWEST_PIECES: Final = 4
+_FEWEST_PIECES: Final = 4  # of a trend of friction
 # Pieces in all: fewer leave the trend's own scatter too uncertain.
 _PIECES: Final = 12
 # Median absolute deviations, as standard deviations of a normal distribution: beyond six lies one
 # sample of 500 million.
-BEYOND: Final = 6.0
+_BEYOND: Final = 6.0
 _NORMAL: Final = 1.4826
 # Longer than any move of an arm takes to forget the one before.
 LONGEST_LAG: Final = 0.5  # s
@@ -97,8 +95,7 @@ def block_index(samples: Samples) -> Indices:
     return np.maximum(np.floor(since / BLOCK + 1e-9).astype(np.intp), 0)
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(NamedTuple):
     """Mean residual of n joints in K bins of their own speed or position.
 
     Attributes:
@@ -150,32 +147,30 @@ class Profile:
         return np.abs(np.nan_to_num(self.bins.mean)) / np.where(std > 0.0, std, np.inf)
 
 
-def _profile_edges(runs: Sequence[Array], usable: Sequence[Rows]) -> Array:
-    """Edges (n, `BINS` + 1) of equal bins over what each joint did in the rows that count."""
-    values, rows = np.concatenate(runs), np.concatenate(usable)
+def _profile(
+    runs: Sequence[Samples], left: Sequence[Array], over: Sequence[Array], repeated: int
+) -> Profile:
+    """Residuals (m, n) in equal bins over what each joint did, in the rows that count."""
+    values, rows = np.concatenate(over), np.concatenate([run.usable for run in runs])
     lowest = np.where(rows, values, np.inf).min(axis=0)
     highest = np.where(rows, values, -np.inf).max(axis=0)
     moved = np.isfinite(lowest) & (highest > lowest)
     lowest, highest = np.where(moved, lowest, 0.0), np.where(moved, highest, 1.0)
-    return np.asarray(np.linspace(lowest, highest, BINS + 1, axis=1))
+    edges, sums = np.linspace(lowest, highest, BINS + 1, axis=1), []
+    for run, residual, own in zip(runs, left, over, strict=True):
+        block = block_index(run)
+        found = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
+        for joint, usable in enumerate(run.usable.T):
+            bins = np.searchsorted(edges[joint, 1:-1], own[:, joint], side="right")
+            place = block * BINS + bins
+            for table, weights in zip(found, (residual[:, joint], usable), strict=True):
+                some = np.bincount(place, np.where(usable, weights, 0.0), len(table) * BINS)
+                table[:, joint] = some.reshape(-1, BINS)
+        sums.append(found)
+    return Profile(edges, block_mean(sums, repeated))
 
 
-def _profile_sums(samples: Samples, residual: Array, over: Array, edges: Array) -> Array:
-    """Sums of a residual (m, n) and of rows by block, joint and bin of `over`: (2, B, n, K)."""
-    block = block_index(samples)
-    n = residual.shape[1]
-    found = np.zeros((2, int(block[-1]) + 1, n, BINS))
-    for joint in range(n):
-        bins = np.searchsorted(edges[joint, 1:-1], over[:, joint], side="right")
-        place, rows = block * BINS + bins, samples.usable[:, joint]
-        for sums, values in zip(found, (residual[:, joint], np.ones(len(rows))), strict=True):
-            some = np.bincount(place, np.where(rows, values, 0.0), len(sums) * BINS)
-            sums[:, joint] = some.reshape(-1, BINS)
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class Ripple:
+class Ripple(NamedTuple):
     """Residual of n joints that follows the angle of their motors.
 
     Attributes:
@@ -212,23 +207,19 @@ def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> 
     The phase is that of the motor's angle about its zero joint angles; the same in every
     recording, as long as nobody takes the gear apart.
     """
-    block = block_index(samples)
-    count, n = int(block[-1]) + 1, residual.shape[1]
-    found = np.zeros((2, count, n, len(HARMONICS), 2))
-    motor = samples.motion.position @ motor_from_joint.T
-    for joint in range(n):
-        rows = samples.usable[:, joint]
-        left = residual[rows, joint]
+    block, motor = block_index(samples), samples.motion.position @ motor_from_joint.T
+    count = int(block[-1]) + 1
+    found = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
+    for joint, rows in enumerate(samples.usable.T):
         for h, harmonic in enumerate(HARMONICS):
             angle = harmonic * motor[rows, joint]
             for part, wave in enumerate((np.cos(angle), np.sin(angle))):
-                found[0, :, joint, h, part] = np.bincount(block[rows], left * wave, count)
-                found[1, :, joint, h, part] = np.bincount(block[rows], wave**2, count)
+                for table, one in zip(found, (residual[rows, joint], wave), strict=True):
+                    table[:, joint, h, part] = np.bincount(block[rows], one * wave, count)
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class FrictionDrift:
+class FrictionDrift(NamedTuple):
     """By how much friction was higher than estimated, piece by piece in the order of recording.
 
     Attributes:
@@ -250,66 +241,48 @@ class FrictionDrift:
         return np.asarray(np.abs(self.change) > limit * self.change_std)
 
 
-def _drift_sums(samples: Samples, residual: Array, friction: Array, pieces: int) -> Array:
-    """Friction (m, n) times residual, and squared, summed over equal parts (2, pieces, n)."""
-    edges = np.linspace(0, len(residual), pieces + 1).astype(np.intp)[:-1]
-    tables = np.where(samples.usable, [friction * residual, friction**2], 0.0)
-    return np.asarray(np.add.reduceat(tables, edges, axis=1))
-
-
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
     """Trend over all pieces in order; None where they are too few.
 
-    Of several recordings, equal parts are compared with each other: what the friction law gets
-    wrong in one part of a motion is no change of friction.
+    The line is common to all parts of a motion. Of several recordings its level is each part's own:
+    what the friction law gets wrong in one part of a motion is no change of friction.
+
+    Args:
+        sums: of each recording, of friction times residual and of friction squared (2, parts, n).
     """
-    if not sums:
+    if sum(one.shape[1] for one in sums) < _FEWEST_PIECES:
         return None
     product, power = np.concatenate(sums, axis=1)
-    if len(product) < FEWEST_PIECES:
-        return None
+    pieces, n = product.shape
     usual = np.median(power, axis=0)
-    moved = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
-    share = np.where(moved, product / np.where(moved, power, 1.0), np.nan)
-    parts = sums[0].shape[1] if len(sums) >= FEWEST_PIECES else 1
-    freedom = max(len(share) - parts - 1, 1)
-    trends = [
-        _trend(own, weight, parts, freedom) for own, weight in zip(share.T, power.T, strict=True)
-    ]
-    change, std = np.array(trends).T
+    known = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
+    share = np.where(known, product / np.where(known, power, 1.0), np.nan)
+    parts = sums[0].shape[1] if len(sums) >= _FEWEST_PIECES else 1
+    freedom = max(pieces - parts - 1, 1)
+    weight = np.where(known, power, 0.0)
+
+    def about_means(values: Array) -> Array:
+        """Values (P, n) less the weighted mean of their part over the recordings."""
+        table, own = values.reshape(-1, parts, n), weight.reshape(-1, parts, n)
+        total = own.sum(axis=0)
+        mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
+        return np.asarray((table - mean).reshape(-1, n))
+
+    at = about_means(np.repeat(np.linspace(-0.5, 0.5, pieces)[:, None], n, axis=1))
+    y = about_means(np.where(known, share, 0.0))
+    count = np.count_nonzero(known, axis=0)
+    spread = np.where(
+        count < _FEWEST_PIECES + parts - 1, np.nan, np.einsum("pn,pn->n", weight, at**2)
+    )
+    change = np.einsum("pn,pn,pn->n", weight, at, y) / spread
+    left = np.where(known, y - change * at, 0.0)
+    scale = count / np.maximum(freedom - (pieces - count), 1)
+    std = np.sqrt(((weight * at * left) ** 2).sum(axis=0) / spread**2 * scale)
     return FrictionDrift(share, change, std, freedom)
 
 
-def _trend(share: Array, weight: Array, parts: int, freedom: int) -> tuple[float, float]:
-    """Rise of a weighted straight line from the first to the last, and its standard error.
-
-    The line is common to all parts of a motion, its level is each part's own.
-    """
-    known = np.isfinite(share)
-    count = int(np.count_nonzero(known))
-    if count < FEWEST_PIECES + parts - 1:
-        return np.nan, np.nan
-    w = np.where(known, weight, 0.0)
-
-    def about_means(values: Array) -> Array:
-        """Values (R parts,) less the weighted mean of their part over the R recordings."""
-        table, own = values.reshape(-1, parts), w.reshape(-1, parts)
-        total = own.sum(axis=0)
-        mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
-        return np.asarray((table - mean).ravel())
-
-    at = about_means(np.linspace(-0.5, 0.5, len(share)))
-    y = about_means(np.where(known, share, 0.0))
-    spread = float(w @ at**2)
-    slope = float(w @ (at * y)) / spread
-    left = np.where(known, y - slope * at, 0.0)
-    scale = count / max(freedom - (len(share) - count), 1)
-    return slope, float(np.sqrt(np.sum((w * at * left) ** 2) / spread**2 * scale))
-
-
-@dataclass(frozen=True, eq=False)
-class Outliers:
-    """Samples of which the residual is beyond `BEYOND` robust deviations of its joint.
+class Outliers(NamedTuple):
+    """Samples of which the residual is beyond six robust deviations of its joint.
 
     Attributes:
         share: of the usable samples of each joint (n,).
@@ -328,7 +301,7 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
     for joint, rows in enumerate(usable.T):
         if rows.any():
             distance = np.abs(residual[:, joint] - np.median(residual[rows, joint]))
-            limit = BEYOND * _NORMAL * float(np.median(distance[rows]))
+            limit = _BEYOND * _NORMAL * float(np.median(distance[rows]))
             far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
     squares = np.where(usable, residual, 0.0) ** 2
     total = squares.sum(axis=0)
@@ -339,8 +312,7 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Autocorrelation:
+class Autocorrelation(NamedTuple):
     """Autocorrelation of the residual of n joints at L + 1 lags.
 
     Attributes:
@@ -457,47 +429,43 @@ def check_residuals(
         motor_from_joint: motor angle per joint angle (n, n); None where unknown.
 
     Raises:
-        IdentificationError: no recording.
+        IdentificationError: no recording was fitted.
     """
-    runs = [*training, *held_out]
-    if not runs:
+    if not training:
         raise IdentificationError("there is no residual to check: no recording is given")
-    fitted, usable = len(training), [run.usable for run in runs]
-    heat = np.where(model.friction_columns, values, 0.0)
-    speeds = _profile_edges([run.motion.velocity for run in runs], usable)
-    positions = _profile_edges([run.motion.position for run in runs], usable)
+    runs, fitted = [*training, *held_out], len(training)
     left = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
     ]
-    each = list(zip(runs, left, strict=True))
-    pieces = max(1, -(-_PIECES // max(fitted, 1)))
-    drift = [
-        _drift_sums(run, own, run.predicted_torque(model, heat), pieces)
-        for run, own in each[:fitted]
-    ]
     torque = np.array([(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0) for run in runs])
-    seen, friction = torque[:fitted].sum(axis=0), sum((one[1].sum(axis=0) for one in drift), 0.0)
-    rows = np.maximum(np.count_nonzero(np.concatenate(usable), axis=0), 1)
-    repeated = fitted if same_motion and fitted else 1
-    velocity = [_profile_sums(run, own, run.motion.velocity, speeds) for run, own in each]
-    posture = [_profile_sums(run, own, run.motion.position, positions) for run, own in each]
+    rows = np.maximum(sum(np.count_nonzero(run.usable, axis=0) for run in runs), 1)
+    repeated = fitted if same_motion else 1
+    heat, drift = np.where(model.friction_columns, values, 0.0), []
+    pieces = -(-_PIECES // fitted)
+    for run, own in zip(training, left, strict=False):
+        friction = run.predicted_torque(model, heat)
+        tables = np.where(run.usable, [friction * own, friction**2], 0.0)
+        edges = np.linspace(0, len(own), pieces + 1).astype(np.intp)[:-1]
+        drift.append(np.add.reduceat(tables, edges, axis=1))
     ripple = None
     if motor_from_joint is not None:
-        waves = [_ripple_sums(run, own, motor_from_joint) for run, own in each]
+        waves = [_ripple_sums(*one, motor_from_joint) for one in zip(runs, left, strict=True)]
         ripple = Ripple(block_mean(waves, repeated))
-    judged = slice(fitted, None) if held_out else slice(None)
-    steps = [np.median(np.diff(run.motion.time)) for run in training or runs]
+    friction_power, seen = sum(one[1].sum(axis=0) for one in drift), torque[:fitted].sum(axis=0)
+    judged = slice(fitted if held_out else 0, None)
+    usable = [run.usable for run in runs]
+    steps = [np.median(np.diff(run.motion.time)) for run in training]
     return ResidualChecks(
         torque_rms=np.sqrt(torque.sum(axis=0) / rows),
         rms=np.sqrt(sum((own**2).sum(axis=0) for own in left) / rows),
         colour=autocorrelation(
-            list(zip(left, usable, strict=True))[: fitted or None], float(np.median(steps))
+            list(zip(left[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
         ),
-        speed=Profile(speeds, block_mean(velocity, repeated)),
-        position=Profile(positions, block_mean(posture, repeated)),
+        speed=_profile(runs, left, [run.motion.velocity for run in runs], repeated),
+        position=_profile(runs, left, [run.motion.position for run in runs], repeated),
         ripple=ripple,
         drift=_friction_drift(drift),
-        friction_share=np.sqrt(friction / np.where(seen > 0.0, seen, 1.0)),
+        friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
         outliers=find_outliers(
             np.concatenate([run.torque for run in runs[judged]]),
             np.concatenate(left[judged]),

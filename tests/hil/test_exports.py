@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from hil.identify.exports import FILES, Exports, provenance_of
 from hil.results import Results, VerdictResult
-from identification.export.parameters import parameters_dict
+from identification.export.parameters import parameters_json
 from identification.export.urdf import not_in_urdf
 from identification.model.kinematics import chain_from_urdf
 
@@ -335,7 +335,8 @@ def test_every_field_of_results_json_is_explained(text: str) -> None:
 
 
 def test_every_field_of_parameters_json_is_explained(text: str, arm: IdentifiedArm) -> None:
-    content = parameters_dict(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
+    found = parameters_json(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
+    content = json.loads(found)
     assert set(content) <= named(text)
     assert set(content["parameters"][0]) <= named(text)
     assert set(content["standard"]) <= named(text)

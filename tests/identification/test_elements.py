@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from identification import Factor, RobotModel, consistent_estimate, estimate
 from identification.errors import ModelError
-from identification.export.parameters import parameters_dict
+from identification.export.parameters import parameters_json
 from identification.model.elements import (
     Anchors,
     Element,
@@ -253,7 +254,8 @@ class TestIdentifiedElements:
 
     def test_the_parameter_file_names_them(self, model: RobotModel, factor: Factor) -> None:
         free = estimate(model, factor)
-        content = parameters_dict(model, free, consistent=consistent_estimate(model, factor, free))
+        consistent = consistent_estimate(model, factor, free)
+        content = json.loads(parameters_json(model, free, consistent=consistent))
         assert [one["parameters"] for one in content["elements"]] == [["spring_1"], ["balancer_2"]]
         assert list(content["standard"]["elements"]) == ["spring_1", "balancer_2"]
         assert "springs and balancers" in content["standard"]["not_in_urdf"]

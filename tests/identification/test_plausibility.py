@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
@@ -13,7 +12,7 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.validation.plausibility import Implausible, _inertia_columns, implausibilities
+from identification.validation.plausibility import Implausible, implausibilities
 from tests.identification.two_link import sine_motion
 
 Array = NDArray[np.float64]
@@ -30,7 +29,13 @@ def model() -> RobotModel:
 def estimate(model: RobotModel) -> Estimate:
     standard = model.nominal.copy()
     standard[[10, 21]] = 0.4, 0.1  # rotors
-    values = np.concatenate([model.base.grouping @ standard, [4, 2, 1.5, 0.8, 0, 0]])
+    return estimate_of(
+        model, np.concatenate([model.base.grouping @ standard, [4, 2, 1.5, 0.8, 0, 0]])
+    )
+
+
+def estimate_of(model: RobotModel, values: Array) -> Estimate:
+    """Values that are known to one per cent."""
     return Estimate(
         names=model.parameter_names,
         units=model.units,
@@ -124,18 +129,6 @@ def test_nothing_is_said_about_parameters_the_data_do_not_determine(
     assert found(model, unknown) == Implausible((), ())
 
 
-def test_the_inertia_matrix_is_pinocchios(model: RobotModel, estimate: Estimate) -> None:
-    reference = pin.buildModelFromXML(URDF)
-    reference.armature = np.array([0.4, 0.1])
-    data = reference.createData()
-    position = a_motion().position[::200]
-    matrices = _inertia_columns(model, position) @ estimate.values
-    for q, matrix in zip(position, matrices, strict=True):
-        upper = np.triu(pin.crba(reference, data, q))
-        expected = upper + np.triu(upper, 1).T
-        np.testing.assert_allclose(matrix, expected, atol=1e-12)
-
-
 def test_a_coupled_motor_that_drives_is_named() -> None:
     coupled = RobotModel.from_urdf(
         URDF,
@@ -146,16 +139,7 @@ def test_a_coupled_motor_that_drives_is_named() -> None:
     standard[coupled.layout.rotors] = 0.4, 0.1
     friction = np.array([4.0, 2.0, 1.5, 0.8, 1.0, -1.0])
     values = np.concatenate([coupled.base.grouping @ standard, friction])
-    estimate = Estimate(
-        names=coupled.parameter_names,
-        units=coupled.units,
-        values=values,
-        covariance=np.diag((0.01 * np.maximum(np.abs(values), 0.1)) ** 2),
-        noise_std=np.ones(2),
-        samples=np.full(2, 1000),
-        method="",
-        condition=10.0,
-    )
+    estimate = estimate_of(coupled, values)
     (words,) = found(coupled, estimate).impossible
     assert words.startswith("friction f1_m2 of motor 2 is negative: -1")
     assert found(coupled, with_value(estimate, "f1_m2", 1.0)) == Implausible((), ())

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from identification import Recording
-from identification.validation.evidence import Surroundings
-from identification.validation.finding import Thresholds
-from identification.validation.findings import Case, jumps
 from identification.validation.position_jumps import position_jumps
+from tests.identification.test_verdict import finding_of
 
 
 def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:
@@ -36,8 +32,7 @@ def test_a_lasting_jump_is_named_with_its_joint_time_and_size(rate: float, size:
     assert (jump.recording, jump.joint) == ("log.mcap", "knee")
     assert jump.time == pytest.approx(one.time[at] - one.time[0])
     assert jump.size == pytest.approx(size, abs=2e-3)
-    evidence = SimpleNamespace(surroundings=Surroundings(jumps=(jump,)))
-    (finding,) = jumps(Case(("hip", "knee"), evidence, Thresholds()))
+    finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
     assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification.errors import IdentificationError
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.finding import Thresholds
-from identification.validation.findings import Case, over_motor_angle, over_time
+from identification.validation.finding import Finding, Thresholds
 from identification.validation.residuals import (
     FEWEST_BLOCKS,
     HARMONICS,
@@ -30,6 +28,7 @@ from identification.validation.residuals import (
     check_residuals,
     find_outliers,
 )
+from tests.identification.test_verdict import finding_of, judged
 from tests.identification.two_link import as_samples, sine_motion
 
 Array = NDArray[np.float64]
@@ -156,11 +155,6 @@ def test_one_recording_is_cut_so_that_drift_can_be_seen(model: RobotModel) -> No
     assert drift is not None and len(drift.share) >= 4
 
 
-def test_no_recording_is_an_error(model: RobotModel) -> None:
-    with pytest.raises(IdentificationError, match="no recording"):
-        check_residuals(model, values_of(model), [])
-
-
 def test_samples_of_white_noise_are_worth_what_they_are() -> None:
     rng = np.random.default_rng(1)
     residual = rng.standard_normal((20000, 3))
@@ -182,21 +176,17 @@ def test_the_memory_of_coloured_noise_is_that_of_theory(memory: float) -> None:
 @settings(max_examples=25, deadline=None)
 def test_the_autocorrelation_is_that_of_counting_pairs(rows: int, seed: int, runs: int) -> None:
     rng = np.random.default_rng(seed)
-    parts = [(rng.standard_normal((rows, 2)), rng.random((rows, 2)) > 0.3) for _ in range(runs)]
+    parts = [(rng.standard_normal((rows, 1)), rng.random((rows, 1)) > 0.3) for _ in range(runs)]
     found = autocorrelation(parts, STEP, longest=10 * STEP)
-    for joint in range(2):
-        covariance = []
-        for lag in range(11):
-            products = [
-                residual[t, joint] * residual[t + lag, joint]
-                for residual, usable in parts
-                for t in range(rows - lag)
-                if usable[t, joint] and usable[t + lag, joint]
-            ]
-            covariance.append(np.sum(products) / max(len(products), 1))
-        if covariance[0] > 0.0:
-            expected = np.array(covariance) / covariance[0]
-            np.testing.assert_allclose(found.correlation[:, joint], expected, atol=1e-9)
+    masked = [np.where(usable, left, np.nan)[:, 0] for left, usable in parts]
+    products = [
+        np.concatenate([one[: rows - lag] * one[lag:] for one in masked]) for lag in range(11)
+    ]
+    expected = [np.nansum(one) / max(1, np.isfinite(one).sum()) for one in products]
+    if expected[0] > 0.0:
+        np.testing.assert_allclose(
+            found.correlation[:, 0], np.array(expected) / expected[0], atol=1e-9
+        )
 
 
 def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not() -> None:
@@ -249,25 +239,12 @@ def test_noise_of_any_size_has_none() -> None:
 
 NAMES = ("shoulder", "elbow")
 LIMIT = Thresholds()
-TORQUE = np.array([10.0, 10.0])
 
 
-def evidence(ripple=None, drift=None, friction_share=1.0) -> SimpleNamespace:
-    checks = SimpleNamespace(
-        ripple=ripple,
-        drift=drift,
-        friction_share=friction_share,
-        rms=0.05 * TORQUE,
-        torque_rms=TORQUE,
-        share=lambda size: size / TORQUE,
-    )
-    return SimpleNamespace(residuals=checks)
-
-
-def ripple(share: float) -> Ripple:
-    """Of the elbow's torque, four times per motor turn."""
+def ripple(size: float) -> Ripple:
+    """Of the elbow [N·m], four times per motor turn."""
     mean = np.zeros((2, len(HARMONICS), 2))
-    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * share * TORQUE[1]
+    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
     std = np.full_like(mean, 1e-6)
     return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
 
@@ -278,47 +255,53 @@ def drift(*change: float) -> FrictionDrift:
     return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
 
 
-@pytest.mark.parametrize("look", [over_motor_angle, over_time])
-def test_what_was_not_looked_at_is_not_spoken_of(look):
-    assert list(look(Case(NAMES, evidence(), LIMIT))) == []
-    assert list(look(Case(NAMES, SimpleNamespace(residuals=None), LIMIT))) == []
+@pytest.fixture(scope="module")
+def sound(model: RobotModel) -> ResidualChecks:
+    return replace(checked(model), ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
-class TestRipple:
-    def found(self, share: float):
-        [finding] = over_motor_angle(Case(NAMES, evidence(ripple(share)), LIMIT))
-        return finding
+class TestPatterns:
+    """What a verdict says of them."""
 
-    def test_none_is_good(self):
-        assert self.found(0.0).level == "good"
+    def found(self, sound: ResidualChecks, check: str, **changes: object) -> Finding:
+        return finding_of(check, NAMES, residuals=replace(sound, **changes))
 
-    def test_a_small_one_is_usual_and_a_large_one_a_doubt(self):
-        assert self.found(0.9 * LIMIT.ripple).level == "information"
-        large = self.found(1.1 * LIMIT.ripple)
-        assert large.level == "doubtful"
-        assert "elbow (4 per motor turn, 3.3% of its torque)" in large.words
-        assert "shoulder" not in large.words
+    def test_what_was_not_looked_at_is_not_spoken_of(self, sound: ResidualChecks) -> None:
+        checks = {one.check for one in judged(NAMES, residuals=sound).findings}
+        assert "whiteness" in checks and not {"torque ripple", "friction over time"} & checks
 
+    @pytest.mark.parametrize(
+        ("share", "level"),
+        [(0.0, "good"), (0.9 * LIMIT.ripple, "information"), (1.1 * LIMIT.ripple, "doubtful")],
+    )
+    def test_ripple_beyond_that_of_sound_drives_is_doubtful(
+        self, sound: ResidualChecks, share: float, level: str
+    ) -> None:
+        found = self.found(sound, "torque ripple", ripple=ripple(share * sound.torque_rms[1]))
+        assert found.level == level and "shoulder" not in found.words
+        expected = f"elbow (4 per motor turn, {share:.1%} of its torque)"
+        assert (expected in found.words) == (level != "good")
 
-class TestDrift:
-    def found(self, *change: float, share=1.0):
-        [finding] = over_time(
-            Case(NAMES, evidence(drift=drift(*change), friction_share=share), LIMIT)
+    @pytest.mark.parametrize(
+        ("change", "share", "level", "words"),
+        [
+            ((1e-5, -1e-5), 1.0, "good", "no change of friction"),
+            ((0.02, 0.0), 1.0, "information", "shoulder by +2.0%; that is at most 2.0% of an axis"),
+            ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
+            ((0.02, -0.2), 1.0, "doubtful", "recordings were made: elbow by -20.0%"),
+        ],
+    )
+    def test_drift_matters_as_far_as_it_makes_torque(
+        self,
+        sound: ResidualChecks,
+        change: tuple[float, float],
+        share: float,
+        level: str,
+        words: str,
+    ) -> None:
+        friction = np.array([share, 1.0])
+        found = self.found(
+            sound, "friction over time", drift=drift(*change), friction_share=friction
         )
-        return finding
-
-    def test_none_that_stands_out_is_good(self):
-        assert self.found(1e-5, -1e-5).level == "good"
-
-    def test_one_that_is_little_torque_is_mentioned(self):
-        little = self.found(0.02, 0.0)
-        assert little.level == "information"
-        assert "shoulder by 2.0% up; that is at most 2.0% of an axis's torque" in little.words
-        weighted = self.found(0.1, 0.0, share=np.array([0.2, 1.0]))
-        assert weighted.level == "information"
-        assert "at most 2.0%" in weighted.words
-
-    def test_a_large_one_is_a_doubt_and_named_with_its_direction(self):
-        large = self.found(0.02, -0.2)
-        assert (large.level, large.role) == ("doubtful", "cause")
-        assert large.words.endswith("elbow by 20.0% down")
+        assert found.level == level and words in found.words
+        assert (found.role == "cause") == (level == "doubtful")
