@@ -168,7 +168,8 @@ class XmlSource:
             if found := pattern.search(tag):
                 tag = tag[: found.start(2)] + written + tag[found.end() :]
             else:
-                tag = re.sub(r"\s*/?>$", lambda end, new=f" {name}={written}": new + end[0], tag)
+                head = tag.removesuffix(">").removesuffix("/").rstrip()
+                tag = f"{head} {name}={written}{tag[len(head) :]}"
         return Edit(element.start, element.inside, tag)
 
     def with_first_child(self, element: Element, lines: Iterable[str]) -> Edit:

@@ -183,7 +183,7 @@ def test_a_rotor_that_cannot_be_is_refused(value: float) -> None:
     model = RobotModel.from_urdf(TWO_LINK)
     standard = model.nominal.copy()
     standard[10] = value
-    with pytest.raises(NotConsistentError, match="'shoulder'|I1m"):
+    with pytest.raises(NotConsistentError, match=r"'shoulder'|I1m"):
         write_urdf(TWO_LINK, model, standard)
 
 
