@@ -20,21 +20,13 @@ turns, and medians are compared. With `--sizes` the chunks of one archive are co
 several ways.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
 import struct
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +37,7 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
+from benchmarks import parser_of, show, timed
 from benchmarks.archive_files import CYCLES, JOINTS, SECONDS, repetitions
 from benchmarks.batch import archives_to_estimate
 from hil.archive import container, open_archive
@@ -127,12 +120,10 @@ def typed(path: Path) -> Columns:
     }
 
 
-def timed(decode: Callable[[Path], Columns], paths: Sequence[Path]) -> float:
-    """Processor time of decoding the archives one after the other [s]."""
-    start = time.process_time()
+def decode_all(decode: Callable[[Path], Columns], paths: Sequence[Path]) -> None:
+    """Decode archives one after the other."""
     for path in paths:
         decode(path)
-    return time.process_time() - start
 
 
 def same(path: Path, decoders: Sequence[Callable[[Path], Columns]]) -> bool:
@@ -163,7 +154,7 @@ def measure(paths: Sequence[Path], turns: int) -> dict[str, Any]:
             count = min(len(paths), shares.get(name, 3))
             first = turn * count % max(1, len(paths) - count + 1)
             taken = paths[first : first + count]
-            rounds[name].append(timed(decode, taken) * len(paths) / len(taken))
+            rounds[name].append(timed(partial(decode_all, decode, taken)) * len(paths) / len(taken))
     times = {name: float(np.median(values)) for name, values in rounds.items()}
     mcap = min(times["mcap_seeking"], times["mcap_streaming"])
     return {
@@ -182,12 +173,14 @@ def sizes(path: Path) -> list[dict[str, Any]]:
     """The chunks of an archive under several compressions: size, and time both ways."""
     decompressor = zstandard.ZstdDecompressor()
     with path.open("rb") as stream:
-        chunks = [
-            container.chunk_data(container.chunk(record), record.offset)
-            for record in container.records(stream, path.stat().st_size)
+        size = path.stat().st_size
+        packed_chunks = [
+            (container.chunk(record), record.offset)
+            for record in container.records(stream, size)
             if record.opcode == container.CHUNK
         ]
-    rest = path.stat().st_size - _compressed_size(path)
+        chunks = [container.chunk_data(*one) for one in packed_chunks]
+    rest = size - sum(len(one.data) for one, _ in packed_chunks)
     ways: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
         "none": (bytes, bytes),
         "lz4": (lz4.frame.compress, lz4.frame.decompress),
@@ -215,19 +208,9 @@ def sizes(path: Path) -> list[dict[str, Any]]:
     return table
 
 
-def _compressed_size(path: Path) -> int:
-    with path.open("rb") as stream:
-        return sum(
-            len(container.chunk(record).data)
-            for record in container.records(stream, path.stat().st_size)
-            if record.opcode == container.CHUNK
-        )
-
-
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser = parser_of(__doc__)
     parser.add_argument("--folder", type=Path, help="where the archives are kept")
     parser.add_argument("--sizes", action="store_true", help="compare compressions as well")
     parser.add_argument("--repetitions", type=int, default=REPETITIONS, help="archives")
@@ -239,13 +222,7 @@ def main() -> None:
         result["archives_to_estimate_s"] = round(archives_to_estimate(paths), 2)
         if arguments.sizes:
             result["sizes"] = sizes(paths[0])
-    if not arguments.json:
-        print(f"decoding {result['cycles']} cycles of {JOINTS} joints, medians:")
-        for name in ("ours", "mcap_seeking", "mcap_streaming", "mcap_struct", "typed"):
-            print(f"  {name:15} {result[f'{name}_s']:8.2f} s")
-        for row in result.get("sizes", ()):
-            print("  " + "  ".join(f"{key} {value}" for key, value in row.items()))
-    print(json.dumps(result))
+    show(result, only_json=arguments.json)
 
 
 if __name__ == "__main__":

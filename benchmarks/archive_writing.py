@@ -11,8 +11,6 @@ packets of both directions are kept as well.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 import time
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import parser_of, show
 from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
@@ -136,8 +135,7 @@ def _processor_time(pid: int) -> float:
 
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each archive")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
@@ -153,10 +151,7 @@ def main() -> None:
         "seconds": arguments.seconds,
         "cycles_per_second": round(1.0 / PERIOD),
     }
-    if not arguments.json:
-        print(f"writing costs {plain['share']:.1%} of one core at 1 kHz, {rich['share']:.1%} with "
-              "raw packets")  # fmt: skip
-    print(json.dumps(result))
+    show(result, only_json=arguments.json)
 
 
 if __name__ == "__main__":

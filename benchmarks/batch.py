@@ -12,17 +12,10 @@ kept. Wall times are those of the machine as it is; the processor time, of this 
 children, does not depend on what else runs.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -34,6 +27,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
+from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.run import Plan, reidentify
 from hil.batch.types import BatchResult, Broken
@@ -124,32 +118,8 @@ def measure_made(
         "seconds_per_archive": seconds,
         "archive_MB": round(size / archives / 1e6, 2),
         "parent_MB": {str(one["archives"]): one["largest_parent_MB"] for one in steps},
-        "million_on_100_machines": million_on_100_machines(steps[0], steps[-1]),
         "steps": steps,
     }
-
-
-def million_on_100_machines(small: dict[str, Any], large: dict[str, Any]) -> dict[str, float]:
-    """A calculation on paper: 10^6 such archives on 100 machines like this one.
-
-    Archives are shared out evenly; what the one process that gives them out does for each comes on
-    top, as if nothing of it happened meanwhile. From a small run and a large one follows what one
-    more archive takes there.
-    """
-    archives, machines = 1e6, 100.0
-    more = max(1, large["archives"] - small["archives"])
-    far = large["first_processor_ms_per_archive"] - large["first_parent_ms_per_archive"]
-    near = _parent_ms(large) - _parent_ms(small)
-    held = large["largest_parent_MB"] - small["largest_parent_MB"]
-    return {
-        "factors_min": round(far * archives / machines / large["workers"] / 6e4, 1),
-        "client_min": round(near / more * archives / 6e4, 1),
-        "client_GB": round(held / more * archives / 1e3, 1),
-    }
-
-
-def _parent_ms(step: dict[str, Any]) -> float:
-    return float(step["first_parent_ms_per_archive"] * step["archives"])
 
 
 def _make(root: Path, archives: int, seconds: float) -> list[Path]:
@@ -209,13 +179,12 @@ def _largest_own() -> float:
 
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = parser_of(__doc__)
     parser.add_argument("places", nargs="*", help="folders with archives anywhere below")
     parser.add_argument("--archives", type=int, default=0, help="make so many instead")
     parser.add_argument("--seconds", type=float, default=12.0, help="duration of each, at most 16")
     parser.add_argument("--folder", type=Path, default=None, help="to keep those made")
     parser.add_argument("--workers", type=int, default=None, help="child processes")
-    parser.add_argument("--json", action="store_true", help="print one line of JSON only")
     arguments = parser.parse_args()
     if bool(arguments.places) == bool(arguments.archives):
         parser.error("name folders, or give --archives")
@@ -225,12 +194,7 @@ def main() -> None:
         )
     else:
         result = measure(arguments.places, arguments.workers)
-    if not arguments.json:
-        for name, value in result.items():
-            if name == "steps":
-                continue
-            print(f"  {name:32} {value}")
-    print(json.dumps(result))
+    show(result, only_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -16,16 +16,8 @@ suspicious only with the fault. *Right* is a verdict that
 names the fault, or leaves it out where it is harmless, and blames nothing else.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import json
 import tempfile
 import time
@@ -36,19 +28,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks import plain_fit
+from benchmarks import parser_of, plain_fit
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
+from benchmarks.identification_study import recorded, study
 from benchmarks.joint_log import JointLog
 from benchmarks.published import FITTED_SHARE, Published, Split, known
-from benchmarks.study_recordings import (
-    Kept,
-    excitation_path,
-    record_excitation,
-    record_validation,
-    study_cell,
-    study_plan,
-    validation_paths,
-)
 from hil.errors import HilError
 from hil.identify import Options, identify_archives
 from hil.importers import Robot
@@ -59,6 +43,7 @@ from identification.errors import IdentificationError
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIMULATED: Final = "simulated"
 _RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
+_VALIDATION_SEED: Final = 1_000_000  # noise of its own
 
 
 @dataclass(frozen=True)
@@ -299,20 +284,14 @@ def split_logs(name: str, data: Path) -> tuple[Split, dict[str, JointLog]]:
 
 def simulated_logs() -> tuple[Split, dict[str, JointLog]]:
     """Excitation and first validation motion of the simulated cell, without unmodelled effects."""
-    cell = study_cell()
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        plan = study_plan(folder, cell)
-        record_excitation(folder, cell, plan, 0, "clean")
-        record_validation(folder, cell, plan, "clean")
-        paths = {
-            "excitation": excitation_path(folder, 0, "clean"),
-            "validation": validation_paths(folder, cell, "clean")[0],
-        }
-        recordings = {name: Kept.load(path).recording for name, path in paths.items()}
+    cell = study()[0]
+    parts = {
+        "excitation": recorded(0).training[0].recording,
+        "validation": recorded(_VALIDATION_SEED, validation=True).held_out[0].recording,
+    }
     robot = Robot(cell.text, cell.urdf, cell.joint_names)
     logs = {}
-    for name, one in recordings.items():
+    for name, one in parts.items():
         assert one.torque is not None
         logs[name] = JointLog(robot, one.time, one.position, None, one.torque, _RATED_PAYLOAD)
     return Split(fitted="excitation", predicted="validation"), logs
@@ -337,14 +316,13 @@ def summary(rows: Sequence[Row], degraded: Sequence[DegradedRow]) -> dict[str, A
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
     parser.add_argument(
         "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
     )
     parser.add_argument("--short", action="store_true", help="fit 40 %% of a log, predict the rest")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
-    parser.add_argument("--json", action="store_true", help="end with a line of JSON")
     options = parser.parse_args(arguments)
     wanted = options.only or [*known(), SIMULATED]
     rows: list[Row] = []

@@ -6,21 +6,13 @@ Coulomb and viscous friction of axis 3 are raised by 35 %.
     python -m benchmarks.comparison [--json] [--repetitions N]
 """
 
-# ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks import parser_of, show
 from hil import Campaign, Cell
 from hil.batch.workers import LocalWorkers
 from hil.campaign import design
@@ -81,21 +73,10 @@ def measure(repetitions: int) -> dict[str, Any]:
 
 def main() -> None:
     """Print what was found."""
-    parser = argparse.ArgumentParser(description="hil compare on planted changes")
-    parser.add_argument("--json", action="store_true")
+    parser = parser_of(__doc__)
     parser.add_argument("--repetitions", type=int, default=3)
     options = parser.parse_args()
-    found = measure(options.repetitions)
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, one in found.items():
-        print(f"{name}: {one['verdict']}; prediction error by model and campaign:")
-        print(one["prediction"])
-        for joint, axis in one["axes"].items():
-            change, low, high = (100.0 * share for share in axis["change"])
-            mark = " CHANGED" if axis["changed"] else ""
-            print(f"  {joint}: {change:+.1f} % ({low:+.1f} to {high:+.1f}){mark}")
+    show(measure(options.repetitions), only_json=options.json)
 
 
 if __name__ == "__main__":

@@ -21,17 +21,8 @@ Run with ``python -m benchmarks.design [--json] [--search]``: the NS 16 (6 joint
 Processor time of one thread but for the search; alternating repetitions; medians.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
 import math
 import resource
 import time
@@ -42,7 +33,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from benchmarks.regressor import common_columns, pinocchio_gram, timed
+from benchmarks import parser_of, show, timed
+from benchmarks.regressor import common_columns, pinocchio_gram
 from hil import Cell
 from hil.design.problem import problem_of, search_settings
 from hil.design.settings import preset
@@ -196,8 +188,7 @@ def time_search(cell: Cell, population: int, generations: int) -> dict[str, floa
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser = parser_of(__doc__)
     parser.add_argument("--search", action="store_true", help="time the paper's search as well")
     parser.add_argument("--repetitions", type=int, default=15)
     parser.add_argument("--individuals", type=int, default=160)
@@ -218,10 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     result["columns"] = cell.model.n_parameters
     result["repetitions"] = options.repetitions
     result["clock"] = "processor time of one thread; searches: wall time"
-    if not options.json:
-        for name, value in result.items():
-            print(f"  {name:36} {value}")
-    print(json.dumps(result))
+    show(result, only_json=options.json)
 
 
 def _processor_time() -> float:

@@ -23,22 +23,14 @@ figaroh is no dependency of this project. ``--install-figaroh`` puts it into an 
 own, `build/figaroh`, which is used where it is there; another interpreter that has it can be named.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import importlib.metadata
 import json
+import os
 import subprocess
 import sys
 import tempfile
-import time
 import venv
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -49,6 +41,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from benchmarks import parser_of, show, timed
 from benchmarks.regressor import SAMPLES, sine_motion
 from identification import Motion, RobotModel
 from identification.estimators.consistent import consistent_estimate
@@ -206,20 +199,13 @@ def measured(tasks: dict[str, Callable[[], float]], repetitions: int) -> dict[st
     return dict(zip(tasks, np.array(rows[1:]).T, strict=True))
 
 
-def took(function: Callable[[], object]) -> float:
-    """Processor time of a call [s], of all threads of this process."""
-    start = time.process_time()
-    function()
-    return time.process_time() - start
-
-
 def time_fits(python: Path | None, repetitions: int) -> dict[str, float | int | None]:
     """Time the fits, ours and figaroh's in turns."""
     same, large = case(SAME_PARAMETERS), case(ALL_FRICTION, WRIST)
     tasks: dict[str, Callable[[], float]] = {
-        "fit": partial(took, partial(fit, same.model, same.samples)),
-        "large_fit": partial(took, partial(fit, large.model, large.samples)),
-        "prepared_fit": partial(took, partial(prepared_fit, same)),
+        "fit": partial(timed, partial(fit, same.model, same.samples)),
+        "large_fit": partial(timed, partial(fit, large.model, large.samples)),
+        "prepared_fit": partial(timed, partial(prepared_fit, same)),
     }
     with nullcontext() if python is None else Rival(python, same.samples) as rival:
         if rival is not None:
@@ -246,10 +232,10 @@ def time_models(repetitions: int) -> dict[str, float | int]:
     factor = Factor.from_samples(one.model, one.samples.motion, one.samples.torque)
     free = estimate(one.model, factor)
     tasks: dict[str, Callable[[], float]] = {
-        f"base_{name}": partial(took, partial(RobotModel.from_urdf, text))
+        f"base_{name}": partial(timed, partial(RobotModel.from_urdf, text))
         for name, text in texts.items()
     }
-    tasks["consistent"] = partial(took, partial(consistent_estimate, one.model, factor, free))
+    tasks["consistent"] = partial(timed, partial(consistent_estimate, one.model, factor, free))
     result: dict[str, float | int] = {}
     for name, values in measured(tasks, repetitions).items():
         result |= _spread(name, values)
@@ -284,8 +270,7 @@ def installed(python: Path | None, *, install: bool) -> Path | None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser = parser_of(__doc__)
     parser.add_argument("--repetitions", type=int, default=9)
     parser.add_argument("--figaroh", type=Path, metavar="PYTHON", help="interpreter that has it")
     parser.add_argument("--install-figaroh", action="store_true", help="into build/figaroh")
@@ -301,10 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "repetitions": options.repetitions,
         "clock": "processor time, BLAS of one thread; medians",
     }
-    if not options.json:
-        for name, value in result.items():
-            print(f"  {name:28} {value}")
-    print(json.dumps(result))
+    show(result, only_json=options.json)
 
 
 def _spread(name: str, seconds: Array) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""A load on a simulated NS 16 weighed: `python -m benchmarks.payload --seeds 200 --json FILE`.
+"""A load on a simulated NS 16 weighed: `python -m benchmarks.payload --seeds 200`.
 
 Torques are pinocchio's. Every seed has a load of its own (4 to 16 kg), a motion of 16 s that is
 recorded without and with it, and noise that is half white and half correlated over 50 ms. The
@@ -7,10 +7,7 @@ friction of every joint differs by 4 % (standard deviation) between any two reco
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,6 +15,7 @@ import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
+from benchmarks import parser_of, show
 from identification.estimators.payload import NAMES, Run, figures_of, identify_payload
 from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body
@@ -175,15 +173,10 @@ def _unit(vector: Array) -> Array:
 
 def main() -> None:
     """Print coverage and errors."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
-    found = coverage(range(options.seeds))
-    text = json.dumps(asdict(found), indent=1)
-    print(text)
-    if options.json is not None:
-        options.json.write_text(text + "\n", encoding="utf-8")
+    show(asdict(coverage(range(options.seeds))), only_json=options.json)
 
 
 if __name__ == "__main__":

@@ -10,44 +10,29 @@ limits of the NS 16 (6 joints).
   ``at_time_calls_only_ms`` is what its bare calls take when all that they return is thrown away.
 - ``batch_ms``: one motion of a population planned together (``plan_chunk``, in this process).
 - ``player_step_us``, ``interpolator_step_us``: one cycle of a motion whose override changes.
-- ``worst_limit_ratio``: how far any quantity of ``--plans`` random motions goes, 1 being its limit
-  (`benchmarks.planner_statistics`).
+- ``worst_limit_ratio``: how far any quantity of ``--plans`` random motions goes, 1 being its limit.
 
 Times are processor time of one thread; medians.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import ruckig
 
-from benchmarks.planner_statistics import (
-    FACTS,
-    FLYS,
-    NarrowRow,
-    fly_table,
-    limit_ratios,
-    random_points,
-)
+from benchmarks import parser_of, show, timed
 from hil import Cell
 from planner import JointLimits, PiecewiseCubic, TrajectoryPlayer, plan
 from planner.arrays import Array
 from planner.interpolator import Interpolator
-from planner.moves import plan_chunk
+from planner.limits import position_rounding
+from planner.moves import FlyPercent, MotionPlan, Move, plan_chunk, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 
 POINTS = 6
@@ -55,13 +40,9 @@ SAMPLES = 16_000
 MOTIONS = 200
 POPULATION = 32
 PERIOD = 1e-3
-
-
-def _timed(function: Callable[[], object]) -> float:
-    """Return the processor time of a call: on a busy machine the wall clock times the others."""
-    start = time.thread_time()
-    function()
-    return time.thread_time() - start
+FLYS = (0.1, 0.25, 0.5, 0.75, 1.0)
+# The ranges of the table: half width and centre of each joint [deg].
+_RANGES = np.deg2rad([[180, 92, 78, 200, 125, 200], [0, 33, -87, 0, 0, 0]])
 
 
 def _stretches(points: Array, limits: JointLimits) -> list[ruckig.Trajectory]:
@@ -104,8 +85,8 @@ def planning_times(limits: JointLimits, random: np.random.Generator) -> dict[str
     sets = [random_points(limits, random, POINTS) for _ in range(MOTIONS)]
     shares = np.ones((POPULATION, limits.n_joints))
     groups = [sets[begin : begin + POPULATION] for begin in range(0, MOTIONS, POPULATION)][:-1]
-    alone = [_timed(partial(plan, points, limits)) for points in sets]
-    company = [_timed(partial(plan_chunk, group, shares, limits, 0.5)) for group in groups]
+    alone = [timed(partial(plan, points, limits)) for points in sets]
+    company = [timed(partial(plan_chunk, group, shares, limits, 0.5)) for group in groups]
     return {
         "plan_ms": 1e3 * float(np.median(alone)),
         "batch_ms": 1e3 * float(np.median(company)) / POPULATION,
@@ -121,9 +102,9 @@ def sampling_times(limits: JointLimits, random: np.random.Generator) -> dict[str
         t = np.linspace(0.0, motion.duration, SAMPLES)
         times.append(
             [
-                _timed(partial(motion.sample, t)),
-                _timed(partial(_each_time, stretches)),
-                _timed(partial(_calls_only, stretches)),
+                timed(partial(motion.sample, t)),
+                timed(partial(_each_time, stretches)),
+                timed(partial(_calls_only, stretches)),
             ]
         )
     ours, arrays, calls = (1e3 * float(value) for value in np.median(times, axis=0))
@@ -143,7 +124,7 @@ def step_times(limits: JointLimits, random: np.random.Generator) -> dict[str, fl
         ("player_step_us", _player_steps(plan(points, limits), limits)),
         ("interpolator_step_us", _interpolator_steps(points, limits)),
     ):
-        times = 1e6 * np.array([_timed(step) for step in steps])
+        times = 1e6 * np.array([timed(step) for step in steps])
         result[name] = float(np.median(times))
         result[name.replace("_us", "_99_us")] = float(np.quantile(times, 0.99))
     return result
@@ -171,10 +152,118 @@ def _interpolator_steps(points: Array, limits: JointLimits) -> Iterator[Callable
         yield arm.get_next_step
 
 
+class NarrowRow(NamedTuple):
+    """One line of the table: a fly, what it gains, how far it passes, how often it is less."""
+
+    fly: float
+    time_ratio: float
+    passing_deg: float
+    corners: int
+    reduced: int
+    stopped: int
+
+
+def random_points(limits: JointLimits, random: np.random.Generator, count: int) -> Array:
+    """Return via points (count, n) anywhere within the limits [rad]."""
+    return random.uniform(limits.lower, limits.upper, (count, limits.n_joints))
+
+
+def limit_ratios(
+    limits: JointLimits, plans: int, random: np.random.Generator
+) -> dict[str, float | int]:
+    """Return how far random motions go, 1 being the limit, and how their corners are passed.
+
+    A fifth each: anywhere; on the ends of the ranges; near one another; one joint at a time; and
+    out and back. Flies, and the joints' shares of speed, are random as well.
+    """
+    worst = np.zeros(4)
+    corners = reduced = stopped = 0
+    for index in range(plans):
+        points = _points(limits, random, index % 5)
+        speed = (
+            random.uniform(0.05, 1.0, limits.n_joints) if index % 2 else np.ones(limits.n_joints)
+        )
+        planned = _planned(points, limits, float(random.uniform(0.01, 1.0)), speed)
+        worst = np.maximum(worst, _reach(planned, limits.scaled(velocity=speed)))
+        corners += len(planned.corners)
+        reduced += planned.reduced_corners
+        stopped += planned.stopped_corners
+    return {
+        "plans": plans,
+        "worst_limit_ratio": float(worst.max()),
+        **{
+            f"worst_{name}_ratio": float(value)
+            for name, value in zip(
+                ("position", "velocity", "acceleration", "jerk"), worst, strict=True
+            )
+        },
+        "corners": corners,
+        "corners_reduced": reduced,
+        "corners_stopped": stopped,
+    }
+
+
+def fly_table(limits: JointLimits, sets: int) -> list[NarrowRow]:
+    """Return the table for random sets of 6 via points within the ranges of `docs/motion.md`."""
+    half, centre = _RANGES
+    narrow = replace(limits, lower=centre - half, upper=centre + half)
+    random = np.random.default_rng(0)
+    points = [random_points(narrow, random, 6) for _ in range(sets)]
+    return [_row(narrow, points, fly) for fly in FLYS]
+
+
+def _row(limits: JointLimits, sets: Sequence[Array], fly: float) -> NarrowRow:
+    ones = np.ones(limits.n_joints)
+    plans = [_planned(points, limits, fly, ones) for points in sets]
+    stops = sum(planned.duration_with_stops for planned in plans)
+    passing = [target.distance for planned in plans for target in planned.targets[:-1]]
+    return NarrowRow(
+        fly,
+        sum(planned.duration for planned in plans) / stops,
+        float(np.rad2deg(np.mean(passing))),
+        sum(len(planned.corners) for planned in plans),
+        sum(planned.reduced_corners for planned in plans),
+        sum(planned.stopped_corners for planned in plans),
+    )
+
+
+def _planned(points: Array, limits: JointLimits, fly: float, speed: Array) -> MotionPlan:
+    moves = [Move(point, joint_speed=speed, fly=FlyPercent(100.0 * fly)) for point in points[1:]]
+    return plan_moves(points[0], moves, limits)
+
+
+def _points(limits: JointLimits, random: np.random.Generator, kind: int) -> Array:
+    points = random_points(limits, random, 6)
+    if kind == 1:
+        points = np.where(points > (limits.lower + limits.upper) / 2.0, limits.upper, limits.lower)
+    elif kind == 2:
+        points = points[0] + 10.0 ** random.uniform(-6.0, -1.0) * (points - points[0])
+    elif kind == 3:
+        for before, point in pairwise(points):
+            resting = np.arange(limits.n_joints) != random.integers(limits.n_joints)
+            point[resting] = before[resting]
+    elif kind == 4:
+        points[2::2] = points[0]
+    return points
+
+
+def _reach(planned: MotionPlan, limits: JointLimits) -> Array:
+    """Return how far position, velocity, acceleration and jerk go, 1 being the limit."""
+    extrema = planned.trajectory.extrema()
+    half = (limits.upper - limits.lower) / 2.0
+    beyond = np.maximum(extrema.upper - limits.upper, limits.lower - extrema.lower)
+    beyond = beyond - position_rounding(limits)  # which is not reaching further
+    rates = (
+        extrema.velocity / limits.velocity,
+        extrema.acceleration / limits.acceleration,
+        extrema.jerk / limits.jerk,
+    )
+    return np.array([ratio.max() for ratio in (1.0 + beyond / half, *rates)])
+
+
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
+    parser = parser_of(__doc__)
     parser.add_argument("--plans", type=int, default=1000, help="motions whose limits are checked")
     parser.add_argument("--sets", type=int, default=1000, help="sets of via points of the table")
     arguments = parser.parse_args()
@@ -187,28 +276,8 @@ def main() -> None:
         **step_times(limits, random),
     }
     result |= limit_ratios(limits, arguments.plans, random)
-    rows = fly_table(limits, arguments.sets)
-    result["fly_table"] = [row._asdict() for row in rows]
-    if not arguments.json:
-        _print(result, rows, arguments.sets)
-    print(json.dumps(result))
-
-
-def _print(result: dict[str, object], rows: list[NarrowRow], sets: int) -> None:
-    for name, value in result.items():
-        if name != "fly_table":
-            print(
-                f"  {name:26} {value:.6f}" if isinstance(value, float) else f"  {name:26} {value}"
-            )
-    print(f"\n{sets} sets of {POINTS} via points; in brackets: cut and join as first tried (facts)")
-    print("  fly %   T / T with stops    passing [deg]    corners: all  reduced  stopped")
-    for row in rows:
-        ratio, distance = FACTS[FLYS.index(row.fly)]
-        print(
-            f"  {row.fly:5.0%}   {row.time_ratio:.3f} ({ratio})       "
-            f"{row.passing_deg:6.2f} ({distance:4})  "
-            f"{row.corners:12} {row.reduced:8} {row.stopped:8}"
-        )
+    result["fly_table"] = [row._asdict() for row in fly_table(limits, arguments.sets)]
+    show(result, only_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -21,16 +21,8 @@ on the fitted part alone; "plain" does without. The headline figures are not fro
 are those of `hil identify` with its default settings, in sample and held out.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import json
 import tempfile
 from collections.abc import Callable, Collection, Sequence
@@ -40,6 +32,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from benchmarks import parser_of
 from benchmarks.published import FITTED_SHARE, Published
 from hil.identify import Options
 from hil.identify.estimating import estimate_with
@@ -278,9 +271,8 @@ def load_case(folder: Path) -> Case:
 
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder with the recording")
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
     arguments = parser.parse_args()
     folder = arguments.data.resolve()
     case = load_case(folder)

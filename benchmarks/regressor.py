@@ -10,25 +10,15 @@ Both use one thread, whose processor time counts. The repetitions alternate, and
 compared; so are the Gram matrices, on the columns that both have.
 """
 
-# ruff: noqa: E402 - threads are pinned before numpy is imported, or BLAS does not see it
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
-import json
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from benchmarks import parser_of, show, timed
 from identification import Factor, Motion, RobotModel
 from identification.model.kinematics import FROM_PINOCCHIO
 from identification.model.regressor import LINK_SYMBOLS
@@ -87,18 +77,9 @@ def _difference(model: RobotModel, ours: Array, theirs: Array) -> float:
     return float(np.max(np.abs(a - b) / length / length[:, None]))
 
 
-def timed(function: Callable[[], object]) -> float:
-    """Return the processor time of a call: on a busy machine the wall clock times the others."""
-    start = time.thread_time()
-    function()
-    return time.thread_time() - start
-
-
 def main() -> None:
     """Measure, and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print the line of JSON only")
-    arguments = parser.parse_args()
+    options = parser_of(__doc__).parse_args()
 
     urdf = URDF.read_text(encoding="utf-8")
     model = RobotModel.from_urdf(urdf)
@@ -131,12 +112,7 @@ def main() -> None:
         "clock": "processor time of one thread",
         "gram_difference": difference,
     }
-    if not arguments.json:
-        print(f"regressor and Gram, {SAMPLES} samples x {model.n_joints} joints, medians:")
-        print(f"  ours       {ours_ms:7.1f} ms  ({model.n_parameters} columns and the torque)")
-        print(f"  pinocchio  {pinocchio_ms:7.1f} ms  (60 columns)")
-        print(f"  ratio      {pinocchio_ms / ours_ms:7.2f}")
-    print(json.dumps(result))
+    show(result, only_json=options.json)
 
 
 if __name__ == "__main__":

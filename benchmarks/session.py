@@ -11,18 +11,10 @@ and a further run says what memory was allocated in between and not given back.
     python -m benchmarks.session [--json] [--cycles N] [--runs N] [--window N]
 """
 
-# ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
-
 from __future__ import annotations
-
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
 
 import argparse
 import gc
-import json
 import struct
 import time
 import tracemalloc
@@ -32,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import parser_of, show
 from drivers import CycleRing, DriveTrain, Guard, GuardLimits, InitPacket, Mode, Session, State
 from drivers.motion_source import BoundsName
 from drivers.packets import DRIVE_ON, CyclicPacket, next_number
@@ -234,8 +227,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--json", action="store_true", help="only the line of JSON")
+    parser = parser_of(__doc__)
     parser.add_argument("--cycles", type=int, default=20_000)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--warm", type=int, default=1_000)
@@ -243,12 +235,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.cycles <= options.warm:
         parser.error(f"--cycles must be more than the {options.warm} of --warm")
-    result = measure(options)
-    if not options.json:
-        print(f"session + guard + drive train, {N} joints, {PERIOD_MS} ms, open mode")
-        for name, value in result.items():
-            print(f"  {name:20s} {value}")
-    print(json.dumps(result))
+    show(measure(options), only_json=options.json)
 
 
 if __name__ == "__main__":

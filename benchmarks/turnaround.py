@@ -11,18 +11,11 @@ An answer that comes later than one cycle after its request is missed; for each,
 the time went. With `--busy` all is done once more beside a process that keeps a processor busy.
 """
 
-# ruff: noqa: E402  the number of BLAS threads has to stand before numpy is imported
-
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
-import argparse
 import json
 import multiprocessing
+import os
 import shutil
 import socket
 import subprocess
@@ -35,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import parser_of
 from benchmarks.session import N, drive_train
 from benchmarks.turnaround_ends import (
     HOST,
@@ -275,11 +269,10 @@ def run(cycles: int, blocks: int, *, busy: bool) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--cycles", type=int, default=100_000)
     parser.add_argument("--blocks", type=int, default=10)
     parser.add_argument("--busy", action="store_true", help="once more beside a busy processor")
-    parser.add_argument("--json", action="store_true", help="only the line of JSON")
     options = parser.parse_args()
     begin = time.monotonic()
     result = run(options.cycles, options.blocks, busy=False)

@@ -25,7 +25,7 @@ END_PERIODS: Final = 2.0
 LONGEST_END: Final = 0.25  # s
 # When a joint turns round, Coulomb friction jumps, and until its servo has followed so does its
 # acceleration. The smoother, whose kernel is a period of its bandwidth wide, cannot follow that.
-# On the simulated NS 16 at 40 Hz (``benchmarks.identification_study --only coverage``) the bias of
+# On the simulated NS 16 at 40 Hz (``benchmarks.identification_study``) the bias of
 # the parameters, rms of its ratio to their standard deviation, is 0.38 if half a period is left out
 # on either side (worst 1.1), 0.20 with one period (worst 0.6), and no smaller with two.
 REVERSAL_PERIODS: Final = 1.0
