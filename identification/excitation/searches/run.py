@@ -16,15 +16,6 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
-from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
-from pymoo.config import Config
-from pymoo.core.problem import Problem
-from pymoo.core.termination import NoTermination
-from pymoo.operators.crossover.sbx import SBX
-from pymoo.operators.mutation.pm import PM
-from pymoo.operators.selection.tournament import TournamentSelection
-from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
 from identification.excitation.criteria import SENSE, Criteria, fitness_eq7
 from identification.excitation.errors import DesignError, NoFeasibleMotionError
@@ -264,6 +255,17 @@ class Evolution:
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
+        # Some 0.2 s to load, which only a search needs.
+        from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
+        from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
+        from pymoo.config import Config
+        from pymoo.core.problem import Problem
+        from pymoo.core.termination import NoTermination
+        from pymoo.operators.crossover.sbx import SBX
+        from pymoo.operators.mutation.pm import PM
+        from pymoo.operators.selection.tournament import TournamentSelection
+        from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
+
         Config.warnings["not_compiled"] = False  # it would be printed
         kind, compare, survival = (
             (GA, comp_by_cv_and_fitness, FitnessSurvival())
