@@ -117,15 +117,16 @@ class Cell:
             name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))
             for name, one in table.joints.items()
         }
-        friction = table.model_copy(update={**changes, "joints": joints})
-        robot = self.file.robot.model_copy(update={"friction": friction})
-        changed = replace(self, file=self.file.model_copy(update={"robot": robot}))
+        changed = self._with_robot(friction=table.model_copy(update={**changes, "joints": joints}))
         _ = changed.model
         return changed
 
     def without_payload(self) -> Cell:
         """The cell without what `[robot.payload]` says that the arm carries."""
-        robot = self.file.robot.model_copy(update={"payload": None})
+        return self._with_robot(payload=None)
+
+    def _with_robot(self, **changes: Any) -> Cell:
+        robot = self.file.robot.model_copy(update=changes)
         return replace(self, file=self.file.model_copy(update={"robot": robot}))
 
     @property
@@ -225,22 +226,16 @@ class Cell:
         if table.transport == "can" and table.can is not None:
             from drivers.transports.can.transport import CanSpec
 
-            bus, axes = table.can.model_dump(), len(self.joint_names)
-            spec = CanSpec(**bus, period=self.period, n_axes=axes)
+            axes = len(self.joint_names)
+            spec = CanSpec(**table.can.model_dump(), period=self.period, n_axes=axes)
             try:
                 spec.check(table.mode)
             except (DriverError, ValueError) as error:
-                raise CellError(
-                    self.path, "controller.can", None, str(error), "name what the bus can carry"
-                ) from error
+                remedy = "name what the bus can carry"
+                raise self.error("controller.can", None, str(error), remedy) from error
             return spec
-        raise CellError(
-            self.path,
-            "controller.transport",
-            table.transport,
-            "a simulated controller in virtual time has no link to open",
-            'write "udp" or "can"',
-        )
+        problem = "a simulated controller in virtual time has no link to open"
+        raise self.error("controller.transport", table.transport, problem, 'write "udp" or "can"')
 
     @property
     def only_simulated(self) -> bool:
@@ -318,17 +313,13 @@ class Cell:
         )
 
     def with_link(self, *, can: CanTable | None = None, **controller: Any) -> Cell:
-        """This cell on another link, in its text too; None keeps what stands there.
+        """This cell with other entries of `[controller]` and `[controller.can]`, in its text too.
 
-        Args:
-            can: in place of `[controller.can]`.
-            controller: entries of `[controller]`, such as `transport`, `host`, `port` and `bind`.
+        None keeps what stands there.
         """
         bus = {} if can is None else can.model_dump(exclude_none=True)
-        return self.with_values(
-            {f"controller.{key}": value for key, value in controller.items()}
-            | {f"controller.can.{key}": value for key, value in bus.items()}
-        )
+        values = {f"controller.{key}": value for key, value in controller.items()}
+        return self.with_values(values | {f"controller.can.{k}": v for k, v in bus.items()})
 
     def with_urdf(self, path: Path, name: str) -> Cell:
         """This cell as a file `path` whose URDF is called `name`; meshes stay where they are."""
@@ -351,7 +342,7 @@ class Cell:
             rotor_inertia=np.array(table.rotor_inertia),
             coulomb=np.array(table.coulomb),
             viscous=np.array(table.viscous),
-            third=np.array(table.third) if table.third else np.zeros(len(self.joint_names)),
+            third=np.array(table.third or np.zeros(len(self.joint_names))),
         )
 
     def parameter_values(
@@ -381,11 +372,6 @@ class Cell:
             for _, term, owner, motor, _ in model.friction.terms
         ]
         return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
-
-    def urdf_angles(self, controller_angles: Array) -> Array:
-        """URDF angles (n,) from the teach pendant's, rad."""
-        frame = AngleFrame.pendant(self)
-        return np.asarray((controller_angles - frame.offset) * frame.sign, dtype=np.float64)
 
     def controller_angles(self, urdf_angles: Array) -> Array:
         """The teach pendant's angles (n,) from those of the URDF, rad."""
@@ -501,14 +487,9 @@ URDF_ROUNDING = 1e-5
 
 _SAME_NUMBER = 0.01  # relative
 _FULL_TURN = 6.3  # degrees; as radians it is one turn
-
-_MAY_BE_EMPTY = {
-    "nominal.third",
-    "limits.torque",
-    "simulation.elasticity",
-    "simulation.inertia_scale",
+_MAY_BE_EMPTY = {"nominal.third", "limits.torque"} | {
+    f"simulation.{name}" for name in ("elasticity", "inertia_scale")
 }
-_PER_JOINT = ("nominal", "limits", "drive_train", "campaign", "simulation")
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
@@ -528,52 +509,46 @@ def _check(cell: Cell) -> None:
             f"is for arms that are identified from recordings, but there is a table [{tables[0]}]",
             'fix these joints in the URDF (type = "fixed")',
         )
-    for name, turns in zip(cell.joint_names, cell.model.chain.revolute, strict=True):
-        if tables and not turns:
-            raise cell.error(
-                tables[0],
-                None,
-                f"is in degrees and revolutions, but joint {name} slides",
-                'fix it in the URDF (type = "fixed"); an arm with sliding joints can be '
-                "identified from recordings, but not moved",
-            )
+    sliding = [
+        name
+        for name, turns in zip(cell.joint_names, cell.model.chain.revolute, strict=True)
+        if not turns
+    ]
+    if tables and sliding:
+        problem = f"is in degrees and revolutions, but joint {sliding[0]} slides"
+        remedy = (
+            'fix it in the URDF (type = "fixed"); an arm with sliding joints can be identified '
+            "from recordings, but not moved"
+        )
+        raise cell.error(tables[0], None, problem, remedy)
     _check_lengths(cell)
-    _build(cell, "workspace", "workspace")
-    if file.drive_train is not None:
-        _build(cell, "drive_train", "drive_train")
-    if file.limits is None:
-        return
-    if file.drive_train is not None or file.limits.frame == "urdf":
-        _build(cell, "limits", "joint_limits")
+    # What is built from a table later can be built.
+    with_drives = file.drive_train is not None
+    placed = file.limits is not None and (with_drives or file.limits.frame == "urdf")
+    for table, attribute, wanted in (
+        ("workspace", "workspace", True),
+        ("drive_train", "drive_train", with_drives),
+        ("limits", "joint_limits", placed),
+        ("bounds", "guard_limits", placed and with_drives),
+    ):
+        try:
+            _ = getattr(cell, attribute) if wanted else None
+        except (ValueError, DriverError) as error:
+            raise cell.error(table, None, str(error), "correct that table") from error
+    if placed and file.limits is not None:
         _check_limits(cell, file.limits)
         _check_postures(cell, file.limits)
-    if file.drive_train is not None:
-        _build(cell, "bounds", "guard_limits")
-
-
-def _build(cell: Cell, table: str, attribute: str) -> None:
-    """What is built from a table later can be built."""
-    try:
-        getattr(cell, attribute)
-    except CellError:
-        raise
-    except (ValueError, DriverError) as error:
-        raise cell.error(table, None, str(error), "correct that table") from error
 
 
 def _check_assumed(cell: Cell) -> None:
     """What is called assumed stands in the file."""
     for name in cell.file.cell.assumed:
         table, _, field = name.partition(".")
-        known = table in CellFile.model_fields
-        if known and getattr(cell.file, table) is None:
-            raise cell.error(
-                table,
-                None,
-                f"is missing, though cell.assumed names {name}",
-                f"add a table [{table}], or take that name out",
-            )
-        if not known or field not in type(getattr(cell.file, table)).model_fields:
+        entries = getattr(cell.file, table) if table in CellFile.model_fields else ()
+        if entries is None:
+            problem = f"is missing, though cell.assumed names {name}"
+            raise cell.error(table, None, problem, f"add a table [{table}], or take that name out")
+        if field not in dict(entries):
             remedy = 'name fields as "table.field"'
             raise cell.error("cell.assumed", name, "names no field of this file", remedy)
 
@@ -581,20 +556,17 @@ def _check_assumed(cell: Cell) -> None:
 def _check_lengths(cell: Cell) -> None:
     """Every list that has one entry per joint has as many as the URDF has joints."""
     n_joints, names = cell.model.n_joints, ", ".join(cell.joint_names)
-    tables = {name: getattr(cell.file, name) for name in _PER_JOINT}
+    tables = {name: getattr(cell.file, name) for name in ("nominal", *_TURNING_ONLY)}
     if cell.file.simulation is not None:
         tables["simulation.drive_train"] = cell.file.simulation.drive_train
     for table, entries in tables.items():
         for name, value in entries or ():
             field = f"{table}.{name}"
-            may_be_empty = field in _MAY_BE_EMPTY
-            if isinstance(value, list) and len(value) not in {n_joints, 0 if may_be_empty else -1}:
-                raise cell.error(
-                    field,
-                    value,
-                    f"has {len(value)} entries but the URDF has {n_joints} joints",
-                    f"give one entry for each of {names}{' or none' if may_be_empty else ''}",
-                )
+            allowed = {n_joints, 0} if field in _MAY_BE_EMPTY else {n_joints}
+            if isinstance(value, list) and len(value) not in allowed:
+                problem = f"has {len(value)} entries but the URDF has {n_joints} joints"
+                remedy = f"give one entry for each of {names}{' or none' * (0 in allowed)}"
+                raise cell.error(field, value, problem, remedy)
 
 
 def _check_postures(cell: Cell, table: LimitsTable) -> None:
@@ -607,29 +579,27 @@ def _check_postures(cell: Cell, table: LimitsTable) -> None:
             f", or correct the limits: no joint may go further than {furthest:.4g}°; are they in "
             "rad? 1 rad is 57.2958°"
         )
-    postures = {}
-    if file.campaign is not None:
-        postures["campaign.home_deg"] = cell.home
-    if file.simulation is not None:
-        postures["simulation.initial_deg"] = cell.initial
-    for field, posture in postures.items():
-        outside = ~((posture >= limits.lower) & (posture <= limits.upper))
-        if outside.any():
-            name = cell.joint_names[int(outside.argmax())]
-            raise cell.error(field, None, f"{name} stands outside [limits]", remedy)
+    for field, posture in (
+        ("campaign.home_deg", None if file.campaign is None else cell.home),
+        ("simulation.initial_deg", None if file.simulation is None else cell.initial),
+    ):
+        if posture is not None:
+            outside = ~((posture >= limits.lower) & (posture <= limits.upper))
+            for joint in np.flatnonzero(outside):
+                name = cell.joint_names[joint]
+                raise cell.error(field, None, f"{name} stands outside [limits]", remedy)
 
 
 def _check_limits(cell: Cell, table: LimitsTable) -> None:
     """No list in degrees holds the URDF's radians, and none is wider than the URDF allows."""
     limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
     ranges = np.subtract(table.upper_deg, table.lower_deg)
-    for field, given, radians, unit in (
-        ("lower_deg", ranges, allowed.upper - allowed.lower, "rad"),
-        ("velocity_deg", np.array(table.velocity_deg), allowed.velocity, "rad/s"),
+    for field, given, radians, unit, too in (
+        ("lower_deg", ranges, allowed.upper - allowed.lower, "rad", " (those of upper_deg too)"),
+        ("velocity_deg", np.array(table.velocity_deg), allowed.velocity, "rad/s", ""),
     ):
         stated = np.isfinite(radians)
         if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
-            too = " (those of upper_deg too)" if field == "lower_deg" else ""
             raise cell.error(
                 f"limits.{field}",
                 getattr(table, field),

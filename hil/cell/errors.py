@@ -6,7 +6,7 @@ still has one cannot be used: nothing is assumed in its place.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, get_args
 
@@ -34,61 +34,60 @@ class CellError(InputError):
 def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> CellError:
     """The first complaint of pydantic, in our words."""
     detail = error.errors(include_url=False)[0]
-    location = [part for part in detail["loc"] if not _is_union_tag(part)]
-    field = _dotted(_walk(schema, location).fields)
-    if detail["type"].startswith("union_tag"):
-        return _kind_error(path, field, detail, described(schema, location))
-    if detail["type"] == "missing":
-        return CellError(path, field, None, "is missing", f"add it: {described(schema, location)}")
-    if detail["type"] == "extra_forbidden":
-        known = ", ".join(sorted(_fields_at(schema, location[:-1])))
-        return CellError(
-            path, field, detail["input"], "is not a field that is known here", f"known are: {known}"
-        )
-    value = None if isinstance(detail["input"], dict) else detail["input"]
+    place, value, kind = _place(schema, detail["loc"]), detail["input"], detail["type"]
+    if kind.startswith("union_tag"):
+        given = value.get("kind") if isinstance(value, dict) else None
+        problem = "is missing" if given is None else "is not a kind that is known here"
+        remedy = f"the list must be {place.description}"
+        return CellError(path, f"{place.name}.kind", given, problem, remedy)
+    if kind == "missing":
+        return CellError(path, place.name, None, "is missing", f"add it: {place.description}")
+    if kind == "extra_forbidden":
+        remedy = f"known are: {', '.join(place.siblings)}"
+        return CellError(path, place.name, value, "is not a field that is known here", remedy)
     problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
-    remedy = remedy or f"it must be {described(schema, location)}"
-    return CellError(path, field, value, problem[0].lower() + problem[1:], remedy)
-
-
-def _dotted(location: list[Any]) -> str:
-    text = ""
-    for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def _is_union_tag(part: object) -> bool:
-    return isinstance(part, str) and ("[" in part or part in {"none", "str", "list", "float"})
+    problem = problem[0].lower() + problem[1:]
+    remedy = remedy or f"it must be {place.description}"
+    return CellError(path, place.name, None if isinstance(value, dict) else value, problem, remedy)
 
 
 class _Place(NamedTuple):
-    """Where a location leads in a schema.
+    """A field of a schema.
 
     Attributes:
-        model: that of the table there, None where there is none.
-        description: of the last named field on the way.
-        fields: the location without the kinds of table that pydantic adds to it.
+        name: dotted.
+        description: of the last field on the way that has one.
+        siblings: the fields of its table.
     """
 
-    model: type[BaseModel] | None
+    name: str
     description: str
-    fields: list[Any]
+    siblings: list[str]
 
 
-def _walk(schema: type[BaseModel], location: list[Any]) -> _Place:
-    models, description = [schema], "as the documentation of the cell file says"
-    fields = []
+def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
+    """Where a location of pydantic leads; its own names of kinds and unions are left out."""
+    name, description = "", "as the documentation of the cell file says"
+    models, siblings = [schema], list[str]()
     for part in location:
-        if (one := _of_kind(models, part)) is not None:
-            models = [one]
+        of_kind = [model for model in models if part in _kinds(model)]
+        if of_kind or (isinstance(part, str) and ("[" in part or part in _UNION_TAGS)):
+            models = of_kind or models
             continue
-        fields.append(part)
-        if models and part in models[0].model_fields:
-            info = models[0].model_fields[part]
-            description = info.description or f"a table [{part}]"
-            models = list(_models_of(info.annotation))
-    return _Place(models[0] if models else None, description, fields)
+        name += f"[{part}]" if isinstance(part, int) else f".{part}" if name else part
+        fields = models[0].model_fields if models else {}
+        siblings = sorted(fields)
+        if isinstance(part, str) and part in fields:
+            description = fields[part].description or f"a table [{part}]"
+            models = list(_models_of(fields[part].annotation))
+    return _Place(name, description, siblings)
+
+
+_UNION_TAGS: Final = {"none", "str", "list", "float"}
+
+
+def _kinds(model: type[BaseModel]) -> tuple[object, ...]:
+    return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
 
 
 def _models_of(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -97,32 +96,6 @@ def _models_of(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for part in get_args(annotation):
         yield from _models_of(part)
-
-
-def _of_kind(models: list[type[BaseModel]], part: object) -> type[BaseModel] | None:
-    """That of several models whose `kind` is `part`; None where this names no kind."""
-    for model in models:
-        kind = model.model_fields.get("kind")
-        if kind is not None and part in get_args(kind.annotation):
-            return model
-    return None
-
-
-def _kind_error(path: Path, field: str, detail: Any, remedy: str) -> CellError:
-    """An entry of a list of several kinds that is of none of them."""
-    given = detail["input"].get("kind") if isinstance(detail["input"], dict) else None
-    problem = "is missing" if given is None else "is not a kind that is known here"
-    return CellError(path, f"{field}.kind", given, problem, f"the list must be {remedy}")
-
-
-def described(schema: type[BaseModel], location: list[Any]) -> str:
-    """What the value at `location` must be, in the words of the schema."""
-    return _walk(schema, location).description
-
-
-def _fields_at(schema: type[BaseModel], location: list[Any]) -> list[str]:
-    model = _walk(schema, location).model
-    return list(model.model_fields) if model else []
 
 
 def _short(value: object) -> str:
@@ -196,7 +169,7 @@ def require_known(path: Path, raw: Mapping[str, Any], schema: type[BaseModel]) -
         name = ".".join(location)
         which = f" (entry {', '.join(map(str, places))})" if places else ""
         where = f"; {WHERE[name]}" if name in WHERE else ""
-        fields[name + which] = described(schema, list(location)) + where
+        fields[name + which] = _place(schema, location).description + where
     if fields:
         raise UnknownFieldsError(path, fields)
 

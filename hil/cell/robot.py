@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -30,7 +30,6 @@ from identification.model.robot import RobotModel
 
 from .errors import CellError
 from .schema import (
-    AnchoredTable,
     CouplingTable,
     ElementTable,
     ExtensionSpringTable,
@@ -60,22 +59,22 @@ def robot_model(
     Raises:
         CellError: names the field that is to blame.
     """
+    friction = robot.friction
     with _blamed(path, "cell.urdf", urdf_name, "correct the URDF"):
-        names = chain_from_urdf(urdf).joint_names if not robot.locked else _all_names(urdf)
-    _known(path, "robot.locked", robot.locked, names)
-    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF"):
+        if robot.locked:  # joints of any kind may be
+            _require(path, "robot.locked", robot.locked, tuple(pinocchio_model(urdf).names)[1:])
         chain = chain_from_urdf(urdf, robot.locked)
-    _known(path, "robot.friction.joints", robot.friction.joints, chain.joint_names)
+    _require(path, "robot.friction.joints", friction.joints, chain.joint_names)
     coupling = _coupling(path, robot.coupling, chain, drive_train)
     payload = _payload(path, robot.payload, chain)
     elements = [_element(path, place, table, chain) for place, table in enumerate(robot.elements)]
-    if robot.friction.ripple:
-        elements += ripples(chain.joint_names, drive_train(), robot.friction.ripple)
-    laws = {
-        name: _law(path, f"robot.friction.joints.{name}", _override(robot.friction, name))
-        for name in robot.friction.joints
-    }
-    common = _law(path, "robot.friction", robot.friction)
+    if friction.ripple:
+        elements += ripples(chain.joint_names, drive_train(), friction.ripple)
+    laws = {}
+    for name, own in friction.joints.items():
+        table = friction.model_copy(update=own.model_dump(exclude_unset=True))
+        laws[name] = _law(path, f"robot.friction.joints.{name}", table)
+    common = _law(path, "robot.friction", friction)
     with (
         _blamed(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"),
         _blamed(path, "robot.elements", None, "correct that table", ElementError),
@@ -104,16 +103,6 @@ def ripples(
     ]
 
 
-def _all_names(urdf: str) -> tuple[str, ...]:
-    """Every joint that moves, also of kinds that the model knows only when they are locked."""
-    return tuple(pinocchio_model(urdf).names)[1:]
-
-
-def _override(friction: FrictionTable, name: str) -> FrictionTable:
-    different = friction.joints[name].model_dump(exclude_unset=True)
-    return friction.model_copy(update=different)
-
-
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
     with _blamed(path, field, None, "correct that table"):
         return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple"}))
@@ -127,18 +116,11 @@ def _coupling(
     field, given, n = "robot.coupling.motor_from_joint", table.motor_from_joint, chain.n_joints
     if given == "drive_train":
         matrix = drive_train()
-    else:
-        widths = {len(row) for row in given} | {len(given)}
-        if widths != {n}:
-            raise CellError(
-                path,
-                field,
-                None,
-                f"is not {n} rows of {n} figures",
-                f"give a row for each motor, in it a figure for each of "
-                f"{', '.join(chain.joint_names)}",
-            )
+    elif {len(row) for row in given} | {len(given)} == {n}:
         matrix = np.array(given, dtype=np.float64)
+    else:
+        remedy = f"give a row for each motor, in it a figure for each of {_list(chain.joint_names)}"
+        raise CellError(path, field, None, f"is not {n} rows of {n} figures", remedy)
     with _blamed(path, field, None, "correct that matrix"):
         return Coupling(matrix, inertia=table.inertia, friction=table.friction)
 
@@ -157,7 +139,7 @@ def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | 
 
 def _element(path: Path, place: int, table: ElementTable, chain: Chain) -> Element:
     field = f"robot.elements[{place}]"
-    _known(path, f"{field}.joint", {table.joint: table}, chain.joint_names)
+    _require(path, f"{field}.joint", [table.joint], chain.joint_names)
     with _blamed(path, field, table.kind, "correct that table"):
         element = _built(table)
         JointElements.of([element], chain.joint_names, tuple(map(bool, chain.revolute)))
@@ -169,7 +151,7 @@ def _built(table: ElementTable) -> Element:
     if isinstance(table, TorsionSpringTable):
         rest = math.radians(table.rest_deg)
         return TorsionSpring(table.joint, rest, table.stiffness, table.identified)
-    anchors = _anchors(table)
+    anchors = Anchors(table.base_distance, table.link_distance, math.radians(table.angle_deg))
     if isinstance(table, ExtensionSpringTable):
         return ExtensionSpring(
             table.joint,
@@ -191,20 +173,15 @@ def _built(table: ElementTable) -> Element:
     )
 
 
-def _anchors(table: AnchoredTable) -> Anchors:
-    return Anchors(table.base_distance, table.link_distance, math.radians(table.angle_deg))
-
-
-def _known(path: Path, field: str, named: Mapping[str, object], joints: tuple[str, ...]) -> None:
+def _require(path: Path, field: str, named: Iterable[str], joints: Sequence[str]) -> None:
     for name in named:
         if name not in joints:
-            raise CellError(
-                path,
-                field,
-                name,
-                "is no moving joint of the URDF",
-                f"its joints are {', '.join(joints)}",
-            )
+            problem, remedy = "is no moving joint of the URDF", f"its joints are {_list(joints)}"
+            raise CellError(path, field, name, problem, remedy)
+
+
+def _list(joints: Sequence[str]) -> str:
+    return ", ".join(joints)
 
 
 @contextmanager

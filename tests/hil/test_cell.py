@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from drivers.transports.udp import UdpSpec
-from hil.cell import Cell, CellError
+from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.schema import CanTable, CellFile
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
@@ -67,9 +67,9 @@ def test_limits_of_the_teach_pendant_become_angles_of_the_urdf(folder: Path) -> 
 
 def test_angles_go_to_the_teach_pendant_and_back(folder: Path) -> None:
     cell = Cell.load(folder / "cell.toml")
-    home = cell.home
-    assert np.degrees(cell.controller_angles(home)) == pytest.approx(cell.campaign.home_deg)
-    assert cell.urdf_angles(cell.controller_angles(home)) == pytest.approx(home)
+    shown, frame = np.array(cell.campaign.home_deg), AngleFrame.pendant(cell)
+    assert np.degrees(cell.controller_angles(cell.home)) == pytest.approx(shown)
+    assert frame.shown(frame.urdf(shown)) == pytest.approx(shown)
 
 
 def test_planted_values_are_the_manufacturers_column_of_table_2(folder: Path) -> None:
@@ -414,9 +414,10 @@ def tables(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type
     for name, info in model.model_fields.items():
         for part in parts(info.annotation):
             kind = part.model_fields.get("kind")
-            full = prefix + name + ("" if kind is None else f".{get_args(kind.annotation)[0]}")
-            yield full, part
-            yield from tables(part, f"{full}.")
+            for one in [""] if kind is None else [f".{one}" for one in get_args(kind.annotation)]:
+                full = f"{prefix}{name}{one}"
+                yield full, part
+                yield from tables(part, f"{full}.")
 
 
 def parts(annotation: Any) -> Iterator[type[BaseModel]]:

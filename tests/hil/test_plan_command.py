@@ -80,7 +80,7 @@ def test_degrees_are_the_teach_pendants_and_end_up_in_the_frame_of_the_urdf(run,
     np.testing.assert_allclose(out["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
     frame = AngleFrame.of(cell)
     pendant = np.array([40.0, 30.0, -60.0, 50.0, 40.0, 10.0])
-    np.testing.assert_allclose(frame.urdf(pendant), cell.urdf_angles(np.radians(pendant)))
+    np.testing.assert_allclose(np.degrees(cell.controller_angles(frame.urdf(pendant))), pendant)
     np.testing.assert_allclose(frame.shown(frame.urdf(pendant)), pendant)
 
 

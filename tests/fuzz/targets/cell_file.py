@@ -93,7 +93,7 @@ def used(cell: Cell) -> None:
         lambda: cell.torque_limit, lambda: cell.session_settings(), lambda: cell.transport_spec(),
         lambda: cell.only_simulated, lambda: cell.workspace, lambda: cell.home,
         lambda: cell.initial, lambda: cell.nominal_values(), lambda: cell.period,
-        lambda: cell.mesh_folders, lambda: cell.urdf_angles(np.zeros(n)),
+        lambda: cell.mesh_folders,
         lambda: cell.controller_angles(np.zeros(n)), lambda: cell.campaign,
     )  # fmt: skip
     for make in makers:
