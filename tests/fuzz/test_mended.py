@@ -103,15 +103,24 @@ def test_a_cell_is_not_begun_from_what_an_archive_cannot_say(
     assert raised.value.remedy
 
 
-@pytest.mark.parametrize("written", ['controller = { transport = "simulated", cycle_ms = 2 }', ""])
+@pytest.mark.parametrize(
+    ("written", "remedy"),
+    [
+        (
+            'controller = { transport = "simulated", cycle_ms = 2 }',
+            r"write \[controller\] in a line of its own",
+        ),
+        ("", r"controller\.cycle_ms: is missing; add it"),
+    ],
+)
 def test_a_cell_whose_link_cannot_be_changed_says_how_to_write_it(
-    tmp_path: Path, written: str
+    tmp_path: Path, written: str, remedy: str
 ) -> None:
     begin, _, rest = CELL.partition("[controller]")
     path = tmp_path / "cell.toml"
     (tmp_path / "fast.urdf").write_text(CELLS_URDF)
     path.write_text(f"{written}\n{begin}{rest[rest.index('[campaign]') :]}")
-    with pytest.raises(InputError, match=r"write \[controller\] in a line of its own"):
+    with pytest.raises(InputError, match=remedy):
         Cell.load(path).with_link(transport="udp")
 
 
