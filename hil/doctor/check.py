@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 class Status(StrEnum):
-    """How a check came out."""
+    """How a check came out: it works, costs latency or depends on chance, fails, is not known."""
 
     OK = "ok"
     WARN = "warn"

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 from scipy.special import gammaincinv
 
 from drivers.exchange.realtime import RealTimeReport
@@ -52,19 +52,13 @@ class Latency:
 
     Attributes:
         name: "wake-up" or "turnaround".
-        samples: (m,) s, finite and not negative, m >= 1.
+        samples: (m,) s, m >= 1.
         seconds: how long was measured.
     """
 
     name: str
     samples: NDArray[np.float64]
     seconds: float
-
-    def __post_init__(self) -> None:
-        if self.samples.ndim != 1 or not len(self.samples) or not self.seconds > 0:
-            raise ValueError(f"{self.name}: no samples")
-        if not (np.isfinite(self.samples).all() and (self.samples >= 0).all()):
-            raise ValueError(f"{self.name}: samples must be finite and not negative")
 
     def percentile(self, percent: float) -> float:
         """The smallest sample that `percent` of all do not exceed, s."""
@@ -77,26 +71,24 @@ class Latency:
         """
         return int(np.floor((self.samples + RESERVE) / period).sum())
 
-    def histogram(self) -> list[tuple[str, int]]:
-        """Bars: bounds in µs, and how many samples lie in them (lower bound included)."""
+    def histogram(self) -> dict[str, int]:
+        """How many samples lie within bounds in µs, lower bound included."""
         counts, _ = np.histogram(self.samples, EDGES)
         finite = (1e6 * EDGES[:-1]).tolist()
         bounds = [f"{low:.0f}-{high:.0f}" for low, high in pairwise(finite)]
-        return list(zip([*bounds, f"over {finite[-1]:.0f}"], counts.tolist(), strict=True))
+        return dict(zip([*bounds, f"over {finite[-1]:.0f}"], counts.tolist(), strict=True))
 
     def summary(self) -> dict[str, float | int]:
         """Figures for scripts, µs."""
-        figures: dict[str, float | int] = {
-            f"p{str(p).replace('.', '')}_us": round(1e6 * self.percentile(p), 1)
-            for p in (50, 99, 99.9)
+        percentiles = {"p50_us": 50.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
+        return {
+            **{name: round(1e6 * self.percentile(p), 1) for name, p in percentiles.items()},
+            "samples": len(self.samples),
+            **{f"late_cycles_{cycle}ms": self.late_cycles(cycle / 1000) for cycle in CYCLES_MS},
         }
-        figures["max_us"] = round(1e6 * float(self.samples.max()), 1)
-        figures["samples"] = len(self.samples)
-        for cycle_ms in (1, 2):
-            figures[f"late_cycles_{cycle_ms}ms"] = self.late_cycles(cycle_ms / 1000)
-        return figures
 
 
+CYCLES_MS: Final = (1, 2)
 CRITERIA: Final = (
     f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs "
     "reserved for packet work and wire, and 99.9 % of the latencies used at most half of it"
@@ -113,37 +105,37 @@ class Fitness:
     Attributes:
         cycle_ms: the controller's cycle.
         fit: by `CRITERIA`.
-        late: cycles late in the measurement.
+        late_cycles: in the measurement.
+        share_used: largest 99.9 % latency plus reserve, as a share of the cycle; None if nothing
+            was measured.
         late_per_hour_upper_95: upper bound of the rate with 95 % confidence, one-sided, for late
             cycles that come independently of each other (Poisson). Those of one long stall do not.
-        used: largest 99.9 % latency plus reserve, as a share of the cycle.
         reason: in words.
     """
 
     cycle_ms: int
     fit: bool
-    late: int
-    late_per_hour_upper_95: float
-    used: float
+    late_cycles: int
+    share_used: float | None
+    late_per_hour_upper_95: float | None
     reason: str
 
 
 def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     """Judge a cycle by the worse of the latencies; without any, it is not fit."""
     if not latencies:
-        return Fitness(cycle_ms, False, 0, float("nan"), float("nan"), "nothing was measured")
+        return Fitness(cycle_ms, False, 0, None, None, "nothing was measured")
     period = cycle_ms / 1000
-    late, worst = max(((each.late_cycles(period), each) for each in latencies), key=lambda p: p[0])
+    worst = max(latencies, key=lambda each: each.late_cycles(period))
     slow = max(latencies, key=lambda each: each.percentile(99.9))
-    used = (slow.percentile(99.9) + RESERVE) / period
+    late, used = worst.late_cycles(period), (slow.percentile(99.9) + RESERVE) / period
     hours = worst.seconds / 3600.0
     # The mean whose Poisson distribution gives `late` or fewer with 5 % probability only.
     bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
     if late:
-        longest = 1e3 * float(worst.samples.max())
         reason = (
-            f"{late} cycles late in {worst.seconds:.0f} s of {worst.name} "
-            f"(some {late / hours:.0f} an hour), the longest {longest:.1f} ms"
+            f"{late} cycles late in {worst.seconds:.0f} s of {worst.name} (some "
+            f"{late / hours:.0f} an hour), the longest {1e3 * worst.samples.max():.1f} ms"
         )
     elif used > 0.5:
         reason = f"none late, but {slow.name} uses {100 * used:.0f} % of the cycle at 99.9 %"
@@ -152,7 +144,8 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
             f"none late in {worst.seconds:.0f} s (fewer than {bound:.0f} an hour, with 95 % "
             f"confidence); {100 * used:.0f} % of the cycle used at 99.9 %"
         )
-    return Fitness(cycle_ms, not late and used <= 0.5, late, bound, used, reason)
+    fit = not late and used <= 0.5
+    return Fitness(cycle_ms, fit, late, round(used, 4), round(bound, 4), reason)
 
 
 TURNAROUND_PERIOD = 1e-3
@@ -173,73 +166,51 @@ def disk_trial(place: Path) -> DiskTrial | None:
     return None if answer is None else DiskTrial(**answer)
 
 
-def measure(
-    name: str, kind: str, period: float, seconds: float, reporter: Reporter
-) -> Latency | None:
-    """Run a latency probe (`wake-ups` or `turnaround`) under a progress bar; None if it failed."""
+def measure(name: str, period: float, seconds: float, reporter: Reporter) -> Latency | None:
+    """Run a latency probe (`wake-up` or `turnaround`) under a progress bar; None if it failed."""
     with tempfile.TemporaryDirectory() as folder, reporter.task(name, seconds) as task:
         file = Path(folder) / "latency.npy"
-        words = [kind, repr(period), repr(seconds), str(file)]
-        if run_probe(words, seconds, task.advance) is None:
+        if run_probe([name, repr(period), repr(seconds), str(file)], seconds, task.advance) is None:
             return None
-        try:
-            return Latency(name, np.load(file).astype(np.float64), seconds)
-        except (OSError, ValueError):
-            return None
+        return Latency(name, np.load(file).astype(np.float64), seconds)
 
 
 def run_probe(
-    words: Sequence[str], seconds: float, advance: Callable[[float], None] | None = None
+    words: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any] | None:
-    """The JSON answer of `hil.doctor.probe`; None if it failed or took `_GRACE` s too long."""
-    command = [sys.executable, "-m", "hil.doctor.probe", *words]
+    """The JSON answer of `hil.doctor.probe`; None if it failed or took `_GRACE` s too long.
+
+    Args:
+        words: of its command line.
+        seconds: that it measures.
+        advance: is called with the seconds that passed meanwhile.
+    """
     probe = subprocess.Popen(
-        command,
+        [sys.executable, "-m", "hil.doctor.probe", *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
     )
+    began, shown, output = time.monotonic(), 0.0, ""
     try:
-        output = _wait(probe, seconds, advance)
+        while (passed := time.monotonic() - began) < seconds + _GRACE:
+            advance(min(passed, seconds) - shown)
+            shown = min(passed, seconds)
+            with suppress(subprocess.TimeoutExpired):
+                output = probe.communicate(timeout=0.2)[0]
+                break
+        advance(seconds - shown)
     finally:
-        _end(probe)
-    try:
-        answer = json.loads(output.splitlines()[-1]) if output and not probe.returncode else None
-    except ValueError:
-        return None
-    return answer if isinstance(answer, dict) else None
-
-
-def _wait(
-    probe: subprocess.Popen[str], seconds: float, advance: Callable[[float], None] | None
-) -> str | None:
-    """What the probe printed; advances the bar by the time that passed, up to `seconds`."""
-    began, shown = time.monotonic(), 0.0
-    while (passed := time.monotonic() - began) < seconds + _GRACE:
-        try:
-            output = probe.communicate(timeout=0.2)[0]
-            if advance is not None and seconds > shown:
-                advance(seconds - shown)
-            return output
-        except subprocess.TimeoutExpired:
-            step = min(passed, seconds) - shown
-            if advance is not None and step > 0:
-                advance(step)
-                shown += step
-    return None
-
-
-def _end(probe: subprocess.Popen[str]) -> None:
-    """Kill what still runs; one caught in a dead disk is not waited for."""
-    probe.kill()
-    with suppress(subprocess.TimeoutExpired):
-        probe.wait(timeout=1.0)
-    if probe.stdout is not None:
-        probe.stdout.close()
-
-
-CYCLES_MS = (1, 2)
+        probe.kill()
+        with suppress(subprocess.TimeoutExpired):  # one caught in a dead disk is not waited for
+            probe.wait(timeout=1.0)
+        if probe.stdout is not None:
+            probe.stdout.close()
+    answer: dict[str, Any] | None = None
+    if output and probe.returncode == 0:
+        answer = json.loads(output.splitlines()[-1])
+    return answer
 
 
 @dataclass(frozen=True)
@@ -249,28 +220,30 @@ class Diagnosis:
     Attributes:
         checks: in the order of a reader's interest.
         latencies: measured; an empty tuple if no probe ran.
-        one: verdict on 1 ms.
-        two: verdict on 2 ms.
+        cycles: verdicts on 1 and 2 ms.
         cycle_ms: the cycle that has to be fit.
         seconds: length of each measurement.
     """
 
     checks: tuple[Check, ...]
     latencies: tuple[Latency, ...]
-    one: Fitness
-    two: Fitness
+    cycles: tuple[Fitness, Fitness]
     cycle_ms: int
     seconds: float
 
     @property
-    def wanted(self) -> Fitness:
-        """The verdict on the cycle that has to be fit."""
-        return self.one if self.cycle_ms == CYCLES_MS[0] else self.two
+    def cycle_fit(self) -> bool:
+        """Whether the cycle is fit that has to be."""
+        return self.cycles[CYCLES_MS.index(self.cycle_ms)].fit
 
     @property
     def fit(self) -> bool:
         """Whether the cell's link can be run from this PC: cycle fit, and no check bad."""
-        return self.wanted.fit and not any(check.status is Status.BAD for check in self.checks)
+        return self.cycle_fit and not self._bad
+
+    @property
+    def _bad(self) -> list[str]:
+        return [check.name for check in self.checks if check.status is Status.BAD]
 
     @property
     def provisional(self) -> bool:
@@ -280,17 +253,17 @@ class Diagnosis:
     @property
     def line(self) -> str:
         """The verdict in one or two sentences."""
+        one, two = (verdict.fit for verdict in self.cycles)
         words = {
             (True, True): "1 ms is fit, and so is 2 ms.",
             (True, False): "1 ms is fit.",
             (False, True): "2 ms is fit; 1 ms is not.",
             (False, False): "Neither 1 ms nor 2 ms is fit.",
-        }[self.one.fit, self.two.fit]
-        unfit = [check.name for check in self.checks if check.status is Status.BAD]
+        }[one, two]
         if self.fit:
             words += f" This PC can answer a controller at {self.cycle_ms} ms."
-        elif self.wanted.fit:
-            words += f" But the link will not work as it is: {', '.join(unfit)}."
+        elif self.cycle_fit:
+            words += f" But the link will not work as it is: {', '.join(self._bad)}."
         else:
             words += f" Do not connect an arm at {self.cycle_ms} ms."
         if self.provisional:
@@ -304,7 +277,6 @@ def examine(
     seconds: float,
     place: Path,
     reporter: Reporter,
-    system: System | None = None,
 ) -> Diagnosis:
     """Look at this PC and measure it for twice `seconds`.
 
@@ -314,9 +286,8 @@ def examine(
         seconds: length of each measurement.
         place: where archives will be written.
         reporter: shows progress.
-        system: the machine, this one if left out.
     """
-    system = system or System()
+    system = System()
     reporter.say("looking at this PC; no packet is sent to the controller")
     given = obtained()
     checks = [
@@ -327,10 +298,8 @@ def examine(
         machine.load(system),
     ]
     before = system.text("/proc/stat") or ""
-    measured = {
-        "wake-up": measure("wake-up", "wake-ups", cycle_ms / 1000, seconds, reporter),
-        "turnaround": measure("turnaround", "turnaround", TURNAROUND_PERIOD, seconds, reporter),
-    }
+    periods = {"wake-up": cycle_ms / 1000, "turnaround": TURNAROUND_PERIOD}
+    measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     checks.append(machine.stolen(before, system.text("/proc/stat") or ""))
     look = "python -m hil.doctor.probe permissions   # says why"
     checks += [
@@ -340,7 +309,7 @@ def examine(
     ]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
     one, two = (judge(latencies, cycle) for cycle in CYCLES_MS)
-    return Diagnosis(tuple(checks), latencies, one, two, cycle_ms, seconds)
+    return Diagnosis(tuple(checks), latencies, (one, two), cycle_ms, seconds)
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
@@ -357,43 +326,37 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
     for title in ("check", "", "found"):
         table.add_column(title, overflow="fold")
     for check in diagnosis.checks:
-        status = f"[{_COLOUR[check.status]}]{check.status}[/]"
-        table.add_row(escape(check.name), status, escape(printable(check.found)))
+        status = Text(check.status, style=_COLOUR[check.status])
+        table.add_row(Text(check.name), status, Text(printable(check.found)))
     console.print(table)
-    for latency in diagnosis.latencies:
-        console.print("\n".join(histogram(latency)), markup=False, highlight=False)
-        console.print()
-    lines = [
+    lines = [line for latency in diagnosis.latencies for line in (*histogram(latency), "")]
+    lines += [
         f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
-        for verdict in (diagnosis.one, diagnosis.two)
+        for verdict in diagnosis.cycles
     ]
     lines += [f"({CRITERIA})", *remedies(diagnosis.checks)]
-    if not diagnosis.wanted.fit:
-        lines.append("\n" + _OTHERWISE.format("use 2 ms; " if diagnosis.two.fit else ""))
-    for line in lines:
+    if not diagnosis.cycle_fit:
+        lines.append("\n" + _OTHERWISE.format("use 2 ms; " if diagnosis.cycles[1].fit else ""))
+    for line in (*lines, ""):
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
-    console.print()
-    colour = "green" if diagnosis.fit else "red"
-    console.print(
-        f"[bold {colour}]{escape(printable(diagnosis.line))}[/]", highlight=False, soft_wrap=True
-    )
+    style = "bold green" if diagnosis.fit else "bold red"
+    console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
 
 
 def histogram(latency: Latency) -> Iterator[str]:
     """Percentiles and bars on a logarithmic scale: rare stalls are what matters."""
-    p50, p99, p999 = (1e6 * latency.percentile(percent) for percent in (50, 99, 99.9))
-    worst = 1e6 * float(latency.samples.max())
+    p50, p99, p999, worst = (1e6 * latency.percentile(p) for p in (50, 99, 99.9, 100))
     yield (
         f"{latency.name}: p50 {p50:.0f}  p99 {p99:.0f}  p99.9 {p999:.0f}  max {worst:.0f} µs, "
         f"{len(latency.samples)} samples in {latency.seconds:g} s"
     )
     most = math.log1p(len(latency.samples))
-    for bounds, count in latency.histogram():
-        bar = "█" * math.ceil(_BAR * math.log1p(count) / most) if count else ""
+    for bounds, count in latency.histogram().items():
+        bar = "█" * math.ceil(_BAR * math.log1p(count) / most)
         yield f"  {bounds:>10} µs {count:>8} {bar}"
 
 
-def remedies(checks: tuple[Check, ...]) -> Iterator[str]:
+def remedies(checks: Sequence[Check]) -> Iterator[str]:
     """What to change, worst first: reason, then commands, each of them once."""
     given: set[str] = set()
     for status in (Status.BAD, Status.WARN, Status.UNKNOWN):
@@ -413,23 +376,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, object]:
         "verdict": diagnosis.line,
         "criteria": CRITERIA,
         "seconds": diagnosis.seconds,
-        "cycles": [_verdict(verdict) for verdict in (diagnosis.one, diagnosis.two)],
+        "cycles": [asdict(verdict) for verdict in diagnosis.cycles],
         "latency": {each.name: each.summary() for each in diagnosis.latencies},
         "checks": [asdict(check) | {"why": check.why} for check in diagnosis.checks],
     }
-
-
-def _verdict(verdict: Fitness) -> dict[str, object]:
-    figures = asdict(verdict)
-    return {
-        "cycle_ms": figures.pop("cycle_ms"),
-        "fit": figures.pop("fit"),
-        "late_cycles": figures.pop("late"),
-        "share_used": _finite(figures.pop("used")),
-        **figures,
-        "late_per_hour_upper_95": _finite(verdict.late_per_hour_upper_95),
-    }
-
-
-def _finite(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None

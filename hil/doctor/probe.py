@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -149,32 +148,21 @@ def _say(answer: object) -> None:
     sys.stdout.flush()
 
 
-def _measured(measure: Callable[[float, float], NDArray[np.float32]], words: list[str]) -> None:
-    period, seconds, file = float(words[0]), float(words[1]), Path(words[2])
-    np.save(file, measure(period, seconds))
-    _say({"file": str(file)})
-
-
-def _timed_wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
-    enter(RealTimeSettings())
-    return wake_ups(period, seconds)
-
-
 def main(words: list[str]) -> None:
     """Run one probe."""
     kind, *rest = words
     if kind == "permissions":
         _say(asdict(enter(RealTimeSettings())))
-    elif kind == "wake-ups":
-        _measured(_timed_wake_ups, rest)
-    elif kind == "turnaround":
-        _measured(turnaround, rest)
-    elif kind == "echo":
-        echo()
     elif kind == "disk":
         _say(disk(Path(rest[0])))
+    elif kind == "echo":
+        echo()
     else:
-        raise SystemExit(f"no probe is called {kind!r}")
+        measure = {"wake-up": wake_ups, "turnaround": turnaround}[kind]
+        if kind == "wake-up":
+            enter(RealTimeSettings())
+        np.save(rest[2], measure(float(rest[0]), float(rest[1])))
+        _say({"file": rest[2]})
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def test_a_stall_costs_as_many_cycles_as_it_is_long() -> None:
 @given(samples)
 def test_every_sample_is_in_one_bar(values: list[float]) -> None:
     measured = latency(*values)
-    assert sum(count for _, count in measured.histogram()) == len(values)
+    assert sum(measured.histogram().values()) == len(values)
 
 
 @given(samples, st.floats(0.1, 99.9))
@@ -80,16 +80,10 @@ def test_a_percentile_is_a_sample_that_so_many_do_not_exceed(
     assert np.mean(np.array(values) <= found) >= percent / 100 - 1e-12
 
 
-@pytest.mark.parametrize("values", [[], [np.nan], [-1e-9], [np.inf], [[1e-6]]])
-def test_what_is_no_latency_is_refused(values: list[float]) -> None:
-    with pytest.raises(ValueError, match="turnaround"):
-        Latency("turnaround", np.array(values), 1.0)
-
-
 @given(samples, st.floats(0.0, 0.01))
 def test_one_more_latency_never_makes_a_cycle_fit(values: list[float], more: float) -> None:
     before, after = judge([latency(*values)], 1), judge([latency(*values, more)], 1)
-    assert after.late >= before.late
+    assert after.late_cycles >= before.late_cycles
     assert judge([latency(*values), latency(more)], 1).fit <= before.fit
 
 
@@ -102,14 +96,14 @@ def test_a_quiet_pc_is_fit_and_what_cannot_be_excluded_is_said() -> None:
     quiet = judge([latency(*np.full(60_000, 60e-6))], 1)
     assert quiet.fit
     # A mean of ln 20 = 2.996 late cycles in 60 s shows none with 5 % probability.
-    assert quiet.late_per_hour_upper_95 == pytest.approx(60 * np.log(20))
+    assert quiet.late_per_hour_upper_95 == pytest.approx(60 * np.log(20), abs=1e-4)
     assert "fewer than 180 an hour" in quiet.reason
 
 
 def test_one_late_cycle_in_the_measurement_is_not_fit() -> None:
     rare = judge([latency(*np.full(60_000, 60e-6), 1.2e-3)], 1)
     assert not rare.fit
-    assert rare.late == 1
+    assert rare.late_cycles == 1
     assert "some 60 an hour" in rare.reason
     # (1 + m) exp(-m) = 5 % for m = 4.744: the bound lies well above what was seen.
     assert rare.late_per_hour_upper_95 == pytest.approx(60 * 4.744, rel=1e-3)
@@ -117,7 +111,7 @@ def test_one_late_cycle_in_the_measurement_is_not_fit() -> None:
 
 def test_a_pc_that_is_always_slow_is_not_fit_though_nothing_was_late() -> None:
     slow = judge([latency(*np.full(1000, 450e-6))], 1)
-    assert (slow.fit, slow.late) == (False, 0)
+    assert (slow.fit, slow.late_cycles) == (False, 0)
     assert "55 % of the cycle" in slow.reason
 
 
@@ -140,11 +134,11 @@ def test_nothing_measured_is_not_fit() -> None:
     ],
 )
 def test_the_verdict_is_a_sentence(one: bool, two: bool, words: str) -> None:
-    assert Diagnosis((), (), verdict(1, one), verdict(2, two), 1, 60.0).line.startswith(words)
+    assert Diagnosis((), (), (verdict(1, one), verdict(2, two)), 1, 60.0).line.startswith(words)
 
 
 def verdict(cycle_ms: int, fit: bool) -> Fitness:
-    return Fitness(cycle_ms, fit, 0, 0.0, 0.1, "for a reason")
+    return Fitness(cycle_ms, fit, 0, 0.1, 0.0, "for a reason")
 
 
 # --- diagnosis and report --------------------------------------------------------------------
@@ -153,7 +147,7 @@ PORT = bad("UDP port 1000", "in use [by] a", "sudo ss -lunp")
 
 def diagnosis(*checks: Check, fit: bool = True, seconds: float = 60.0) -> Diagnosis:
     measured = (latency(50e-6, 3e-3, length=seconds),)
-    return Diagnosis(checks, measured, verdict(1, fit), verdict(2, True), 1, seconds)
+    return Diagnosis(checks, measured, (verdict(1, fit), verdict(2, True)), 1, seconds)
 
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
@@ -210,7 +204,8 @@ def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
 def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit() -> None:
     def page(two: bool) -> str:
         console = Console(record=True, width=100, file=io.StringIO())
-        show(Diagnosis((), (latency(3e-3),), verdict(1, False), verdict(2, two), 1, 60.0), console)
+        verdicts = verdict(1, False), verdict(2, two)
+        show(Diagnosis((), (latency(3e-3),), verdicts, 1, 60.0), console)
         return console.export_text()
 
     assert "use 2 ms" in page(two=True)
@@ -228,7 +223,7 @@ def test_the_json_says_what_the_page_says() -> None:
     assert found["fit"] is False
     assert found["checks"][0]["remedy"] == ["sudo ss -lunp"]
     assert found["latency"]["turnaround"]["late_cycles_1ms"] == 3
-    empty = Diagnosis((), (), judge([], 1), judge([], 2), 1, 60.0)
+    empty = Diagnosis((), (), (judge([], 1), judge([], 2)), 1, 60.0)
     assert json.loads(json.dumps(as_json(empty)))["cycles"][0]["late_per_hour_upper_95"] is None
 
 
@@ -297,7 +292,7 @@ def test_a_probe_that_fails_or_hangs_gives_nothing(monkeypatch: pytest.MonkeyPat
     began = time.monotonic()
     assert run_probe(["echo"], 0.0) is None  # waits 5 s for packets
     assert time.monotonic() - began < 4.0
-    assert measure("wake-up", "no such probe", 1e-3, 0.1, Silent()) is None
+    assert measure("no such probe", 1e-3, 0.1, Silent()) is None
 
 
 def test_the_disk_is_tried_where_the_archives_will_be(tmp_path: Path) -> None:
