@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -101,7 +102,7 @@ def new(
         stated = from_archive(from_archive_file, made.joint_names)
         # Limits belong together, with their frame.
         known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
-    made = made.with_known(known)
+    made = replace(made, known=known)
     text, unknown = (made.for_design() if design_only else made).text(output)
     if design_only and not unknown:
         text = with_clear_home(text, made, output)

@@ -105,20 +105,16 @@ def _fix(joint: ET.Element, position: float) -> None:
             place = place + rotation.apply(along * position)
         else:
             rotation = rotation * Rotation.from_rotvec(along * position)
-        origin.set("xyz", _text(place))
-        origin.set("rpy", _text(rotation.as_euler("xyz")))
+        for name, values in (("xyz", place), ("rpy", rotation.as_euler("xyz"))):
+            origin.set(name, " ".join(repr(float(value)) for value in values))
     joint.set("type", "fixed")
-    for tag in _OF_MOVING_JOINTS:
-        for element in joint.findall(tag):
+    for element in [*joint]:
+        if element.tag in _OF_MOVING_JOINTS:
             joint.remove(element)
 
 
 def _three(text: str | None, default: str) -> Array:
     return np.array([float(part) for part in (text or default).split()])
-
-
-def _text(values: Array) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 _ONE_FOR_ALL: Final = frozenset(
@@ -145,7 +141,7 @@ class NewCell:
         joint_names: those that move, in the order of all lists.
         urdf: its text, None where the file that was named is used as it is.
         urdf_path: of the URDF (or the table of DH parameters) that was read.
-        collision: the collision shapes' mesh paths; None where the URDF has no shapes at all.
+        meshes: the collision shapes' mesh paths that begin with `package://`.
         known: what is known of it.
         design_only: whether motions are designed and not run: no drive train, no controller.
     """
@@ -154,7 +150,7 @@ class NewCell:
     joint_names: tuple[str, ...]
     urdf: str | None
     urdf_path: Path
-    collision: tuple[str, ...] | None
+    meshes: tuple[str, ...]
     known: Known
     design_only: bool = False
 
@@ -227,10 +223,10 @@ class NewCell:
 
     def _mesh_folders(self, folder: Path) -> list[str] | None:
         """Folders in which the paths of collision meshes begin; None where none is needed."""
-        if not self.collision:
+        if not self.meshes:
             return None
         found: dict[str, None] = {}
-        for mesh in self.collision:
+        for mesh in self.meshes:
             relative = mesh.removeprefix("package://")
             above = self.urdf_path.resolve().parents
             place = next((place for place in above if (place / relative).is_file()), None)
@@ -248,10 +244,6 @@ class NewCell:
             f"{name} = {toml_value([round(speed / seconds, _ROUND) for speed in speeds])}"
             for name, seconds in (("acceleration_deg", 0.3), ("jerk_deg", 0.03))
         ]
-
-    def with_known(self, known: Known) -> NewCell:
-        """The same arm, with other things known of it."""
-        return replace(self, known=known)
 
     def for_design(self) -> NewCell:
         """The same arm, its motions to be designed only; what can be assumed is."""
@@ -303,54 +295,48 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
     """What the URDF that was read from `path` says of a cell."""
     chain = _chain(path, text)
-    unknown = sorted(set(fixed) - set(chain.joint_names))
-    if unknown:
-        raise InputError(
-            path,
-            f"has no moving joint {unknown[0]}",
-            remedy=f"it has {', '.join(chain.joint_names)}",
-        )
-    sliding = [
-        name
-        for name, turns in zip(chain.joint_names, chain.revolute, strict=True)
+    names = chain.joint_names
+    if unknown := sorted(set(fixed) - set(names)):
+        remedy = f"it has {', '.join(names)}"
+        raise InputError(path, f"has no moving joint {unknown[0]}", remedy=remedy)
+    limits = urdf_limits(text, names)
+    nearest = dict(zip(names, np.clip(0.0, limits.lower, limits.upper).tolist(), strict=True))
+    sliding = {
+        name: nearest[name]
+        for name, turns in zip(names, chain.revolute, strict=True)
         if not turns and name not in fixed
-    ]
-    limits = urdf_limits(text, chain.joint_names)
-    nearest = np.clip(0.0, limits.lower, limits.upper)  # to zero
-    positions = {name: float(nearest[chain.joint_names.index(name)]) for name in sliding}
-    following = {
-        name: led
-        for name, led in mimics(text).items()
-        if name in chain.joint_names and name not in sliding
     }
-    positions |= {name: offset for name, (_, offset) in following.items()} | {**fixed}
-    notes = tuple(
-        f"{name} slides, and is fixed at {positions[name]:g} m in the cell's copy of the URDF; "
+    following = {
+        name: led for name, led in mimics(text).items() if name in names and name not in sliding
+    }
+    positions = sliding | {name: offset for name, (_, offset) in following.items()} | {**fixed}
+    notes = [
+        f"{name} slides, and is fixed at {position:g} m in the cell's copy of the URDF; "
         f"--fix {name}=… for another position"
-        for name in sliding
-    )
-    notes += tuple(
+        for name, position in sliding.items()
+    ]
+    notes += [
         f"{name} follows {leader} (<mimic>), which no model here does: it is fixed at "
         f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
         "position. If it is part of a linkage that carries the arm, this model is not of your arm"
         for name, (leader, _) in following.items()
-    )
+    ]
     used = with_fixed(text, positions) if positions else text
     moving = _chain(path, used).joint_names
     shapes = _COLLISION.findall(text)
-    meshes = sorted({mesh for shape in shapes for mesh in _MESH.findall(shape)})
     if not shapes:
-        notes += (
+        notes.append(
             "the URDF has no <collision> shapes: add some (boxes, cylinders and spheres will do) "
-            "before the arm is moved",
+            "before the arm is moved"
         )
+    name = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", used)
     return NewCell(
-        name=_robot_name(used) or path.stem,
+        name=(name[1].strip()[:80] if name else "") or path.stem,
         joint_names=moving,
         urdf=used if positions else None,
         urdf_path=path,
-        collision=tuple(meshes) if shapes else None,
-        known=from_urdf(used, moving) | Known(notes=notes),
+        meshes=tuple(sorted({mesh for shape in shapes for mesh in _MESH.findall(shape)})),
+        known=from_urdf(used, moving) | Known(notes=tuple(notes)),
     )
 
 
@@ -360,11 +346,6 @@ def _chain(path: Path, urdf: str) -> Chain:
             return chain_from_urdf(urdf)
     except ModelError as error:
         raise InputError(path, str(error), remedy="correct the URDF") from error
-
-
-def _robot_name(urdf: str) -> str:
-    found = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", urdf)
-    return found[1].strip()[:80] if found else ""
 
 
 _TURNED: Final = 3
@@ -383,19 +364,14 @@ def with_clear_home(text: str, new: NewCell, path: Path) -> str:
         checker = collision_checker(cell)
     except CellError:
         return text
-    limits = cell.joint_limits
-    for posture in _postures(cell.home):
-        inside = (posture > limits.lower) & (posture < limits.upper)
-        if inside.all() and clearance(checker, posture[None]) is None:
-            shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
-            return with_values(text, {"campaign.home_deg": shown})
-    return text
-
-
-def _postures(home: Array) -> Iterator[Array]:
+    limits, home = cell.joint_limits, cell.home
     for count in range(_TURNED + 1):
         for joints in combinations(range(len(home)), count):
             for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=count):
                 posture = home.copy()
                 posture[list(joints)] += turns
-                yield posture
+                inside = (posture > limits.lower) & (posture < limits.upper)
+                if inside.all() and clearance(checker, posture[None]) is None:
+                    shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
+                    return with_values(text, {"campaign.home_deg": shown})
+    return text

@@ -18,7 +18,7 @@ from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.guard import GuardLimits
 from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
-from hil.archive import Archive, open_archive
+from hil.archive import open_archive
 from hil.campaign import Stop
 from hil.campaign.live_link import ExchangeView
 from hil.campaign.motion_link import END_TIMEOUT
@@ -51,7 +51,13 @@ class Known:
     @classmethod
     def said_by(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
         """Figures that all have one origin; a field of which nothing is known is left out."""
-        known = {name: value for name, value in values.items() if not _empty(value)}
+        nothing: list[Any] = [UNKNOWN]
+        known = {
+            name: value
+            for name, value in values.items()
+            if value != UNKNOWN
+            and not (isinstance(value, list) and value and value == nothing * len(value))
+        }
         return cls(known, dict.fromkeys(known, origin), tuple(notes))
 
     def without(self, table: str) -> Known:
@@ -171,15 +177,26 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         ArchiveError: it cannot be read, is of another arm, or carries neither.
     """
     archive = open_archive(path, fields=())
+
+    def refusal(problem: str, field: str = "", remedy: str = "") -> ArchiveError:
+        remedy = remedy or "name an archive that hil wrote"
+        return ArchiveError(archive.path, problem, field=field, remedy=remedy)
+
     if archive.joint_names != tuple(joint_names):
-        raise ArchiveError(
-            archive.path,
+        raise refusal(
             f"is of an arm with the joints {', '.join(archive.joint_names)}",
             remedy=f"those of the URDF are {', '.join(joint_names)}",
         )
     known = Known()
     if "cell.toml" in archive.attachments:
-        values = _cell_values(archive)
+        try:
+            tables = toml_of(archive.text("cell.toml"))
+        except ValueError as error:
+            raise refusal(f"is no TOML ({error})", "cell.toml") from error
+        loose = [name for name, entries in tables.items() if not isinstance(entries, Mapping)]
+        if loose:
+            raise refusal(f"is no cell file: {loose[0]!r} is no table", "cell.toml")
+        values = {f"{name}.{key}": value for name in tables for key, value in tables[name].items()}
         for name in ("cell.urdf", "cell.mesh_folders"):  # of the computer it was recorded on
             values.pop(name, None)
         known = Known.said_by(f"from {archive.path.name}", values)
@@ -190,42 +207,13 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         try:
             known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
         except PacketError as error:
-            raise _unusable(archive, "init_packet.bin", f"is no init packet ({error})") from error
+            raise refusal(f"is no init packet ({error})", "init_packet.bin") from error
     if not known.values:
-        raise ArchiveError(
-            archive.path,
-            "carries neither a cell nor an init packet",
-            remedy="name one that hil recorded",
-        )
+        raise refusal("carries neither a cell nor an init packet")
     if archive.header.only_simulated:
         note = f"{archive.path.name} was recorded from a simulated controller"
         known |= Known(notes=(note,))
     return known
-
-
-def _cell_values(archive: Archive) -> dict[str, Any]:
-    """What the cell file says that travels in an archive, by dotted field."""
-    try:
-        tables = toml_of(archive.text("cell.toml"))
-    except ValueError as error:
-        raise _unusable(archive, "cell.toml", f"is no TOML ({error})") from error
-    loose = [name for name, entries in tables.items() if not isinstance(entries, Mapping)]
-    if loose:
-        raise _unusable(archive, "cell.toml", f"is no cell file: {loose[0]!r} is no table")
-    return _flat(tables)
-
-
-def _unusable(archive: Archive, name: str, problem: str) -> ArchiveError:
-    return ArchiveError(archive.path, problem, field=name, remedy="name an archive that hil wrote")
-
-
-def _flat(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """`{"table": {"key": value}}` as `{"table.key": value}`; tables within tables stay."""
-    return {
-        f"{table}.{key}": value
-        for table, entries in tables.items()
-        for key, value in entries.items()
-    }
 
 
 def _degrees(radians: ArrayLike) -> list[float | str]:
@@ -243,12 +231,6 @@ def _wire(values: ArrayLike, *, zero: bool = True, positive: bool = False) -> li
         else UNKNOWN
         for value in np.asarray(values, dtype=np.float32)
     ]
-
-
-def _empty(value: Any) -> bool:
-    return value == UNKNOWN or (
-        isinstance(value, list) and bool(value) and all(entry == UNKNOWN for entry in value)
-    )
 
 
 _POLL = 0.05
@@ -297,17 +279,14 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
         if stop.requested:
             raise OperatorStopError("ended before the controller came; no file was written.")
         if time.monotonic() > deadline:
-            heard = view.status.answered or view.status.malformed or view.status.stale
-            raise ControllerFault(
-                f"no init packet came within {wait:g} s"
-                + (", though packets did: a session was running already" if heard else "")
-                + (f"; {view.not_understood}" if view.not_understood else "")
-                + "; start this command first, then the controller's Open program"
-                + (
-                    f" ({view.status.foreign} packets came from elsewhere)"
-                    * bool(view.status.foreign)
-                )
-            )
+            status, words = view.status, [f"no init packet came within {wait:g} s"]
+            if status.answered or status.malformed or status.stale:
+                words[0] += ", though packets did: a session was running already"
+            words += [view.not_understood] if view.not_understood else []
+            words.append("start this command first, then the controller's Open program")
+            if status.foreign:
+                words[-1] += f" ({status.foreign} packets came from elsewhere)"
+            raise ControllerFault("; ".join(words))
         time.sleep(_POLL)
     return view.connection.init
 

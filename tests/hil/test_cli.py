@@ -136,6 +136,19 @@ def test_a_command_does_not_wait_for_libraries_that_it_does_not_use(command: str
     assert not {f"scipy.{part}" for part in parts} & loaded
 
 
+@pytest.mark.slow
+def test_status_takes_at_most_0_8_s_of_processor(campaign: Campaign) -> None:
+    """The least of some runs: other programs on this computer make it longer."""
+    spent = []
+    for _ in range(8):
+        before = os.times()
+        assert hil("status", campaign.folder.root).returncode == 0
+        after = os.times()
+        children = (after.children_user, after.children_system)
+        spent.append(sum(children) - before.children_user - before.children_system)
+    assert min(spent) <= 0.8
+
+
 def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict(
     tmp_path: Path,
 ) -> None:

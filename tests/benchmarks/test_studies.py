@@ -1,10 +1,18 @@
+"""Studies of many seeds: coverage of intervals, excitations, payloads."""
+
 from __future__ import annotations
+
+import json
 
 import numpy as np
 import pytest
 
+from benchmarks import excitation_study
 from benchmarks.identification_study import Covered, coverage, recorded, study
+from benchmarks.payload import arm_model, load_of, runs_of
+from benchmarks.payload import coverage as payload_coverage
 from identification.estimators.least_squares import estimate
+from identification.estimators.payload import find_difference
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -51,3 +59,41 @@ def test_least_squares_is_what_numpy_makes_of_pinocchios_regressor() -> None:
     values = estimate(model, Factor.of(model, samples), weights).values
     ours = model.torque(values, *samples.motion[1:])[samples.usable]
     assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
+
+
+def test_an_unknown_case_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        excitation_study.main(["--only", "C"])
+    assert "front" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_quick_study_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    excitation_study.main(["--quick", "--seeds", "1", "--only", "B (eq. 7)", "front", "--json"])
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [each["case"] for each in rows] == ["B (eq. 7)", "front"]
+    assert all(each["evaluated"] >= 144 for each in rows)
+
+
+class TestPayload:
+    """Loads on a simulated NS 16, friction drifting by 4 % between the recordings."""
+
+    def test_a_few_loads_are_weighed_within_two_percent(self) -> None:
+        """Of 8 with 95 %, fewer than 5 inside come once in some hundred times, of one figure."""
+        found = payload_coverage(range(1000, 1008))
+        assert found.worst < 0.02
+        assert min(*found.covered.values(), found.moment_covered) >= 0.5
+
+    @pytest.mark.slow
+    def test_of_200_loads_intervals_hold_90_to_99_percent(self) -> None:
+        found = payload_coverage(range(200))
+        assert found.mass_error < 0.01
+        assert found.within_one_percent > 0.9
+        for figure, share in {**found.covered, "moment": found.moment_covered}.items():
+            assert 0.90 <= share <= 0.99, figure
+
+    def test_pairs_of_one_load_do_not_differ(self) -> None:
+        """A, B, B, A: nothing is refused that is one load."""
+        model, load = arm_model(), load_of(3)
+        runs = runs_of(3, model, loads=(None, load, load, None))
+        assert find_difference(model, runs) is None

@@ -1,0 +1,132 @@
+"""Benchmarks run as a person runs them: their line of JSON agrees with itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from benchmarks.archive_files import repetitions
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@cache
+def run(name: str, *arguments: str) -> dict:
+    """What a benchmark prints; a warning is an error."""
+    done = subprocess.run(
+        [sys.executable, "-m", f"benchmarks.{name}", "--json", *arguments],
+        cwd=ROOT, env=os.environ | {"PYTHONWARNINGS": "error"},
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    (line,) = done.stdout.splitlines()
+    return json.loads(line)
+
+
+@pytest.mark.slow
+class TestArchive:
+    @pytest.fixture(scope="class")
+    def figures(self) -> dict:
+        return run("archive", "--sizes", "--repetitions", "1", "--rounds", "1")
+
+    def test_ratios_are_those_of_the_times(self, figures: dict) -> None:
+        """And large, even on a busy machine."""
+        fastest = min(figures["mcap_seeking_s"], figures["mcap_streaming_s"])
+        for name, theirs, least in (("mcap", fastest, 4.0), ("typed", figures["typed_s"], 20.0)):
+            ratio = figures[f"decode_ratio_to_{name}"]
+            assert ratio == pytest.approx(theirs / figures["ours_s"], rel=0.1)
+            assert ratio > least
+        assert figures["cycles"] == 16_000
+
+    def test_sizes_are_those_of_each_compression(self, figures: dict) -> None:
+        sizes = {row["compression"]: row["megabytes_per_minute"] for row in figures["sizes"]}
+        assert sizes["zstd 3"] < sizes["zstd -1"] < sizes["lz4"] < sizes["none"]
+
+    def test_writing_costs_a_fraction_of_a_core(self) -> None:
+        """It fails where a cycle is not archived."""
+        figures = run("archive_writing", "--seconds", "2")
+        assert figures["records_lost"] == 0
+        share = figures["writing_share_of_core"]
+        assert 0.0 < share < figures["writing_share_of_core_with_packets"] < 0.2
+        assert figures["megabytes_per_minute"] < figures["megabytes_per_minute_with_packets"]
+
+
+def test_no_two_archives_hold_the_same(tmp_path: Path) -> None:
+    paths = repetitions(tmp_path / "a", 2, cycles=500)
+    paths += repetitions(tmp_path / "b", 2, first=2, cycles=500, recorded_at="2026-01-05T08:00Z")
+    assert len({hashlib.sha256(path.read_bytes()).digest() for path in paths}) == 4
+
+
+class TestDesign:
+    @pytest.fixture(scope="class")
+    def figures(self) -> dict:
+        return run("design", "--repetitions", "1", "--individuals", "6")
+
+    def test_both_sides_find_the_same_criteria(self, figures: dict) -> None:
+        """On the columns that both have; 8 ms find what 1 kHz finds, or ratios mean nothing."""
+        assert abs(figures["log10_det_difference"]) < 1e-8
+        assert abs(figures["coupling_index_difference"]) < 1e-8
+        assert abs(figures["log10_det_difference_to_1_khz"]) < 0.05
+        assert abs(figures["coupling_index_difference_to_1_khz"]) < 0.5
+
+    def test_ratios_are_those_of_the_times(self, figures: dict) -> None:
+        for ratio, theirs in (
+            ("ratio_to_pinocchio", "pinocchio_1_khz_ms"),
+            ("ratio_same_rate", "pinocchio_same_rate_ms"),
+        ):
+            assert figures[ratio] == pytest.approx(figures[theirs] / figures["ours_ms"], rel=0.01)
+
+    @pytest.mark.parametrize("search", ["", "_front"])
+    def test_the_slowest_individual_is_no_faster_than_their_mean(
+        self, figures: dict, search: str
+    ) -> None:
+        assert 0.0 < figures[f"individual{search}_ms"] <= figures[f"individual{search}_worst_ms"]
+        assert figures[f"scoring{search}_ms"] <= figures[f"scoring{search}_worst_ms"]
+        assert figures[f"individual{search}_ms"] < figures[f"scoring{search}_ms"]
+        assert figures[f"individuals{search}"] == 6
+        assert figures["individual_20_s_ms"] > 0.0
+
+    @pytest.mark.slow
+    def test_a_small_search_by_one_worker_and_by_two(self) -> None:
+        """It fails where they find different motions."""
+        figures = run(
+            "design", "--repetitions", "1", "--individuals", "2",
+            "--search", "--population", "8", "--generations", "2",
+        )  # fmt: skip
+        assert figures["ga_individuals"] == 16
+        assert min(figures["ga_one_worker_s"], figures["ga_two_workers_s"]) > 0.0
+
+
+class TestIdentification:
+    @pytest.fixture(scope="class")
+    def figures(self) -> dict:
+        return run("identification", "--repetitions", "1")
+
+    def test_it_times_the_sizes_that_it_states(self, figures: dict) -> None:
+        assert figures["samples"] == 16_000
+        assert figures["parameters"] == 58
+        assert figures["large_parameters"] >= 80
+        # The ranks are those of the literature's arms.
+        assert figures["base_ns16_rank"] == figures["base_ur10_rank"] == 40
+
+    def test_medians_lie_between_least_and_most(self, figures: dict) -> None:
+        for task in ("fit", "large_fit", "prepared_fit", "base_ns16", "base_ur10", "consistent"):
+            least, median, most = (figures[f"{task}_{kind}ms"] for kind in ("least_", "", "most_"))
+            assert 0.0 < least <= median <= most
+        assert figures["prepared_fit_ms"] > figures["fit_ms"]
+
+    def test_there_is_no_ratio_without_the_rival(self, figures: dict) -> None:
+        if "figaroh_pivoting_ms" not in figures:
+            assert figures["ratio_to_figaroh"] is None
+            assert figures["torque_difference"] is None
+            return
+        ratio = figures["figaroh_pivoting_ms"] / figures["fit_ms"]
+        assert figures["ratio_to_figaroh"] == pytest.approx(ratio, rel=0.01)
+        # Both have fitted the same: what remains is how either counts degrees of freedom.
+        assert figures["torque_difference"] < 1e-6
