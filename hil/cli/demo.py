@@ -162,9 +162,15 @@ def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
     result = DesignResult.load(path)
     result.require_cell(cell, path)
     constraints = result.settings.constraints
-    lacking = [] if constraints.collision else ["contacts were not looked at (collision = false)"]
-    lacking += [] if constraints.current else ["currents were not looked at (current = false)"]
-    lacking += [] if result.complete else ["it was stopped before its end (complete = false)"]
+    lacking = [
+        words
+        for had, words in (
+            (constraints.collision, "contacts were not looked at (collision = false)"),
+            (constraints.current, "currents were not looked at (current = false)"),
+            (result.complete, "it was stopped before its end (complete = false)"),
+        )
+        if not had
+    ]
     if lacking:
         reporter.say(
             f"note: in the search for {path} {' and '.join(lacking)}; the motion itself is checked "
@@ -185,18 +191,14 @@ def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:
     if output.is_symlink() or not output.is_dir():
         raise CampaignFolderError(output, "is no folder of its own", "name a folder")
     found = {path.name for path in output.iterdir()}
-    if not found:
-        return
-    if not force:
-        raise CampaignFolderError(
-            output, "is not empty", "name another folder, go on with --resume, or add --force"
-        )
+    if found and not force:
+        remedy = "name another folder, go on with --resume, or add --force"
+        raise CampaignFolderError(output, "is not empty", remedy)
     foreign = sorted(found - _OURS)
-    if foreign or "manifest.json" not in found:
+    if foreign or (found and "manifest.json" not in found):
         what = f"holds {foreign[0]}" if foreign else "is no campaign"
-        raise CampaignFolderError(
-            output, f"{what}, so --force will not remove it", "name another folder"
-        )
+        problem = f"{what}, so --force will not remove it"
+        raise CampaignFolderError(output, problem, "name another folder")
 
 
 def _make_room(output: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_format
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -76,10 +76,10 @@ def move(
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
     axis = axis_alone(cell, joint) if only_axis else None
-    start_of = None
-    if campaign is not None:
-        start_of = campaign.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
-    wanted = None if to is None else posture(cell, to, start_of)
+    wanted = None
+    if to is not None:
+        motion = None if campaign is None else campaign.plan.excitation.trajectory
+        wanted = posture(cell, to, None if motion is None else motion.sample(np.zeros(1))[0][0])
     with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
         link.connection.say = partial(say, err=True)
         if yes and not link.only_simulated:
@@ -107,21 +107,20 @@ def move(
         if not json:
             typer.echo(printable(_described(way, cell, link)))
         _confirm(cell, link, yes=yes, json=json)
-        name = None
-        if campaign is None or output is not None:
+        own = campaign.folder if campaign is not None and output is None else None
+        if own is None:
             path = archive_path(output or Path("runs/move"), "move")
         else:
-            make_folder(campaign.folder.archives)
-            name = campaign.folder.next_name("move", 0).filename
-            path = campaign.folder.archives / name
+            make_folder(own.archives)
+            path = own.archives / own.next_name("move", 0).filename
         reporter = make_reporter(quiet=json)
         with stop_on_interrupt() as stop, reporter.task("moving (s)", way.duration) as task:
             durable = cell.controller.transport != "simulated"
             watch = _Shown(task)
             ended = send(way, cell, link, path, stop=stop, watch=watch, durable=durable)
             stopped = stop.requested
-        if campaign is not None and name is not None:
-            campaign.folder.add(name, ended.outcome)
+        if own is not None:
+            own.add(path.name, ended.outcome)
         figures: dict[str, object] = {
             "archive": str(path),
             "outcome": ended.outcome,
@@ -148,19 +147,19 @@ def move(
 
 
 class _Shown:
-    """Moves the bar on with the arm."""
+    """Moves the bar on with the arm; only Ctrl-C stops the motion."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._done = task, 0.0
 
     def show(self, progress: MotionProgress) -> None:
         """Look at the motion."""
-        if progress.motion_time is not None and progress.motion_time > self._done:
-            self._task.advance(progress.motion_time - self._done)
-            self._done = progress.motion_time
+        done = max(self._done, progress.motion_time or 0.0)
+        self._task.advance(done - self._done)
+        self._done = done
 
     def request(self) -> OperatorRequest:
-        """The motion as it was planned; only Ctrl-C stops it."""
+        """The motion as it was planned."""
         return OperatorRequest()
 
 
@@ -171,11 +170,9 @@ def _reserved(campaign: Campaign | None) -> Iterator[None]:
     Raises:
         CampaignFolderError: one is at work on it, or the folder was changed.
     """
-    if campaign is None:
-        yield
-        return
-    with campaign.folder.locked():
-        campaign.folder.require_unchanged()
+    with nullcontext() if campaign is None else campaign.folder.locked():
+        if campaign is not None:
+            campaign.folder.require_unchanged()
         yield
 
 

@@ -124,26 +124,24 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
 
 
 def _report(path: Path, done: Recorded, cell: Cell) -> None:
-    seconds = done.records * cell.period
     lost = f", {done.records_lost} records LOST" if done.records_lost else ""
     lost += f", {done.events_lost} events LOST" if done.events_lost else ""
     say(
-        f"{path}: {seconds:.1f} s in {done.records} cycles, {done.missed} packets missed, "
-        f"{done.late} answers late, {done.untaken} not accepted{lost}; "
+        f"{path}: {done.records * cell.period:.1f} s in {done.records} cycles, {done.missed} "
+        f"packets missed, {done.late} answers late, {done.untaken} not accepted{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 
 
 class View:
-    """A live line on a terminal, a line now and then elsewhere."""
+    """A live line on a terminal, a line now and then elsewhere; a context manager."""
 
     def __init__(self, cell: Cell, stop: Stop, *, quiet: bool) -> None:
-        self._over = ""
         self._cell, self._stop, self._quiet = cell, stop, quiet
         console = Console()
         live = not quiet and console.is_terminal
         self._status: Status | None = console.status("") if live else None
-        self._next = 0.0
+        self._over, self._next = "", 0.0
 
     def __enter__(self) -> View:
         if self._status is not None:

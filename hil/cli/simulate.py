@@ -51,10 +51,9 @@ _REPEATED: Final = frozenset({Phase.CLOSED, Phase.OPENING, Phase.OPEN})
 class Status:
     """One line for each change of phase and, on a terminal, one that is written over.
 
-    Where open mode is lost again and again, one line for the 2nd, 4th, 8th ... time.
-
-    A line is written only if the terminal or pipe can take it at once; a reader that has stopped
-    reading loses lines, the PC program loses nothing.
+    Where open mode is lost again and again, one line for the 2nd, 4th, 8th ... time. A line is
+    written only if the terminal or pipe can take it at once; a reader that has stopped reading
+    loses lines, the PC program loses nothing.
 
     Args:
         place: where the PC program is expected.
@@ -73,42 +72,35 @@ class Status:
         stretch: float = 0.0,
         descriptor: int = 1,
     ) -> None:
-        self._stretch = stretch
-        self._place = place
-        self._settings = settings
-        self._quiet = quiet
-        self._out = descriptor
+        self._place, self._settings, self._stretch = place, settings, stretch
+        self._quiet, self._out = quiet, descriptor
         self._terminal = not quiet and os.isatty(descriptor)
-        self._began = time.monotonic()
-        self._refresh_at = 0.0
+        self._began, self._refresh_at = time.monotonic(), 0.0
         self._phase: Phase | None = None
-        self._reason = ""
-        self._cycles = -1
+        self._reason, self._cycles = "", -1
 
     def introduce(self, name: str) -> None:
         """Say what this is, and what it is not."""
         settings = self._settings
+        missed = settings.missed_replies
         self.say(
             f"{name}: a SIMULATED controller for {self._place}; nothing moves.\n"
             f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, "
-            f"{'cold' if settings.cold_start else 'warm'} start, open mode ends after "
-            f"{settings.missed_replies} missing "
-            f"{'reply' if settings.missed_replies == 1 else 'replies'}, process {os.getpid()}"
-            + (
-                f"\ncycles are made longer by up to {self._stretch:g} s to wait for an answer; "
-                "no real controller does that"
-                if self._stretch
-                else ""
-            )
+            f"{'cold' if settings.cold_start else 'warm'} start, open mode ends after {missed} "
+            f"missing {'reply' if missed == 1 else 'replies'}, process {os.getpid()}"
         )
+        if self._stretch:
+            self.say(
+                f"cycles are made longer by up to {self._stretch:g} s to wait for an answer; "
+                "no real controller does that"
+            )
 
     def watch(self, controller: SimulatedController, tally: Tally) -> None:
         """Show what has changed since the last cycle."""
         if self._quiet:
             return
-        phase = controller.phase
-        if phase is not self._phase or tally.cycles < self._cycles:
-            self._phase = phase
+        if controller.phase is not self._phase or tally.cycles < self._cycles:
+            self._phase = controller.phase
             self._say_change(controller)
         self._cycles = tally.cycles
         if self._terminal and (now := time.monotonic()) >= self._refresh_at:
@@ -118,7 +110,8 @@ class Status:
     def say(self, text: str) -> None:
         """Write a line that stays."""
         if not self._quiet:
-            self._write(("\r\x1b[K" if self._terminal else "") + text + "\n")
+            self.clear()
+            self._write(text + "\n")
 
     def clear(self) -> None:
         """Take the line that is written over away."""
@@ -126,26 +119,18 @@ class Status:
             self._write("\r\x1b[K")
 
     def _say_change(self, controller: SimulatedController) -> None:
-        lost = controller.openings_lost
+        lost, seconds = controller.openings_lost, f"{time.monotonic() - self._began:8.3f} s"
         if lost <= 1 or controller.gave_up or controller.phase not in _REPEATED:
-            self.say(self._change(controller))
+            text = f"{seconds}  {WORDS[controller.phase]}"
+            if controller.phase is Phase.OPENING:
+                text += f" in mode {self._settings.open_mode}"
+            if controller.reason and controller.reason != self._reason:
+                text += f": {controller.reason}"
+            self._reason = controller.reason
+            self.say(text)
         elif controller.phase is Phase.CLOSED and lost.bit_count() == 1:
-            self.say(
-                f"{self._seconds()}  open mode was lost again, {lost} times in a row by now: "
-                f"{controller.reason}"
-            )
-
-    def _seconds(self) -> str:
-        return f"{time.monotonic() - self._began:8.3f} s"
-
-    def _change(self, controller: SimulatedController) -> str:
-        text = f"{self._seconds()}  {WORDS[controller.phase]}"
-        if controller.phase is Phase.OPENING:
-            text += f" in mode {self._settings.open_mode}"
-        if controller.reason and controller.reason != self._reason:
-            text += f": {controller.reason}"
-        self._reason = controller.reason
-        return text
+            again = f"open mode was lost again, {lost} times in a row by now: {controller.reason}"
+            self.say(f"{seconds}  {again}")
 
     def _line(self, tally: Tally) -> str:
         if not tally.cycles:
@@ -316,10 +301,10 @@ def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
 def _figures(served: Served) -> dict[str, object]:
     """The summary for a script; times in µs."""
     summary = served.summary
-    times = {"stretch_max_us": round(1e6 * summary.stretch_max, 1)}
+    times = {"stretch_max_us": summary.stretch_max}
     for name, each in (("answer", summary.answer), ("cost", summary.cost)):
         for part, seconds in zip(("p50", "p99", "max"), _parts(each), strict=True):
-            times[f"{name}_{part}_us"] = round(1e6 * seconds, 1)
+            times[f"{name}_{part}_us"] = seconds
     return {
         **{name: count for name, count in vars(summary).items() if isinstance(count, int)},
         "foreign": served.foreign,
@@ -327,25 +312,29 @@ def _figures(served: Served) -> dict[str, object]:
         "starts": served.starts,
         "phase": served.controller.phase.name.lower(),
         "reason": served.controller.reason,
-        **times,
+        **{name: round(1e6 * seconds, 1) for name, seconds in times.items()},
     }
 
 
 def _sentences(served: Served) -> list[str]:
     """The summary for a person."""
     summary, reason = served.summary, served.controller.reason
-    stretched = (
-        f"; {plural(summary.stretched, 'cycle')} stretched to wait for an answer, by up to "
-        f"{1e3 * summary.stretch_max:.1f} ms, as no real controller does"
-    )
     if not summary.cycles:
         return [f"no PC program answered; the first packet was sent {_times(summary.knocks)}"]
     end = "the session has ended (504)" if summary.ended else "the session was given up"
-    return [
-        f"{end}{': ' if reason else ''}{reason}; open mode was reached {_times(served.intervals)}",
+    counts = (
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from elsewhere{stretched if summary.stretched else ''}",
+        f"{served.foreign} from elsewhere"
+    )
+    if summary.stretched:
+        counts += (
+            f"; {plural(summary.stretched, 'cycle')} stretched to wait for an answer, by up to "
+            f"{1e3 * summary.stretch_max:.1f} ms, as no real controller does"
+        )
+    return [
+        f"{end}{': ' if reason else ''}{reason}; open mode was reached {_times(served.intervals)}",
+        counts,
         f"answers came after {_spread(summary.answer)}",
         f"controller and arm took {_spread(summary.cost)} to compute a cycle; "
         f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
