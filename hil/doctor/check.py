@@ -5,9 +5,11 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec
 
 
 class Status(StrEnum):
@@ -19,36 +21,6 @@ class Status(StrEnum):
     UNKNOWN = "unknown"
 
 
-_WHY = {
-    "user": "nothing of hil needs root, and what root may do says nothing about other users",
-    "real-time priority": "without it other programs may run before the packet is answered",
-    "memory lock": "a page that has to be fetched from disk costs many cycles",
-    "processor idle latency": "halves the usual wake-up time",
-    "disk space": "a full disk ends the motion: the arm is stopped, what was archived is whole",
-    "disk": "a motion is stopped if the disk keeps the archive waiting for seconds",
-    "clock source": "the clock is read several times a cycle; a slow one costs µs each time",
-    "frequency governor": "a processor that clocks down answers its first packet late",
-    "idle states": "a sleeping processor has to wake before it can answer",
-    "isolated processors": "other programs and interrupts stay off an isolated processor; worth it "
-    "only if the latency measured below is not good enough",
-    "kernel preemption": "how long the kernel finishes its own work before a waiting program runs",
-    "virtual machine": "the host may stop it for milliseconds, and no program in it can tell",
-    "stolen time while measuring": "time in which a virtual machine did not run",
-    "other load": "real-time priority goes before other programs, not before interrupts and disk",
-    "controller link": "routes, ports and buses are looked at for a cell with a real link",
-    "wake-up latency": "without it nothing is known",
-    "turnaround latency": "without it nothing is known",
-    "CAN": "a node at another bit rate disturbs every frame on the bus",
-    "UDP port": "the controller sends to this port and no other",
-    "route to the controller": "a router or a wrong card in between adds delay, or loses all",
-    "card": "packets of the controller come every millisecond; nothing else should share the card",
-    "interrupt coalescing": "a card that gathers packets delays each",
-    "ARP entry": "an entry that expires is asked for anew in mid-motion, and answers wait for it",
-    "firewall": "a filtered controller looks exactly like one that is switched off",
-}
-"""What each check matters for, by the beginning of its name."""
-
-
 @dataclass(frozen=True)
 class Check:
     """The outcome of one check.
@@ -58,37 +30,53 @@ class Check:
         status: how it came out.
         found: what was found, in words.
         remedy: commands to type, one a line, each to be typed as it stands; empty if none.
+        why: what it matters for.
     """
 
     name: str
     status: Status
     found: str
     remedy: tuple[str, ...] = ()
-
-    @property
-    def why(self) -> str:
-        """What it matters for."""
-        return next((why for name, why in _WHY.items() if self.name.startswith(name)), "")
+    why: str = ""
 
 
-def ok(name: str, found: str) -> Check:
+def ok(found: str) -> Check:
     """It works."""
-    return Check(name, Status.OK, found)
+    return Check("", Status.OK, found)
 
 
-def warn(name: str, found: str, *remedy: str) -> Check:
+def warn(found: str, *remedy: str) -> Check:
     """It costs latency, or depends on chance."""
-    return Check(name, Status.WARN, found, remedy)
+    return Check("", Status.WARN, found, remedy)
 
 
-def bad(name: str, found: str, *remedy: str) -> Check:
+def bad(found: str, *remedy: str) -> Check:
     """The link does not work so."""
-    return Check(name, Status.BAD, found, remedy)
+    return Check("", Status.BAD, found, remedy)
 
 
-def unknown(name: str, found: str, *remedy: str) -> Check:
+def unknown(found: str, *remedy: str) -> Check:
     """It cannot be found out from here."""
-    return Check(name, Status.UNKNOWN, found, remedy)
+    return Check("", Status.UNKNOWN, found, remedy)
+
+
+P = ParamSpec("P")
+
+
+def named(name: str) -> Callable[[Callable[P, Check]], Callable[P, Check]]:
+    """Name the outcome of a check, with its arguments by number; its docstring is the reason."""
+
+    def decorate(check: Callable[P, Check]) -> Callable[P, Check]:
+        why = " ".join((check.__doc__ or "").split()).removesuffix(".")
+
+        @wraps(check)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> Check:
+            found = check(*args, **kwargs)
+            return replace(found, name=name.format(*args), why=why[0].lower() + why[1:])
+
+        return checked
+
+    return decorate
 
 
 COMMAND_TIMEOUT = 3.0

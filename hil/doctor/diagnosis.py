@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -302,8 +302,9 @@ def examine(
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     checks.append(machine.stolen(before, system.text("/proc/stat") or ""))
     look = "python -m hil.doctor.probe permissions   # says why"
+    failed = replace(bad("the probe gave no figures", look), why="without it nothing is known")
     checks += [
-        bad(f"{name} latency", "the probe gave no figures", look)
+        replace(failed, name=f"{name} latency")
         for name, latency in measured.items()
         if latency is None
     ]
@@ -378,5 +379,5 @@ def as_json(diagnosis: Diagnosis) -> dict[str, object]:
         "seconds": diagnosis.seconds,
         "cycles": [asdict(verdict) for verdict in diagnosis.cycles],
         "latency": {each.name: each.summary() for each in diagnosis.latencies},
-        "checks": [asdict(check) | {"why": check.why} for check in diagnosis.checks],
+        "checks": [asdict(check) for check in diagnosis.checks],
     }

@@ -8,13 +8,13 @@ import json
 import re
 import socket
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.reading import text_of, toml_of
 
-from .check import Check, Status, System, bad, ok, unknown, warn
+from .check import Check, Status, System, bad, named, ok, unknown, warn
 
 if TYPE_CHECKING:
     from hil.cell.schema import CanTable, ControllerTable
@@ -45,41 +45,38 @@ def controller_in(path: Path) -> ControllerTable:
 _ARPHRD_CAN = "280"
 
 
+@named("CAN {0.interface} {0.channel}")
 def can_check(bus: CanTable, system: System) -> Check:
-    """Whether the bus can be opened as the cell says; a bus without a kernel device is not tried.
-
-    Opening an adapter puts it on the bus, which acknowledges frames: that is left to the exchange.
-    """
+    """A node at another bit rate disturbs every frame on the bus."""
+    # Opening an adapter puts it on the bus, which acknowledges frames: left to the exchange.
     fd = bus.profile == "fd"
-    name = f"CAN {bus.interface} {bus.channel}"
     if bus.interface != "socketcan":
-        return unknown(name, "not a kernel device; it is opened by the exchange only")
+        return unknown("not a kernel device; it is opened by the exchange only")
     folder = f"/sys/class/net/{bus.channel}"
     if not system.path(folder).exists():
         driver = "sudo modprobe can_raw   # and the card's driver"
-        return bad(name, "does not exist", "ip -brief link show type can", driver)
+        return bad("does not exist", "ip -brief link show type can", driver)
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
-        return bad(name, "is no CAN interface", "ip -brief link")
+        return bad("is no CAN interface", "ip -brief link")
     rates = f"bitrate {bus.bitrate or 1_000_000}"
     if fd:
         rates += f" dbitrate {bus.data_bitrate or 5_000_000} fd on"
     bring_up = f"sudo ip link set {bus.channel} up txqueuelen 100 type can {rates}"
     state = system.text(f"{folder}/operstate") or "unknown"
     if state == "down":
-        return bad(name, "down", bring_up)
+        return bad("down", bring_up)
     details = _details(bus.channel, system)
     if details.get("info_kind") == "vcan":
-        return ok(name, "virtual bus, no bit rate")
+        return ok("virtual bus, no bit rate")
     nominal, data = (_rate(details, timing) for timing in ("bittiming", "data_bittiming"))
     if nominal is None:
-        look = f"ip -details link show {bus.channel}"
-        return unknown(name, f"{state}; bit rate not stated", look)
+        return unknown(f"{state}; bit rate not stated", f"ip -details link show {bus.channel}")
     found = f"{state}, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
     wanted = bus.data_bitrate or data if fd else data
     if nominal == (bus.bitrate or nominal) and data == wanted and (data or not fd):
-        return ok(name, found)
+        return ok(found)
     down = f"sudo ip link set {bus.channel} down"
-    return bad(name, f"{found}; the cell needs otherwise", down, bring_up)
+    return bad(f"{found}; the cell needs otherwise", down, bring_up)
 
 
 def _details(channel: str, system: System) -> dict[str, Any]:
@@ -99,9 +96,6 @@ def _rate(details: dict[str, Any], timing: str) -> int | None:
         return None
 
 
-_START = "/proc/sys/net/ipv4/ip_unprivileged_port_start"
-
-
 def try_port(bind: str, port: int) -> int:
     """Bind the address for an instant; the number of the error, 0 if it worked.
 
@@ -115,27 +109,27 @@ def try_port(bind: str, port: int) -> int:
     return 0
 
 
+@named("UDP port {1}")
 def port_check(bind: str, port: int, error: int, system: System) -> Check:
-    """Whether the port can be bound, and what to do if not; `error` is that of `try_port`."""
-    name = f"UDP port {port}"
+    """The controller sends to this port and no other."""
+    # `error` is that of `try_port`.
     if error == 0:
-        return ok(name, f"can be bound on {bind}")
+        return ok(f"can be bound on {bind}")
     if error == errno.EADDRINUSE:
         user = owner_of(port, system) or "a program of another user"
-        return bad(name, f"in use by {user}", f"sudo ss -lunp sport = :{port}")
+        return bad(f"in use by {user}", f"sudo ss -lunp sport = :{port}")
     if error == errno.EADDRNOTAVAIL:
         look = "ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0"
-        return bad(name, f"{bind} is no address of this PC", look)
+        return bad(f"{bind} is no address of this PC", look)
     if error in (errno.EACCES, errno.EPERM):
-        start = system.number(_START)
+        start = system.number("/proc/sys/net/ipv4/ip_unprivileged_port_start")
         setting = f"net.ipv4.ip_unprivileged_port_start={port}"
         return bad(
-            name,
             f"ports below {start} need a privilege" if start is not None else "not permitted",
             f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
             "# once, and for good: hil itself then needs no privilege for it",
         )
-    return bad(name, f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})")
+    return bad(f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})")
 
 
 def owner_of(port: int, system: System) -> str | None:
@@ -234,15 +228,10 @@ def neighbour(address: str, device: str, system: System) -> tuple[str, bool] | N
     """Hardware address of an address on a card, and whether its ARP entry is permanent."""
     for line in (system.text("/proc/net/arp") or "").splitlines()[1:]:
         words = line.split()
-        if len(words) < 6 or words[0] != address or words[5] != device:
-            continue
-        try:
-            flags = int(words[2], 16)
-        except ValueError:
-            continue
-        if flags & _COMPLETE and words[3] != "00:00:00:00:00:00":
-            return words[3], bool(flags & _PERMANENT)
-        return None
+        if len(words) >= 6 and words[0] == address and words[5] == device:
+            flags = int(words[2], 16) if re.fullmatch(r"0x[0-9a-fA-F]+", words[2]) else 0
+            if flags & _COMPLETE and words[3] != "00:00:00:00:00:00":
+                return words[3], bool(flags & _PERMANENT)
     return None
 
 
@@ -256,97 +245,92 @@ _SPARE_USECS = 50
 """µs that a card may gather packets before it interrupts."""
 
 
+@named("route to the controller")
 def route_check(host: str, address: str | None, route: Route | None) -> Check:
-    """Whether the controller is reached over a card of its own network."""
-    name = "route to the controller"
+    """A router or a wrong card in between adds delay, or loses all."""
     if address is None:
-        found = f"{host!r} is no IPv4 address nor in /etc/hosts"
         remedy = f"# write the address in the cell file: host = 10.2.12.150 or the like, not {host}"
-        return bad(name, found, remedy)
+        return bad(f"{host!r} is no IPv4 address nor in /etc/hosts", remedy)
     add = f"sudo ip addr add {_neighbouring(address)}/24 dev CARD"
     if route is None:
         look = "ip -brief link   # which card is the controller's?"
-        return bad(name, f"none to {address}", look, f"{add} && sudo ip link set CARD up")
+        return bad(f"none to {address}", look, f"{add} && sudo ip link set CARD up")
     if route.device == LOOPBACK:
-        return ok(name, f"{address} is this PC itself (a simulated controller)")
+        return ok(f"{address} is this PC itself (a simulated controller)")
     if route.gateway is not None:
         found = f"over gateway {route.gateway} on {route.device}"
-        return bad(name, found, f"{add}   # CARD: the one cabled to the controller")
-    return ok(name, f"{address} directly on {route.device}")
+        return bad(found, f"{add}   # CARD: the one cabled to the controller")
+    return ok(f"{address} directly on {route.device}")
 
 
+@named("card {0}")
 def device_check(device: str, system: System) -> Check:
-    """Whether the card is up, wired, fast and its own."""
-    folder, name = f"{_NET}/{device}", f"card {device}"
+    """Packets of the controller come every millisecond; nothing else should share the card."""
+    folder = f"{_NET}/{device}"
     if device == LOOPBACK:
-        return ok(name, "loopback")
+        return ok("loopback")
     if not system.path(folder).exists():
-        return bad(name, "does not exist", "ip -brief link")
+        return bad("does not exist", "ip -brief link")
     state = system.text(f"{folder}/operstate") or "unknown"
     if state not in ("up", "unknown") or system.text(f"{folder}/carrier") == "0":
-        up = f"sudo ip link set {device} up"
-        return bad(name, f"{state}, no carrier", up, "# check the cable")
+        return bad(f"{state}, no carrier", f"sudo ip link set {device} up", "# check the cable")
     if system.path(f"{folder}/wireless").exists() or system.path(f"{folder}/phy80211").exists():
-        return bad(name, "is wireless", "# use a cable")
+        return bad("is wireless", "# use a cable")
     speed, duplex = system.number(f"{folder}/speed"), system.text(f"{folder}/duplex")
     words = [state, f"{speed} Mbit/s" if speed and speed > 0 else "speed not stated"]
     words += [f"{duplex} duplex"] if duplex in ("half", "full") else []
-    found = ", ".join([*words, f"driver {_driver(folder, system)}"])
+    try:
+        words.append(f"driver {system.path(f'{folder}/device/driver').resolve(strict=True).name}")
+    except OSError:
+        words.append("driver none (virtual)")
+    found = ", ".join(words)
     if duplex == "half" or (speed is not None and 0 < speed < 100):
-        return bad(name, found, f"sudo ethtool -s {device} autoneg on")
+        return bad(found, f"sudo ethtool -s {device} autoneg on")
     if device in default_devices(system):
         remedy = "# give the controller a card of its own; this one carries the default route too"
-        return warn(name, f"{found}; shared with other traffic", remedy)
-    return ok(name, found)
+        return warn(f"{found}; shared with other traffic", remedy)
+    return ok(found)
 
 
-def _driver(folder: str, system: System) -> str:
-    link = system.path(f"{folder}/device/driver")
-    try:
-        return link.resolve(strict=True).name
-    except OSError:
-        return "none (virtual)"
-
-
+@named("interrupt coalescing of {0}")
 def coalescing(device: str, system: System) -> Check:
-    """Whether the card holds packets back to interrupt less often."""
-    name = f"interrupt coalescing of {device}"
+    """A card that gathers packets delays each."""
     answer = system.run(["ethtool", "-c", device])
     if answer is None:
-        look = ("sudo apt install ethtool", f"ethtool -c {device}")
-        return unknown(name, "ethtool is not installed", *look)
+        remedy = "sudo apt install ethtool", f"ethtool -c {device}"
+        return unknown("ethtool is not installed", *remedy)
     if answer.status != 0:
         if "not supported" in answer.errors.lower():
-            return ok(name, "the card has none")
+            return ok("the card has none")
         found = answer.errors.strip().splitlines()[-1:] or ["ethtool failed"]
-        return unknown(name, found[0], f"sudo ethtool -c {device}")
+        return unknown(found[0], f"sudo ethtool -c {device}")
     usecs = re.search(r"^rx-usecs:\s*(\d+)", answer.output, re.MULTILINE)
     adaptive = re.search(r"^Adaptive RX:\s*on", answer.output, re.MULTILINE) is not None
     words = f"rx-usecs {usecs[1] if usecs else 'not stated'}{', adaptive' * adaptive}"
     if adaptive or (usecs and int(usecs[1]) > _SPARE_USECS):
-        return warn(name, words, f"sudo ethtool -C {device} adaptive-rx off rx-usecs 0")
-    return ok(name, words)
+        return warn(words, f"sudo ethtool -C {device} adaptive-rx off rx-usecs 0")
+    return ok(words)
 
 
+@named("ARP entry of the controller")
 def neighbour_check(address: str, device: str, entry: tuple[str, bool] | None) -> Check:
-    """Whether the controller's hardware address is fixed."""
-    name = "ARP entry of the controller"
+    """An entry that expires is asked for anew in mid-motion, and answers wait for it."""
     mac, permanent = entry or ("MAC", False)
     remedy = f"sudo ip neigh replace {address} lladdr {mac} dev {device} nud permanent"
     if entry is None:
         hint = "# MAC: read it off the controller; a C4G's begins with 00:04:50"
-        return warn(name, "none (the table was read, no request was sent)", remedy, hint)
-    return ok(name, f"{mac}, permanent") if permanent else warn(name, f"{mac}, will expire", remedy)
+        return warn("none (the table was read, no request was sent)", remedy, hint)
+    return ok(f"{mac}, permanent") if permanent else warn(f"{mac}, will expire", remedy)
 
 
+@named("firewall")
 def firewall(address: str, port: int, system: System) -> Check:
-    """Whether a packet filter may drop the controller's packets; only root can read its rules."""
-    commands = (["nft", "list", "ruleset"], ["iptables", "-S"])
+    """A filtered controller looks exactly like one that is switched off."""
+    commands = (["nft", "list", "ruleset"], ["iptables", "-S"])  # only root can read them
     outputs = [answer for command in commands if (answer := system.run(command)) is not None]
     look = "sudo nft list ruleset; sudo iptables -S"
     if any(_may_drop(answer.output) for answer in outputs if answer.status == 0):
         return warn(
-            "firewall",
             "there are rules that drop or reject incoming packets",
             look,
             f"sudo nft insert rule inet filter input ip saddr {address} udp dport {port} accept"
@@ -354,13 +338,13 @@ def firewall(address: str, port: int, system: System) -> Check:
             f"# with ufw: sudo ufw allow from {address} to any port {port} proto udp",
         )
     if any(answer.status != 0 for answer in outputs):
-        return unknown("firewall", "its rules may be read by root only", look)
+        return unknown("its rules may be read by root only", look)
     if outputs:
-        return ok("firewall", "no rule drops incoming packets")
+        return ok("no rule drops incoming packets")
     if not system.path("/proc/net/netfilter").exists():
-        return ok("firewall", "this kernel has no packet filter")
+        return ok("this kernel has no packet filter")
     found = "neither nft nor iptables is installed to read its rules"
-    return unknown("firewall", found, "sudo apt install nftables", look)
+    return unknown(found, "sudo apt install nftables", look)
 
 
 def _may_drop(rules: str) -> bool:
@@ -386,21 +370,21 @@ def network_checks(host: str, port: int, address: str | None, system: System) ->
     if address is None or route is None or first.status is not Status.OK:
         return [first]
     device = route.device
-    if device == LOOPBACK:
-        return [first, device_check(device, system)]
-    return [
-        first,
-        device_check(device, system),
-        coalescing(device, system),
-        neighbour_check(address, device, neighbour(address, device, system)),
-        firewall(address, port, system),
-    ]
+    checks = [first, device_check(device, system)]
+    if device != LOOPBACK:
+        checks += [
+            coalescing(device, system),
+            neighbour_check(address, device, neighbour(address, device, system)),
+            firewall(address, port, system),
+        ]
+    return checks
 
 
 def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
     """What lies between this PC and the controller of a cell; None for no cell."""
     if table is None or table.transport == "simulated":
-        return [ok("controller link", "none: no cell, or a simulated one")]
+        why = "routes, ports and buses are looked at for a cell with a real link"
+        return [replace(ok("none: no cell, or a simulated one"), name="controller link", why=why)]
     if table.can is not None and table.transport == "can":
         return [can_check(table.can, system)]
     return [

@@ -13,7 +13,7 @@ from pathlib import Path
 from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
 from hil.archive.process import STALL_LIMIT
 
-from .check import Check, System, bad, ok, unknown, warn
+from .check import Check, System, bad, named, ok, unknown, warn
 
 GROUP = "realtime"
 RULE_FILE = "/etc/udev/rules.d/90-hil.rules"
@@ -24,61 +24,60 @@ def permissions(given: RealTimeReport | None, system: System) -> list[Check]:
     """What the operating system allows; `given` is None where the probe failed."""
     return [
         user(os.geteuid()),
-        scheduling(given, _limit(resource.RLIMIT_RTPRIO)),
-        memory_lock(given, _limit(resource.RLIMIT_MEMLOCK)),
+        scheduling(given, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]),
+        memory_lock(given, resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]),
         processor_awake(given, system),
     ]
 
 
+@named("user")
 def user(uid: int) -> Check:
-    """Who is asking: what root may do says nothing about the operator."""
+    """Nothing of hil needs root, and what root may do says nothing about other users."""
     if uid:
-        return ok("user", f"{_name()}, not root")
-    return warn("user", "root", "# run hil doctor as the user who will run hil")
+        return ok(f"{_name()}, not root")
+    return warn("root", "# run hil doctor as the user who will run hil")
 
 
+@named("real-time priority")
 def scheduling(given: RealTimeReport | None, limit: int) -> Check:
-    """Whether real-time priority was given to a process that asked for it; limit -1 for none."""
+    """Without it other programs may run before the packet is answered."""
     limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if given is None:
-        return unknown("real-time priority", f"the probe gave no answer; {limited}")
+        return unknown(f"the probe gave no answer; {limited}")
     if "FIFO" in given.scheduling.upper():
-        return ok("real-time priority", f"{given.scheduling} given ({limited})")
+        return ok(f"{given.scheduling} given ({limited})")
     found = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
-    throttled = "cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs"
-    too_low = 0 <= limit < RealTimeSettings().priority
-    return bad(
-        "real-time priority",
-        found,
-        *_limit_lines("rtprio", "98"),
-        *([] if too_low else [throttled]),
-    )
+    remedy = _limit_lines("rtprio", "98")
+    if not 0 <= limit < RealTimeSettings().priority:
+        remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
+    return bad(found, *remedy)
 
 
+@named("memory lock")
 def memory_lock(given: RealTimeReport | None, limit: int) -> Check:
-    """Whether memory may be locked in RAM; limit in bytes, -1 for none."""
+    """A page that has to be fetched from disk costs many cycles."""
     limited = "no limit" if limit < 0 else f"memlock limit {limit // 1024} KiB"
     if given is None:
-        return unknown("memory lock", f"the probe gave no answer; {limited}")
+        return unknown(f"the probe gave no answer; {limited}")
     if given.memory_locked:
-        return ok("memory lock", f"given ({limited})")
+        return ok(f"given ({limited})")
     remedy = _limit_lines("memlock", "unlimited")
     if any(sentence.startswith("only memory") for sentence in given.refused):
-        return warn("memory lock", f"only what is in use at the start; {limited}", *remedy)
-    return bad("memory lock", f"refused; {limited}", *remedy)
+        return warn(f"only what is in use at the start; {limited}", *remedy)
+    return bad(f"refused; {limited}", *remedy)
 
 
+@named("processor idle latency")
 def processor_awake(given: RealTimeReport | None, system: System) -> Check:
-    """Whether /dev/cpu_dma_latency may be held at 0."""
+    """Halves the usual wake-up time."""
     if given is not None and given.cpu_awake:
-        return ok("processor idle latency", "/dev/cpu_dma_latency can be held at 0")
+        return ok("/dev/cpu_dma_latency can be held at 0")
     if not system.path("/dev/cpu_dma_latency").exists():
-        return unknown("processor idle latency", "this kernel has no /dev/cpu_dma_latency")
+        return unknown("this kernel has no /dev/cpu_dma_latency")
     if given is None:
-        return unknown("processor idle latency", "the probe gave no answer")
+        return unknown("the probe gave no answer")
     rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
     return warn(
-        "processor idle latency",
         "/dev/cpu_dma_latency may not be written",
         _join(),
         f"echo '{rule}' | sudo tee {RULE_FILE}",
@@ -94,11 +93,6 @@ def _limit_lines(item: str, value: str) -> tuple[str, ...]:
 
 def _join() -> str:
     return f"sudo groupadd -f {GROUP} && sudo usermod -aG {GROUP} {_name()}"
-
-
-def _limit(limit: int) -> int:
-    """The limit in force; -1 for none."""
-    return resource.getrlimit(limit)[0]
 
 
 def _name() -> str:
@@ -134,21 +128,32 @@ class DiskTrial:
 
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     """Room and write time; None stands for a disk that gave no answer in time."""
-    if trial is None:
-        return [bad("disk", f"no answer from the disk of {place}", f"df -h {place}", _MOVE)]
+    return [disk_write(place, trial)] if trial is None else [
+        disk_space(trial), disk_write(place, trial)
+    ]  # fmt: skip
+
+
+@named("disk space")
+def disk_space(trial: DiskTrial) -> Check:
+    """A full disk ends the motion: the arm is stopped, what was archived is whole."""
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
-    look = f"du -xh {trial.folder} | sort -h | tail"
-    poor = warn if hours >= 0.5 else bad
-    room = ok("disk space", found) if hours >= 2 else poor(found, look)
+    if hours >= 2:
+        return ok(found)
+    return (warn if hours >= 0.5 else bad)(found, f"du -xh {trial.folder} | sort -h | tail")
+
+
+@named("disk write")
+def disk_write(place: Path, trial: DiskTrial | None) -> Check:
+    """A motion is stopped if the disk keeps the archive waiting for seconds."""
+    if trial is None:
+        return bad(f"no answer from the disk of {place}", f"df -h {place}", _MOVE)
     if not trial.seconds:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no figures'}"
-        return [room, bad("disk write", refused, f"ls -ld {trial.folder}; id", _MOVE)]
+        return bad(refused, f"ls -ld {trial.folder}; id", _MOVE)
     worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
     found = f"64 KiB are safe after {1e3 * middle:.1f} ms, {1e3 * worst:.1f} ms at worst"
-    if worst < _SLOW:
-        return [room, ok("disk write", found)]
-    return [room, (warn if worst < _TOO_SLOW else bad)("disk write", found, _MOVE)]
+    return ok(found) if worst < _SLOW else (warn if worst < _TOO_SLOW else bad)(found, _MOVE)
 
 
 _CPU = "/sys/devices/system/cpu"
@@ -178,72 +183,64 @@ def cpus(system: System) -> list[str]:
     return [name for name in system.names(_CPU) if re.fullmatch(r"cpu\d+", name)]
 
 
+@named("clock source")
 def clock_source(system: System) -> Check:
-    """Whether reading the clock is cheap."""
+    """The clock is read several times a cycle; a slow one costs µs each time."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     source = system.text(f"{folder}/current_clocksource")
     if not source:
-        return unknown("clock source", _UNSTATED)
+        return unknown(_UNSTATED)
     if source in _GOOD_CLOCKS:
-        return ok("clock source", source)
+        return ok(source)
     offered = (system.text(f"{folder}/available_clocksource") or "").split()
     remedy = [f"echo tsc | sudo tee {folder}/current_clocksource"] if "tsc" in offered else []
-    return warn("clock source", source, *remedy)
+    return warn(source, *remedy)
 
 
+@named("frequency governor")
 def governor(system: System) -> Check:
-    """Whether processors keep their full frequency."""
+    """A processor that clocks down answers its first packet late."""
     found = {system.text(f"{_CPU}/{cpu}/cpufreq/scaling_governor") for cpu in cpus(system)}
     names = sorted(name for name in found if name)
-    if not names:
-        return ok("frequency governor", "no frequency scaling on this machine")
-    if names == ["performance"]:
-        return ok("frequency governor", "performance")
+    if names in ([], ["performance"]):
+        return ok("".join(names) or "no frequency scaling on this machine")
     setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
-    return warn("frequency governor", ", ".join(names), setting)
+    return warn(", ".join(names), setting)
 
 
+@named("idle states")
 def idle_states(system: System, *, no_sleep: bool) -> Check:
-    """Exit latency of the deepest idle state in use; no matter if none is entered."""
-    folders = [
-        f"{_CPU}/{cpu}/cpuidle/{state}"
-        for cpu in cpus(system)
-        for state in system.names(f"{_CPU}/{cpu}/cpuidle")
-    ]
-    latencies = {
-        folder: latency
-        for folder in folders
-        if (latency := system.number(f"{folder}/latency")) is not None
-        and latency >= 0
-        and system.number(f"{folder}/disable") != 1
-    }
+    """A sleeping processor has to wake before it can answer."""
+    latencies = {}
+    for cpu in cpus(system):
+        for state in system.names(f"{_CPU}/{cpu}/cpuidle"):
+            folder = f"{_CPU}/{cpu}/cpuidle/{state}"
+            latency = system.number(f"{folder}/latency")
+            if latency is not None and latency >= 0 and system.number(f"{folder}/disable") != 1:
+                latencies[folder] = latency
     if not latencies:
         driver = system.text(f"{_CPU}/cpuidle/current_driver")
-        return ok(
-            "idle states",
-            f"idle driver {driver}" if driver not in (None, "none") else "none listed",
-        )
+        return ok(f"idle driver {driver}" if driver not in (None, "none") else "none listed")
     deepest = max(latencies, key=lambda folder: latencies[folder])
     name = system.text(f"{deepest}/name") or deepest.rpartition("/")[2]
     found = f"deepest is {name}, {latencies[deepest]} µs to wake"
     if no_sleep:
-        return ok("idle states", f"{found}; not entered during an exchange")
+        return ok(f"{found}; not entered during an exchange")
     if latencies[deepest] <= 50:
-        return ok("idle states", found)
-    remedy = "# see 'processor idle latency': with that right, no idle state matters"
-    return warn("idle states", found, remedy)
+        return ok(found)
+    return warn(found, "# see 'processor idle latency': with that right, no idle state matters")
 
 
+@named("isolated processors")
 def isolation(system: System) -> Check:
-    """Whether a processor is isolated from other programs."""
+    """Other programs stay off an isolated processor; worth it only if the latency is too large."""
     if names := system.text(f"{_CPU}/isolated"):
-        return ok("isolated processors", names)
+        return ok(names)
     count = len(cpus(system))
-    if count < 4:
-        return ok("isolated processors", f"none; with {count} there is none to spare")
     last = count - 1
+    if count < 4:
+        return ok(f"none; with {count} there is none to spare")
     return warn(
-        "isolated processors",
         f"none of {count}",
         f"# add to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub: "
         f"isolcpus=managed_irq,domain,{last} nohz_full={last} rcu_nocbs={last}",
@@ -251,28 +248,26 @@ def isolation(system: System) -> Check:
     )
 
 
+@named("kernel preemption")
 def preemption(system: System) -> Check:
-    """The kernel's preemption model."""
+    """How long the kernel finishes its own work before a waiting program runs."""
     version = system.text("/proc/version") or ""
     if "PREEMPT_RT" in version or system.text("/sys/kernel/realtime") == "1":
-        return ok("kernel preemption", "PREEMPT_RT")
+        return ok("PREEMPT_RT")
     model = _preemption_model(system)
     if model in ("full", "lazy"):
-        return ok("kernel preemption", model)
-    install = (
+        return ok(model)
+    remedy = [
         "sudo apt install linux-image-rt-amd64   # Debian; Ubuntu: sudo pro enable realtime-kernel"
-    )
+    ]
     if model is None:
-        return unknown("kernel preemption", _UNSTATED, install)
-    if "PREEMPT_DYNAMIC" not in version:
-        return warn("kernel preemption", model, install)
-    return warn(
-        "kernel preemption",
-        model,
-        install,
-        "# or add preempt=full to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub:",
-        "sudo update-grub && sudo reboot",
-    )
+        return unknown(_UNSTATED, *remedy)
+    if "PREEMPT_DYNAMIC" in version:
+        remedy += [
+            "# or add preempt=full to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub:",
+            "sudo update-grub && sudo reboot",
+        ]
+    return warn(model, *remedy)
 
 
 def _preemption_model(system: System) -> str | None:
@@ -289,33 +284,24 @@ def _preemption_model(system: System) -> str | None:
     except (OSError, EOFError):
         release = system.text("/proc/sys/kernel/osrelease") or ""
         config = system.text(f"/boot/config-{release}") or ""
-    for option, model in (
-        ("PREEMPT_NONE", "none"),
-        ("PREEMPT_VOLUNTARY", "voluntary"),
-        ("PREEMPT_LAZY", "lazy"),
-        ("PREEMPT", "full"),
-    ):
-        if re.search(rf"^CONFIG_{option}=y$", config, re.MULTILINE):
-            return model
+    for option in ("_NONE", "_VOLUNTARY", "_LAZY", ""):
+        if re.search(rf"^CONFIG_PREEMPT{option}=y$", config, re.MULTILINE):
+            return option[1:].lower() or "full"
     return None
 
 
+@named("virtual machine")
 def virtualisation(system: System) -> Check:
-    """Whether another operating system runs between this one and the hardware."""
+    """The host may stop it for milliseconds, and no program in it can tell."""
     flags = re.search(r"^flags\s*:(.*)$", system.text("/proc/cpuinfo") or "", re.MULTILINE)
     product = system.text("/sys/class/dmi/id/product_name") or ""
     makers = r"\b(KVM|QEMU|VirtualBox|VMware|Virtual Machine)\b"
-    if not (flags and "hypervisor" in flags[1].split()) and not re.search(
-        makers, product, re.IGNORECASE
-    ):
-        return ok("virtual machine", "no sign of one")
+    in_one = flags is not None and "hypervisor" in flags[1].split()
+    if not in_one and not re.search(makers, product, re.IGNORECASE):
+        return ok("no sign of one")
     share = stolen_share(system.text("/proc/stat") or "")
     found = "yes" if share is None else f"yes; {100 * share:.2f} % of its time stolen since boot"
-    return warn(
-        "virtual machine",
-        found,
-        "# for simulated controllers only; run an arm from a PC of its own",
-    )
+    return warn(found, "# for simulated controllers only; run an arm from a PC of its own")
 
 
 def stolen_share(stat: str, since: str = "") -> float | None:
@@ -337,29 +323,25 @@ def _ticks(stat: str) -> list[int] | None:
     return None if line is None else [int(word) for word in line[1].split()]
 
 
+@named("stolen time while measuring")
 def stolen(before: str, after: str) -> Check:
-    """How much processor time the host gave to others during the measurement."""
+    """Time in which a virtual machine did not run."""
     share = stolen_share(after, before)
     if share is None:
-        return unknown("stolen time while measuring", _UNSTATED)
+        return unknown(_UNSTATED)
     found = f"{100 * share:.2f} %"
     if share < 1e-4:
-        return ok("stolen time while measuring", found)
-    return warn(
-        "stolen time while measuring",
-        found,
-        "# ask for dedicated processors, or use a PC of its own",
-    )
+        return ok(found)
+    return warn(found, "# ask for dedicated processors, or use a PC of its own")
 
 
+@named("other load")
 def load(system: System) -> Check:
-    """What else is running."""
+    """Real-time priority goes before other programs, not before interrupts and disk."""
     try:
         minute = float((system.text("/proc/loadavg") or "").split()[0])
     except (IndexError, ValueError):
-        return unknown("other load", _UNSTATED, "uptime")
+        return unknown(_UNSTATED, "uptime")
     count = max(len(cpus(system)), 1)
     found = f"{minute:g} waiting or running over the last minute, {count} processors"
-    if minute <= 0.5 * count:
-        return ok("other load", found)
-    return warn("other load", found, "top   # and end what is not needed")
+    return ok(found) if minute <= 0.5 * count else warn(found, "top   # and end what is not needed")

@@ -13,6 +13,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ def verdict(cycle_ms: int, fit: bool) -> Fitness:
 
 
 # --- diagnosis and report --------------------------------------------------------------------
-PORT = bad("UDP port 1000", "in use [by] a", "sudo ss -lunp")
+PORT = replace(bad("in use [by] a", "sudo ss -lunp"), name="UDP port 1000", why="it is the port")
 
 
 def diagnosis(*checks: Check, fit: bool = True, seconds: float = 60.0) -> Diagnosis:
@@ -158,7 +159,7 @@ def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
 
 
 def test_an_unknown_or_warning_does_not() -> None:
-    assert diagnosis(warn("a", "x"), unknown("b", "x")).fit
+    assert diagnosis(warn("x"), unknown("x")).fit
 
 
 def test_a_short_measurement_calls_itself_provisional() -> None:
@@ -183,10 +184,10 @@ def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
 
 def test_remedies_come_worst_first_and_each_command_once() -> None:
     checks = (
-        warn("w", "slow", "make it fast"),
-        ok("g", "good"),
+        warn("slow", "make it fast"),
+        ok("good"),
         PORT,
-        bad("o", "", "sudo ss -lunp"),
+        bad("", "sudo ss -lunp"),
     )
     commands = [line.strip() for line in remedies(checks) if line.startswith("    ")]
     assert commands == ["sudo ss -lunp", "make it fast"]
@@ -197,7 +198,7 @@ def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
     show(diagnosis(PORT), console)
     text = console.export_text()
     assert "in use [by] a" in text
-    assert "the controller sends to this port" in text
+    assert "it is the port" in text
     assert "2000-5000 µs        1 █" in text
 
 
