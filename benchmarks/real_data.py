@@ -32,7 +32,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks import parser_of
+from benchmarks import parser_of, show
 from benchmarks.published import FITTED_SHARE, Published
 from hil.identify import Options
 from hil.identify.estimating import estimate_with
@@ -278,16 +278,10 @@ def main() -> None:
     case = load_case(folder)
     splits = splits_of(case.recording)
     models = model_table(case, splits)
-    largest, model = list(case.models().items())[-1]
+    model = [*case.models().values()][-1]
     estimators = estimator_table(case, model, splits)
     essential = essential_table(case, model, splits)
     default = default_errors(folder)
-    if not arguments.json:
-        print(f"{folder.name}, hil identify: in sample {default['in_sample']:.2%},", end=" ")
-        print(f"held out {default['held_out']:.2%}")
-        _show(f"{folder.name}: models, weighted least squares", models)
-        _show(f"{folder.name}: estimators, {largest}", estimators)
-        _show(f"{folder.name}: essential parameters, {largest}", essential)
     result = {
         "data": folder.name,
         "held_out_relative_error": default["held_out"],
@@ -296,7 +290,7 @@ def main() -> None:
         "estimators": estimators,
         "essential": essential,
     }
-    print(json.dumps(result))
+    show(result, only_json=arguments.json)
 
 
 def _coupled_motors(recording: Recording) -> Array | None:
@@ -326,24 +320,6 @@ def _refitted(model: RobotModel, whole: PhaseFactor, kept: Collection[str]) -> A
         )
     ).values
     return values
-
-
-def _show(heading: str, table: dict[str, Any]) -> None:
-    print(f"\n### {heading}\n")
-    columns = list(dict.fromkeys(key for row in table.values() for key in row))
-    print("| | " + " | ".join(column.replace("_", " ") for column in columns) + " |")
-    print("|---" * (len(columns) + 1) + "|")
-    for name, row in table.items():
-        cells = [_cell(row.get(column, "")) for column in columns]
-        print(f"| {name.replace('_', ' ')} | " + " | ".join(cells) + " |")
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(_cell(one) for one in value)
-    if isinstance(value, float):
-        return f"{value:.2%}" if value < 1.0 else f"{value:.3g}"
-    return str(value)
 
 
 if __name__ == "__main__":

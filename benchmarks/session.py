@@ -42,6 +42,16 @@ LOOP = 50_000
 START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
 
 
+def sines(t: Array, start: Array, fade_time: float) -> tuple[Array, Array]:
+    """Position and velocity (m, 6) of joint sinusoids from rest, faded in, at times (m,)."""
+    s = np.clip(t[:, None] / fade_time, 0.0, 1.0)
+    fade = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+    rate = 140.0 * s**3 * (1.0 - s) ** 3 / fade_time
+    phase = 2.0 * np.pi * FREQUENCY * t[:, None]
+    slope = fade * 2.0 * np.pi * FREQUENCY * np.cos(phase) + rate * np.sin(phase)
+    return start + AMPLITUDE * fade * np.sin(phase), AMPLITUDE * slope
+
+
 class Sinusoid:
     """Joint sinusoids from rest, faded in over two seconds and going on for ever, as a table."""
 
@@ -49,14 +59,10 @@ class Sinusoid:
     finished = False
 
     def __init__(self, start: Array) -> None:
-        t = np.arange(FADE + LOOP)[:, None] * (PERIOD_MS / 1000.0)
-        s = np.clip(t / (FADE * PERIOD_MS / 1000.0), 0.0, 1.0)
-        fade = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-        rate = 0.5 * 140.0 * s**3 * (1.0 - s) ** 3
-        phase = 2.0 * np.pi * FREQUENCY * t
-        self.position = start + AMPLITUDE * fade * np.sin(phase)
-        slope = fade * 2.0 * np.pi * FREQUENCY * np.cos(phase) + rate * np.sin(phase)
-        self.velocity = AMPLITUDE * slope
+        period = PERIOD_MS / 1000.0
+        self.position, self.velocity = sines(
+            np.arange(FADE + LOOP, dtype=np.float64) * period, start, FADE * period
+        )
         self.start = start
         self._index = 0
 
@@ -91,9 +97,9 @@ def drive_train() -> DriveTrain:
     )
 
 
-def new_session(capacity: int) -> Session:
-    """A session with limits that the sinusoid keeps."""
-    limits = GuardLimits(
+def limits() -> GuardLimits:
+    """Limits that the sinusoids keep."""
+    return GuardLimits(
         lower=np.full(N, -3.0),
         upper=np.full(N, 3.0),
         velocity=np.full(N, 3.0),
@@ -102,7 +108,11 @@ def new_session(capacity: int) -> Session:
         following_error=np.full(N, 2.0),
         current=np.full(N, 20.0),
     )
-    return Session(drive_train(), Guard(limits, PERIOD_MS / 1000.0), CycleRing(N, capacity))
+
+
+def new_session(capacity: int) -> Session:
+    """A session of these drives."""
+    return Session(drive_train(), Guard(limits(), PERIOD_MS / 1000.0), CycleRing(N, capacity))
 
 
 CLOSED = 3

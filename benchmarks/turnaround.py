@@ -2,8 +2,7 @@
 
 The controller is paced by absolute deadlines; the exchange runs a long motion of six joints under
 the guard while an ordinary process drains its ring. In the same run, in blocks that alternate, a
-bare echo process with the same scheduling shows what this machine can do at all (the floor), and
-`cyclictest`, where it is installed, what it does without any network or Python.
+bare echo process with the same scheduling shows what this machine can do at all (the floor).
 
     python -m benchmarks.turnaround [--cycles N] [--busy] [--json]
 
@@ -13,12 +12,9 @@ the time went. With `--busy` all is done once more beside a process that keeps a
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
-import shutil
 import socket
-import subprocess
 import tempfile
 import time
 from dataclasses import replace
@@ -28,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import parser_of
-from benchmarks.session import N, drive_train
+from benchmarks import parser_of, show
+from benchmarks.session import drive_train, limits
 from benchmarks.turnaround_ends import (
     HOST,
     PERIOD,
@@ -41,7 +37,7 @@ from benchmarks.turnaround_ends import (
     echo,
     spin,
 )
-from drivers import GuardLimits, MotionEnded
+from drivers import MotionEnded
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.transports.udp import UdpSpec
@@ -49,24 +45,7 @@ from drivers.transports.udp import UdpSpec
 Array = NDArray[np.float64]
 
 CLOSED_CYCLES = 5
-CYCLICTEST_SECONDS = 10
-AIM_P50_US = 60.0
-AIM_P99_US = 100.0
-"""How far above the floor the exchange may be."""
 _spawn = multiprocessing.get_context("spawn")
-
-
-def limits() -> GuardLimits:
-    """Limits that the sweep keeps."""
-    return GuardLimits(
-        lower=np.full(N, -3.0),
-        upper=np.full(N, 3.0),
-        velocity=np.full(N, 3.0),
-        acceleration=np.full(N, 20.0),
-        jerk=np.full(N, 300.0),
-        following_error=np.full(N, 2.0),
-        current=np.full(N, 20.0),
-    )
 
 
 def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings:
@@ -230,38 +209,14 @@ def summary(times: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def cyclictest() -> dict[str, Any]:
-    """Wake-up latency as `cyclictest` sees it, where it is installed and permitted."""
-    command = shutil.which("cyclictest")
-    if command is None:
-        return {}
-    last = str(max(os.sched_getaffinity(0)))
-    options = ["-q", "-m", "-p50", "-i1000", "-t1", "-a", last, "-h20000"]
-    run = subprocess.run(
-        [command, *options, f"-D{CYCLICTEST_SECONDS}"], capture_output=True, text=True, check=False
-    )
-    rows = [line.split() for line in run.stdout.splitlines() if line[:1].isdigit()]
-    if run.returncode != 0 or not rows:
-        return {}
-    latency = np.repeat([int(row[0]) for row in rows], [int(row[1]) for row in rows])
-    highest = [line for line in run.stdout.splitlines() if line.startswith("# Max Latencies")]
-    return {
-        "cyclictest_p50_us": float(np.percentile(latency, 50)),
-        "cyclictest_p99_us": float(np.percentile(latency, 99)),
-        "cyclictest_max_us": int(highest[0].split(":")[1]),
-        "cyclictest_late": int((latency > 1000).sum()),
-    }
-
-
 def run(cycles: int, blocks: int, *, busy: bool) -> dict[str, Any]:
-    """One run with `cyclictest` after it, beside a load or not."""
+    """One run, beside a load or not."""
     load = _spawn.Process(target=spin, args=(os.getpid(),), daemon=True)
     if busy:
         load.start()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            result = summary(measure(cycles, blocks, Path(folder)))
-        return result | cyclictest()
+            return summary(measure(cycles, blocks, Path(folder)))
     finally:
         if busy:
             load.kill()
@@ -280,27 +235,7 @@ def main() -> None:
         beside = run(options.cycles, options.blocks, busy=True)
         result |= {f"busy_{name}": value for name, value in beside.items()}
     result["seconds"] = round(time.monotonic() - begin)
-    if not options.json:
-        show(result)
-    print(json.dumps(result))
-
-
-def show(result: dict[str, Any]) -> None:
-    """The figures, one per line, and every miss."""
-    for name, value in result.items():
-        if not name.endswith("misses"):
-            print(f"  {name:28s} {value}")
-    for prefix in ("", "busy_"):
-        for miss in result.get(f"{prefix}misses", ()):
-            print(f"  {prefix}missed cycle {miss['cycle']}: {miss['what']} ({miss})")
-        if f"{prefix}p50_us" in result:
-            over_p50 = result[f"{prefix}p50_us"] - result[f"{prefix}floor_p50_us"]
-            over_p99 = result[f"{prefix}p99_us"] - result[f"{prefix}floor_p99_us"]
-            more = result[f"{prefix}missed"] - result[f"{prefix}floor_late"]
-            print(
-                f"  {prefix or 'idle '}above the floor: p50 {over_p50:+.1f} us (aim {AIM_P50_US})"
-            )
-            print(f"  {' ':5}p99 {over_p99:+.1f} us (aim {AIM_P99_US}), misses {more:+d} (aim 0)")
+    show(result, only_json=options.json)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.session import AMPLITUDE, FREQUENCY, N, drive_train, init_packet
+from benchmarks.session import START, N, drive_train, init_packet, sines
 from drivers import CyclicPacket, Mode
 from drivers.exchange.realtime import RealTimeSettings, enter
 from drivers.motion_source import BoundsName
@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 HOST: Final = "127.0.0.1"
 PERIOD_MS: Final = 1
 PERIOD: Final = PERIOD_MS / 1000.0
-START: Final = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
 WARM_UP: Final = 300
 """Cycles at the beginning that are not measured."""
 _TIMEVAL: Final = struct.Struct("@qq")
@@ -38,14 +37,9 @@ class Sweep:
     bounds: BoundsName = "plan"
 
     def __init__(self, cycles: int) -> None:
-        t = np.arange(cycles + 1)[:, None] * PERIOD
-        s = np.clip(t / 2.0, 0.0, 1.0)
-        fade = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-        rate = 0.5 * 140.0 * s**3 * (1.0 - s) ** 3
-        phase = 2.0 * np.pi * FREQUENCY * t
-        slope = fade * 2.0 * np.pi * FREQUENCY * np.cos(phase) + rate * np.sin(phase)
-        self.position = START + AMPLITUDE * fade * np.sin(phase)
-        self.velocity = AMPLITUDE * slope
+        self.position, self.velocity = sines(
+            np.arange(cycles + 1, dtype=np.float64) * PERIOD, START, 2.0
+        )
         self.start = START
         self._offset = np.zeros(N)
         self._index = 0
