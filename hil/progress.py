@@ -12,7 +12,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -40,11 +39,16 @@ def say(text: str, *, err: bool = False) -> None:
     put(Console(stderr=err), text)
 
 
-class Task(Protocol):
-    """The running piece of work."""
+class Task:
+    """The running piece of work; shows how much of it is done, and what is being done now."""
+
+    def __init__(self, show: Callable[[float, str], None]) -> None:
+        self._show, self._done = show, 0.0
 
     def advance(self, units: float, note: str = "") -> None:
         """`units` more are done; `note` says what is being done now."""
+        self._done += units
+        self._show(self._done, note)
 
 
 class Reporter(Protocol):
@@ -56,17 +60,6 @@ class Reporter(Protocol):
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
         """A piece of work of `total` units; advance it through the yielded task."""
-
-
-class _Advancing:
-    """A task that passes on how much is done by now, of so many units."""
-
-    def __init__(self, show: Callable[[float, str], None]) -> None:
-        self._show, self._done = show, 0.0
-
-    def advance(self, units: float, note: str = "") -> None:
-        self._done += units
-        self._show(self._done, note)
 
 
 class Silent:
@@ -88,7 +81,7 @@ class Silent:
                 said = tenth
                 self.say(f"{title}: {10 * tenth} %  {note}".rstrip())
 
-        yield _Advancing(show)
+        yield Task(show)
 
 
 class LineReporter(Silent):
@@ -116,13 +109,14 @@ class Bar:
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
         """A bar with what is done, the time spent and the time left."""
+        whole = Column(no_wrap=True)
         progress = _WithNote(
-            _whole(TextColumn, "{task.description}"),
+            TextColumn("{task.description}", table_column=whole),
             BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=_NARROWEST)),
-            _whole(MofNCompleteColumn),
-            _whole(TimeElapsedColumn),
-            _whole(TextColumn, "left"),
-            _whole(TimeRemainingColumn),
+            MofNCompleteColumn(table_column=whole),
+            TimeElapsedColumn(table_column=whole),
+            TextColumn("left", table_column=whole),
+            TimeRemainingColumn(table_column=whole),
             console=self._console,
             transient=True,
             expand=True,
@@ -133,7 +127,7 @@ class Bar:
             def show(done: float, note: str) -> None:
                 progress.update(task, completed=round(done), note=printable(note, keep=""))
 
-            yield _Advancing(show)
+            yield Task(show)
 
 
 class _WithNote(Progress):
@@ -144,11 +138,6 @@ class _WithNote(Progress):
         for task in self.tasks:
             yield self.make_tasks_table([task])
             yield Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
-
-
-def _whole(column: Callable[..., ProgressColumn], *arguments: str) -> ProgressColumn:
-    """Return a column that gives up none of its text for others."""
-    return column(*arguments, table_column=Column(no_wrap=True))
 
 
 def reporter(*, quiet: bool = False) -> Reporter:

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from types import FrameType
 from typing import Final, Literal
 
@@ -98,11 +97,9 @@ class Buttons:
     """
 
     def __init__(self, duration: float | None = None) -> None:
-        self.interrupted = False
+        self.interrupted = self._at_once = False
         self._until = None if duration is None else time.monotonic() + duration
-        self._at_once = False
-        self._drive_on = False
-        self._emergency_stop = False
+        self._pressed: set[int] = set()
 
     def request(self) -> Request:
         """Go on; or end, by a signal or because the time is over; or give up."""
@@ -114,21 +111,18 @@ class Buttons:
     def press(self, signum: int, frame: FrameType | None = None) -> None:
         """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
         del frame
-        if signum == signal.SIGUSR1:
-            self._drive_on = True
-        elif signum == signal.SIGUSR2:
-            self._emergency_stop = True
+        if signum in (signal.SIGUSR1, signal.SIGUSR2):
+            self._pressed.add(signum)
         else:
-            self._at_once = self.interrupted
-            self.interrupted = True
+            self._at_once, self.interrupted = self.interrupted, True
 
     def pass_on(self, controller: SimulatedController) -> None:
-        """Press on the controller what was pressed here."""
-        if self._drive_on:
-            self._drive_on = False
+        """Press on the controller what was pressed here: drive on, or the emergency stop."""
+        if signal.SIGUSR1 in self._pressed:
+            self._pressed.discard(signal.SIGUSR1)
             controller.drive_on()
-        if self._emergency_stop:
-            self._emergency_stop = False
+        if signal.SIGUSR2 in self._pressed:
+            self._pressed.discard(signal.SIGUSR2)
             controller.emergency_stop()
 
 
@@ -222,7 +216,20 @@ def serve_session(
         starts += 1
         controller = build()
         entered: Counter[Phase] = Counter()
-        observe = partial(_observe, controller, entered, [controller.phase], pressed, watch)
+        phase = controller.phase
+
+        def observe(
+            tally: Tally,
+            controller: SimulatedController = controller,
+            entered: Counter[Phase] = entered,
+        ) -> None:
+            nonlocal phase
+            if controller.phase is not phase:
+                phase = controller.phase
+                entered[phase] += 1
+            pressed.pass_on(controller)
+            watch(controller, tally)
+
         try:
             summary = serve(
                 controller, far_end, faults=faults, request=pressed.request, watch=observe,
@@ -238,19 +245,3 @@ def serve_session(
         until = time.monotonic() + KNOCK_INTERVAL
         while time.monotonic() < until and pressed.request() is Request.GO_ON:
             time.sleep(0.05)
-
-
-def _observe(
-    controller: SimulatedController,
-    entered: Counter[Phase],
-    phase: list[Phase],
-    pressed: Buttons,
-    watch: Callable[[SimulatedController, Tally], None],
-    tally: Tally,
-) -> None:
-    """Count phases as they are entered (`phase` holds the last one); pass on the buttons."""
-    if controller.phase is not phase[0]:
-        phase[0] = controller.phase
-        entered[phase[0]] += 1
-    pressed.pass_on(controller)
-    watch(controller, tally)
