@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -128,3 +130,51 @@ def test_commands_that_findings_recommend_exist() -> None:
         command, words = command_of(line.split())
         known = {option for parameter in command.params for option in parameter.opts}
         assert {word for word in words if word.startswith("-")} <= known, line
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages, built without a warning."""
+    folder = tmp_path_factory.mktemp("pages")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-q", "-W", str(ROOT / "docs"), str(folder)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.slow
+class TestBuilt:
+    def test_the_pages_need_no_network(self, built: Path) -> None:
+        needs = re.compile(r'<(?:script|link|img)[^>]*(?:src|href)="(?:https?:)?//[^"]*"')
+        for page in built.rglob("*.html"):
+            assert not needs.findall(page.read_text("utf-8")), page.name
+        elsewhere = re.compile(r"url\(\s*['\"]?(?:https?:)?//")
+        for sheet in built.rglob("*.css"):
+            assert not elsewhere.search(sheet.read_text("utf-8")), sheet.name
+
+    def test_formulae_are_mathml(self, built: Path) -> None:
+        page = (built / "theory.html").read_text("utf-8")
+        assert page.count("<math") > 20 and r"\boldsymbol" not in page
+        assert "mathjax" not in page.lower().replace("mathjax_ignore", "")  # a class of sections
+
+    def test_names_in_the_theory_lead_to_the_reference(self, built: Path) -> None:
+        page = (built / "theory.html").read_text("utf-8")
+        for name in ("identification.Regressor", "drivers.Session", "planner.TrajectoryPlayer"):
+            name = re.escape(name)
+            links = rf'#{name}[^"]*"[^>]*><code', rf'"[^>]*><code[^>]*><span class="pre">{name}'
+            assert any(re.search(rf'href="api-[^"]*{link}', page) for link in links), name
+
+    def test_the_reference_has_every_public_name(self, built: Path) -> None:
+        import identification
+        import planner
+
+        for package in (planner, identification):
+            page = (built / f"api-{package.__name__}.html").read_text("utf-8")
+            missing = [
+                name for name in package.__all__ if f'id="{package.__name__}.{name}"' not in page
+            ]
+            assert not missing
