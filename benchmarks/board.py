@@ -18,17 +18,15 @@ names the fault, or leaves it out where it is harmless, and blames nothing else.
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks import parser_of, plain_fit
+from benchmarks import parser_of, plain_fit, show
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
 from benchmarks.identification_study import recorded, study
 from benchmarks.joint_log import JointLog
@@ -46,52 +44,8 @@ _RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
 _VALIDATION_SEED: Final = 1_000_000  # noise of its own
 
 
-@dataclass(frozen=True)
-class Row:
-    """One split of one recording: errors of both, over all joints and by joint, and their times.
-
-    Attributes:
-        ratio: of hil's error to the plain one.
-        seconds: that each took, by name.
-        inside: share of held-out means of torque inside hil's 95 % intervals; None in sample.
-        white_inside: share inside the intervals that white residuals would have.
-    """
-
-    data: str
-    split: str
-    hil: float
-    plain: float
-    ratio: float
-    hil_joints: list[float]
-    plain_joints: list[float]
-    seconds: dict[str, float]
-    inside: float | None
-    white_inside: float | None
-
-
-@dataclass(frozen=True)
-class DegradedRow:
-    """One fault of one recording.
-
-    Attributes:
-        hil: held-out error with the fault; None where the recording was refused.
-        undegraded: without it.
-        named: checks that the verdict calls wrong or suspicious; of those that it calls so without
-            the fault as well only what is expected.
-        words: what it says of them, or why the recording was refused.
-        expected: checks of which any is right.
-        right: whether the fault was named, or left out where harmless, and nothing else blamed.
-    """
-
-    data: str
-    case: str
-    hil: float | None
-    undegraded: float
-    ratio: float | None
-    named: list[str]
-    words: list[str]
-    expected: list[str]
-    right: bool
+Row = dict[str, Any]
+"""Of the line of JSON: `data` and `split` or `case`, and what was found."""
 
 
 class Parts(NamedTuple):
@@ -164,25 +118,28 @@ def plain_errors(parts: Parts) -> tuple[float, list[float]]:
 
 
 def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str, JointLog]) -> Row:
-    """Both errors on one split of logs, which the archives hold."""
+    """Both errors on one split of logs, which the archives hold, and the seconds that each took.
+
+    `inside` is None in sample; `white_inside`: of the intervals that white residuals would have.
+    """
     parts = cut(split, logs)
     start = time.perf_counter()
     ours = identified_split(split, archives, parts)
     middle = time.perf_counter()
     plain, plain_joints = plain_errors(parts)
     calibration = ours.results.calibration
-    return Row(
-        data=name,
-        split=str(split),
-        hil=ours.error,
-        plain=plain,
-        ratio=ours.error / plain,
-        hil_joints=ours.joints,
-        plain_joints=plain_joints,
-        seconds={"hil": middle - start, "plain": time.perf_counter() - middle},
-        inside=None if calibration is None else calibration.inside,
-        white_inside=None if calibration is None else calibration.white_inside,
-    )
+    return {
+        "data": name,
+        "split": str(split),
+        "hil": ours.error,
+        "plain": plain,
+        "ratio": ours.error / plain,
+        "hil_joints": ours.joints,
+        "plain_joints": plain_joints,
+        "seconds": {"hil": middle - start, "plain": time.perf_counter() - middle},
+        "inside": None if calibration is None else calibration.inside,
+        "white_inside": None if calibration is None else calibration.white_inside,
+    }
 
 
 def rows_of(name: str, data: Path, *, short: bool = False) -> Iterator[Row]:
@@ -206,7 +163,7 @@ def import_all(published: Published, data: Path, folder: Path) -> dict[str, Path
     return {log: published.imported(log, data, folder / f"{log}.mcap") for log in published.logs}
 
 
-def degraded_rows(name: str, split: Split, logs: Mapping[str, JointLog]) -> Iterator[DegradedRow]:
+def degraded_rows(name: str, split: Split, logs: Mapping[str, JointLog]) -> Iterator[Row]:
     """One split with each fault in turn."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -225,10 +182,14 @@ def degraded_rows(name: str, split: Split, logs: Mapping[str, JointLog]) -> Iter
             yield degraded_row(name, case, whole, found)
 
 
-def degraded_row(name: str, case: str, whole: Identified, found: Identified | str) -> DegradedRow:
-    """What became of a fault, beside the identification without it; words where it was refused."""
+def degraded_row(name: str, case: str, whole: Identified, found: Identified | str) -> Row:
+    """What became of a fault, beside the identification without it; words where it was refused.
+
+    `named` are checks that the verdict calls wrong or suspicious; of those that it calls so without
+    the fault as well only what is `expected`.
+    """
     expected = EXPECTED[case].checks
-    error, ratio, named, words = None, None, list[str](), list[str]()
+    error, ratio, named = None, None, list[str]()
     if isinstance(found, str):
         words = [found]
     else:
@@ -237,17 +198,17 @@ def degraded_row(name: str, case: str, whole: Identified, found: Identified | st
         error, ratio = found.error, found.error / whole.error
         named = list(dict.fromkeys(one.check for one in findings))
         words = [f"{one.check}: {one.words}" for one in findings]
-    return DegradedRow(
-        data=name,
-        case=case,
-        hil=error,
-        undegraded=whole.error,
-        ratio=ratio,
-        named=named,
-        words=words,
-        expected=sorted(expected),
-        right=ratio is not None and is_right(case, ratio, named),
-    )
+    return {
+        "data": name,
+        "case": case,
+        "hil": error,
+        "undegraded": whole.error,
+        "ratio": ratio,
+        "named": named,
+        "words": words,
+        "expected": sorted(expected),
+        "right": ratio is not None and is_right(case, ratio, named),
+    }
 
 
 def suspicious(results: Results) -> list[FindingResult]:
@@ -257,13 +218,7 @@ def suspicious(results: Results) -> list[FindingResult]:
 
 
 def is_right(case: str, ratio: float, named: Collection[str]) -> bool:
-    """Whether a verdict explains a fault.
-
-    Args:
-        case: name of the fault.
-        ratio: of the held-out errors with and without it.
-        named: checks that the verdict calls wrong or suspicious, see `DegradedRow`.
-    """
+    """Whether a verdict explains a fault, by the ratio of errors with and without it."""
     expected, blamed = EXPECTED[case], CAUSES.intersection(named)
     if blamed - expected.checks:
         return False
@@ -297,25 +252,20 @@ def simulated_logs() -> tuple[Split, dict[str, JointLog]]:
     return Split(fitted="excitation", predicted="validation"), logs
 
 
-def summary(rows: Sequence[Row], degraded: Sequence[DegradedRow]) -> dict[str, Any]:
+def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
     """What the line of JSON holds."""
-    ratios = np.array([one.ratio for one in rows])
-    found: dict[str, Any] = {"rows": [asdict(one) for one in rows]}
+    found: dict[str, Any] = {"rows": list(rows)}
     if rows:
-        found |= {
-            "worst_ratio": float(ratios.max()),
-            "mean_ratio": float(np.exp(np.log(ratios).mean())),
-        }
+        ratios = np.array([one["ratio"] for one in rows])
+        mean = float(np.exp(np.log(ratios).mean()))
+        found |= {"worst_ratio": float(ratios.max()), "mean_ratio": mean}
     if degraded:
-        found |= {
-            "degraded": [asdict(one) for one in degraded],
-            "right": sum(one.right for one in degraded),
-        }
+        found |= {"degraded": list(degraded), "right": sum(one["right"] for one in degraded)}
     return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, and print the figures."""
+    """Measure, and print each row as it comes, then the line of JSON."""
     parser = parser_of(__doc__)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
     parser.add_argument(
@@ -326,49 +276,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     wanted = options.only or [*known(), SIMULATED]
     rows: list[Row] = []
-    degraded: list[DegradedRow] = []
-    print(_HEADING)
+    degraded: list[Row] = []
     for name in wanted:
         for one in () if name == SIMULATED else rows_of(name, options.data, short=options.short):
             rows.append(one)
-            print(_line(one), flush=True)
-    found = summary(rows, ())
-    if rows:
-        print(f"worst ratio {found['worst_ratio']:.3f}, geometric mean {found['mean_ratio']:.3f}")
-    if options.degraded:
-        print(_DEGRADED_HEADING)
-        for name in wanted:
-            for spoilt in degraded_rows(name, *split_logs(name, options.data)):
-                degraded.append(spoilt)
-                print(_degraded_lines(spoilt), flush=True)
-        print(f"right in {sum(one.right for one in degraded)} of {len(degraded)}")
-    if options.json:
-        print(json.dumps(summary(rows, degraded)))
-
-
-_HEADING: Final = (
-    f"{'recording':11} {'split':30} {'hil':>7} {'plain':>7} {'ratio':>6} {'inside':>6}"
-    f" {'hil':>6} {'plain':>7}  by joint: hil/plain [%]"
-)
-_DEGRADED_HEADING: Final = f"\n{'recording':11} {'fault':19} {'hil':>7} {'ratio':>6} right  named"
+            if not options.json:
+                print(_line(one), flush=True)
+    for name in wanted if options.degraded else ():
+        for one in degraded_rows(name, *split_logs(name, options.data)):
+            degraded.append(one)
+            if not options.json:
+                print(_line(one), flush=True)
+    show(summary(rows, degraded), only_json=True)
 
 
 def _line(row: Row) -> str:
-    joints = " ".join(
-        f"{100 * ours:.3g}/{100 * plain:.3g}"
-        for ours, plain in zip(row.hil_joints, row.plain_joints, strict=True)
-    )
-    inside = "-" if row.inside is None else f"{row.inside:.0%}"
-    return (
-        f"{row.data:11} {row.split:30} {row.hil:7.2%} {row.plain:7.2%} {row.ratio:6.3f} {inside:>6}"
-        f" {row.seconds['hil']:4.0f} s {row.seconds['plain']:5.1f} s  {joints}"
-    )
-
-
-def _degraded_lines(row: DegradedRow) -> str:
-    error = f"{'-':>7} {'-':>6}" if row.hil is None else f"{row.hil:7.2%} {row.ratio:6.3f}"
-    first = f"{row.data:11} {row.case:19} {error} {'yes' if row.right else 'no':5}  "
-    return "\n".join([first + ", ".join(row.named), *(f"{'':15}{words}" for words in row.words)])
+    """Names, errors and what is said of them."""
+    shown = [f"{row['data']:11} {row.get('split') or row['case']:30}"]
+    errors = [key for key in ("hil", "plain", "undegraded") if row.get(key) is not None]
+    shown += [f"{key} {row[key]:.2%}" for key in errors]
+    shown += [f"{key} {row[key]:.2f}" for key in ("ratio", "inside") if row.get(key) is not None]
+    if "right" in row:
+        shown += ["right" if row["right"] else "not right", *row["words"]]
+    return "  ".join(shown)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -76,13 +75,14 @@ class TestRow:
         found = board.row("arm", split, archives, logs)
         torque = board.cut(split, logs).predicted.torque
         floor = 0.3 * np.sqrt(torque.size) / np.linalg.norm(torque)
-        for error, joints in ((found.hil, found.hil_joints), (found.plain, found.plain_joints)):
+        for name in ("hil", "plain"):
+            error, joints = found[name], found[f"{name}_joints"]
             assert 0.9 * floor < error < 1.5 * floor
             squares = np.square(joints) @ np.square(np.linalg.norm(torque, axis=0))
             assert error == pytest.approx(np.sqrt(squares) / np.linalg.norm(torque))
-        assert found.ratio == found.hil / found.plain
-        assert (found.inside is None) == split.in_sample
-        assert found.inside is None or found.inside > 0.9
+        assert found["ratio"] == found["hil"] / found["plain"]
+        assert (found["inside"] is None) == split.in_sample
+        assert found["inside"] is None or found["inside"] > 0.9
 
     def test_the_line_of_json(self, logs: dict[str, JointLog], archives: dict[str, Path]) -> None:
         split = Split(fitted="one", predicted="other")
@@ -106,7 +106,7 @@ class TestDegradedRow:
         some = {name: board.DEGRADATIONS[name] for name in ("lost rows", "payload in half")}
         monkeypatch.setattr(board, "DEGRADATIONS", some)
         split = Split(fitted="one", predicted="other")
-        lost, loaded = map(asdict, board.degraded_rows("arm", split, logs))
+        lost, loaded = board.degraded_rows("arm", split, logs)
         assert lost.keys() == {
             "data", "case", "hil", "undegraded", "ratio", "named", "words", "expected", "right",
         }  # fmt: skip
@@ -117,8 +117,8 @@ class TestDegradedRow:
     def test_a_refused_recording_is_wrong(self, logs: dict[str, JointLog], tmp_path: Path) -> None:
         whole = board.identified_parts(board.Parts(logs["one"], logs["other"]), tmp_path)
         found = board.degraded_row("arm", "lost rows", whole, "refused: the clock repeats")
-        assert (found.hil, found.ratio, found.right) == (None, None, False)
-        assert found.words == ["refused: the clock repeats"]
+        assert (found["hil"], found["ratio"], found["right"]) == (None, None, False)
+        assert found["words"] == ["refused: the clock repeats"]
 
 
 class TestRight:
