@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -121,7 +122,7 @@ def as_a_cell_is_begun(path: Path, archive: Archive) -> None:
         assert error.remedy
         return
     if archive.joint_names == JOINTS:
-        cell = cell_of_urdf(_urdf(), {}).with_known(known)
+        cell = replace(cell_of_urdf(_urdf(), {}), known=known)
         cell.text(path.with_name("cell.toml"))
 
 
