@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
-from pydantic_core import PydanticUndefined
 
 # Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
 Number = Annotated[FiniteFloat, Field(strict=True)]
@@ -36,7 +35,7 @@ def _turning(ratios: list[float]) -> list[float]:
 GearRatios = Annotated[Vector, AfterValidator(_turning)]
 
 
-def field(description: str, default: Any = PydanticUndefined, **bounds: Any) -> Any:
+def field(description: str, default: Any = ..., **bounds: Any) -> Any:
     """A field that says what its value must be; without a default it is required."""
     return Field(default, description=description, **bounds)
 
