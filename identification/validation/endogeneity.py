@@ -57,11 +57,9 @@ class EndogeneityTest:
         freedom: degrees of freedom of the F.
         coefficient: of each joint's column (n,): minus the share of it that is noise of
             measurement; NaN where there is none.
-        coefficient_std: its standard deviation (n,).
         noise: torque V pi that stands for what the instruments do not explain of the regressor,
             as a share of each joint's torque (n,), both as RMS.
         shift: least squares less instrumental variables (p,).
-        shift_std: its standard deviation, cluster-robust (p,).
         shifted: names of the parameters that differ by more than chance (all of them together
             5 %).
         predicted: torque that the two estimates predict differently on the fitted motion, as a
@@ -73,10 +71,8 @@ class EndogeneityTest:
     p_value: float
     freedom: tuple[int, int]
     coefficient: Array
-    coefficient_std: Array
     noise: Array
     shift: Array
-    shift_std: Array
     shifted: tuple[str, ...]
     predicted: Array
     words: str
@@ -103,58 +99,45 @@ def endogeneity_test(
         result: see :func:`identification.estimators.instrumental.estimate_instrumental`.
     """
     used = np.asarray(factor.samples.any(axis=1))
-    blocks = factor.weighted(result.weights)[used]
-    added, active, noise = _noise_columns(factor, blocks.sum(axis=0), result, used)
-    statistic, freedom, gamma, gamma_std = _wald(*_augmented(blocks, added))
-    coefficient = np.full((2, factor.n_joints), np.nan)
-    coefficient[:, active] = gamma, gamma_std
-    p_value = float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan
+    blocks, values = factor.weighted(result.weights)[used], result.estimate.values
+    p, total = len(values), blocks.sum(axis=0)
+    # V pi, what the instruments leave of W pi, as a combination of [Z | W | y].
+    explained = solve(NormalEquations(total[:p, :p], total[:p, p : 2 * p] @ values, 0.0, 0)).values
+    left_over = np.concatenate([-explained, values, [0.0]])
+    noise = _share(factor, left_over)
+    active = np.flatnonzero((noise > _SAME) & (result.weights > 0.0)).tolist()
+    # Normal equations of y = W pi + C gamma by blocks, a column of C for each active joint.
+    information = np.zeros((len(blocks), p + len(active), p + len(active)))
+    moments = np.zeros((len(blocks), p + len(active)))
+    information[:, :p, :p] = blocks[:, p : 2 * p, p : 2 * p]
+    moments[:, :p] = blocks[:, p : 2 * p, -1]
+    for k, joint in enumerate(active, start=p):
+        place, products = factor.places(joint), np.zeros((len(blocks), 2 * p + 1))
+        products[:, place] = result.weights[joint] * (factor.gram[joint][used] @ left_over[place])
+        information[:, k, :p] = information[:, :p, k] = products[:, p : 2 * p]
+        information[:, k, k] = products @ left_over
+        moments[:, k] = products[:, -1]
+    statistic, freedom, gamma, gamma_std = _wald(information, moments, len(active))
+    coefficient = np.full(factor.n_joints, np.nan)
+    coefficient[active] = gamma
     shift, shift_std, count = _shift(blocks)
-    names, known = model.parameter_names, shift_std > 0.0
+    known = shift_std > 0.0
     critical = student_limit(LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
-    shifted = tuple(
-        names[k] for k in np.flatnonzero(known & (np.abs(shift) > critical * shift_std))
-    )
+    beyond = np.flatnonzero(known & (np.abs(shift) > critical * shift_std))
     test = EndogeneityTest(
         statistic=statistic,
-        p_value=p_value,
+        p_value=float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan,
         freedom=freedom,
-        coefficient=coefficient[0],
-        coefficient_std=coefficient[1],
+        coefficient=coefficient,
         noise=noise,
         shift=shift,
-        shift_std=shift_std,
-        shifted=shifted,
-        predicted=_share(factor, np.concatenate([np.zeros(len(names)), shift, [0.0]])),
+        shifted=tuple(model.parameter_names[k] for k in beyond),
+        predicted=_share(factor, np.concatenate([np.zeros(p), shift, [0.0]])),
         words="",
     )
-    return replace(test, words=_words(test, result.weak, model.joint_names))
-
-
-def _noise_columns(
-    factor: PhaseFactor, total: Array, result: InstrumentalEstimate, used: NDArray[np.bool_]
-) -> tuple[tuple[Array, Array], list[int], Array]:
-    """One column per joint: what the instruments leave of W, times the parameters.
-
-    Returns:
-        By blocks, the weighted products of the k columns that are not nothing with [Z | W | y]
-        (B, k, 2 p + 1), and with themselves (B, k); which k joints these are; and the size of all
-        n as a share of the torque (n,).
-    """
-    p = factor.n_parameters // 2
-    values = result.estimate.values
-    explained = solve(NormalEquations(total[:p, :p], total[:p, p : 2 * p] @ values, 0.0, 0)).values
-    combination = np.concatenate([-explained, values, [0.0]])
-    noise = _share(factor, combination)
-    active = np.flatnonzero((noise > _SAME) & (result.weights > 0.0)).tolist()
-    products = np.zeros((int(used.sum()), len(active), 2 * p + 1))
-    squares = np.zeros(products.shape[:2])
-    for k, joint in enumerate(active):
-        place = factor.places(joint)
-        own = result.weights[joint] * factor.gram[joint][used] @ combination[place]
-        products[:, k, place] = own
-        squares[:, k] = own @ combination[place]
-    return (products, squares), active, noise
+    weak = f" The instruments are too weak for {joined(result.weak)}." if result.weak else ""
+    significance = gamma / np.where(gamma_std > 0.0, gamma_std, np.inf)
+    return replace(test, words=_words(test, significance, model.joint_names) + weak)
 
 
 def _share(factor: PhaseFactor, combination: Array) -> Array:
@@ -164,19 +147,6 @@ def _share(factor: PhaseFactor, combination: Array) -> Array:
         own, total = combination[factor.places(joint)], gram.sum(axis=0)
         shares[joint] = np.sqrt(max(float(own @ total @ own), 0.0) / max(total[-1, -1], 1e-300))
     return shares
-
-
-def _augmented(blocks: Array, added: tuple[Array, Array]) -> tuple[Array, Array, int]:
-    """Normal equations of y = W pi + C gamma by blocks: (B, q, q), (B, q), number of gamma."""
-    products, squares = added
-    p, k = blocks.shape[-1] // 2, products.shape[1]
-    information = np.zeros((len(blocks), p + k, p + k))
-    information[:, :p, :p] = blocks[:, p : 2 * p, p : 2 * p]
-    information[:, p:, :p] = products[:, :, p : 2 * p]
-    information[:, :p, p:] = products[:, :, p : 2 * p].transpose(0, 2, 1)
-    information[:, range(p, p + k), range(p, p + k)] = squares
-    moments = np.concatenate([blocks[:, p : 2 * p, -1], products[:, :, -1]], axis=1)
-    return information, moments, k
 
 
 def _wald(
@@ -226,21 +196,20 @@ def _shift(blocks: Array) -> tuple[Array, Array, int]:
     return shift, np.where(known, spread, 0.0), len(moved[0])
 
 
-def _words(test: EndogeneityTest, weak: Sequence[str], joints: Sequence[str]) -> str:
-    """Put the answer in words."""
-    caution = f" The instruments are too weak for {joined(weak)}." if weak else ""
+def _words(test: EndogeneityTest, significance: Array, joints: Sequence[str]) -> str:
+    """Put the answer in words, the columns' coefficients given in their standard deviations."""
     if np.isnan(test.p_value):
         return (
             "There is nothing to test: the instruments are the measured motion itself, or the"
-            f" recording is too short.{caution}"
+            " recording is too short."
         )
     answer = "Nothing says that noise in the regressor has biased least squares"
-    if test.biased:
+    if test.matters:
+        answer = "Least squares is biased by noise in the regressor"
+    elif test.biased:
         answer = (
-            "Least squares is biased by noise in the regressor"
-            if test.matters
-            else "Noise in the regressor biases least squares measurably, but moves no axis's"
-            f" torque by {MATTERS:.1%} or more: too small to matter"
+            "Noise in the regressor biases least squares measurably, but moves no axis's torque by"
+            f" {MATTERS:.1%} or more: too small to matter"
         )
     worst = int(np.argmax(test.noise))
     text = (
@@ -249,13 +218,12 @@ def _words(test: EndogeneityTest, weak: Sequence[str], joints: Sequence[str]) ->
         f" {test.noise[worst]:.1%} of the torque of {joints[worst]}; the two estimates differ by up"
         f" to {float(np.max(test.predicted)):.1%} of an axis's torque"
     )
-    if test.biased:
-        text += f", beyond chance in {', '.join(test.shifted)}" if test.shifted else ""
-        significance = test.coefficient / test.coefficient_std
-        if significance[int(np.nanargmax(np.abs(significance)))] > 0.0:
-            text += (
-                ". It does not act as noise of measurement does: a disturbance or error of the"
-                " model that moves the arm is the likelier cause"
-            )
+    if test.biased and test.shifted:
+        text += f", beyond chance in {', '.join(test.shifted)}"
+    if test.biased and significance[np.argmax(np.abs(significance))] > 0.0:
+        text += (
+            ". It does not act as noise of measurement does: a disturbance or error of the model"
+            " that moves the arm is the likelier cause"
+        )
     advice = " Use the instrumental variables, or less noisy positions." if test.matters else ""
-    return f"{text}.{advice}{caution}"
+    return f"{text}.{advice}"
