@@ -109,31 +109,25 @@ def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual
         arm: the model; the first arm counts.
         recordings: motion and torque.
     """
-    slow, turns = [], []
+    slow: list[Array] = []
+    turns: list[Array] = []
     for samples in recordings:
+        velocity = samples.motion.velocity
         residual = samples.torque - samples.predicted_torque(arm.model, arm.values[0])
-        turning = np.sign(samples.motion.velocity) * arm.model.moving(samples.motion.velocity)
+        turning = np.sign(velocity) * arm.model.moving(velocity)
         for stretch in samples.segments:
             period = (samples.motion.time[stretch] * FEEDBACK).astype(np.intp)
-            for one in np.split(np.arange(stretch.start, stretch.stop), _steps(period)):
-                slow.append(residual[one].mean(axis=0))
-                turns.append(turning[one].mean(axis=0))
+            cuts = np.flatnonzero(np.diff(period)) + 1
+            for found, values in ((slow, residual), (turns, turning)):
+                found += [part.mean(axis=0) for part in np.split(values[stretch], cuts)]
     means, direction = np.array(slow), np.array(turns)
-    power = np.mean(means**2, axis=0)
-    constant = np.mean(means, axis=0)
-    rest = means - constant
+    power, constant = np.mean(means**2, axis=0), np.mean(means, axis=0)
     aside = direction - direction.mean(axis=0)
-    along = (aside * rest).sum(axis=0) ** 2
-    size = (aside**2).sum(axis=0)
+    along = (aside * (means - constant)).sum(axis=0) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        explained = np.nan_to_num(along / size) / len(means)
-        return SlowResidual(
-            np.sqrt(power), np.nan_to_num(constant**2 / power), np.nan_to_num(explained / power)
-        )
-
-
-def _steps(period: NDArray[np.intp]) -> NDArray[np.intp]:
-    return np.flatnonzero(np.diff(period)) + 1
+        explained = np.nan_to_num(along / (aside**2).sum(axis=0)) / len(means)
+        shares = np.nan_to_num([constant**2 / power, explained / power])
+    return SlowResidual(np.sqrt(power), shares[0], shares[1])
 
 
 class _Dynamics:
@@ -180,13 +174,10 @@ class _Dynamics:
         return q + duration * moved, moved
 
     def _slowed(self, before: Array, free: Array, response: Array, most: Array) -> Array:
-        """Return the speeds (V, n) that dry friction leaves of those without it.
+        """Return what dry friction leaves of the speeds `free` (V, n) after a step.
 
-        Args:
-            before: speeds before the step (V, n).
-            free: speeds after it without dry friction (V, n).
-            response: speeds per impulse (V, n, n).
-            most: largest impulse of dry friction of each joint and coupled motor (V, n + k).
+        It has impulses up to `most` (V, n + k) of joints and coupled motors; `response` (V, n, n)
+        is the speed of an impulse.
         """
         turns = self._turns
         directions = np.sign(before @ turns.T)
@@ -197,12 +188,7 @@ class _Dynamics:
         if not turned.any():
             return np.asarray(moved)
         # Some change direction or rest: each as much as stops it, at most what it has.
-        columns, impulse, most, speeds = (
-            columns[turned],
-            impulse[turned],
-            most[turned],
-            moved[turned],
-        )
+        columns, impulse, most, speeds = (one[turned] for one in (columns, impulse, most, moved))
         own = np.einsum("kn,ank->ak", turns, columns)
         for _ in range(_ROUNDS):
             changed = False
@@ -220,10 +206,7 @@ class _Dynamics:
         return np.asarray(moved)
 
     def _friction(self, v: Array) -> tuple[Array, Array, Array]:
-        """Return what friction depends on speed alone, its slope, and what depends on direction.
-
-        Of all joints (V, n), with their speeds (V, n, n), and of joints and then motors (V, n + k).
-        """
+        """Return friction of speed alone (V, n), its slope (V, n, n), and dry one (V, n + k)."""
         turns, zero = self._turns, np.zeros(())
         speeds = v @ turns.T
         smooth, slope, dry = np.zeros((3, *speeds.shape))

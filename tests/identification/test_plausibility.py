@@ -45,10 +45,9 @@ def known(values: Array, model: RobotModel = MODEL, std: float = 0.01) -> Estima
 
 def with_value(name: str, value: float, std: float = 0.01) -> Estimate:
     """Of the arm, but for one base parameter or friction coefficient."""
-    found = known(parameters(), std=std)
-    return replace(
-        found, values=np.where([one == name for one in found.names], value, found.values)
-    )
+    values = parameters()
+    values[MODEL.parameter_names.index(name)] = value
+    return replace(known(parameters(), std=std), values=values)
 
 
 def signs(found: Estimate, model: RobotModel = MODEL, *, error: float = 0.1) -> Implausible:

@@ -128,7 +128,9 @@ def by_mujoco(arm: Simulated, given: Samples) -> Array:
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = given.motion.position[0], given.motion.velocity[0]
     mujoco.mj_forward(model, data)
-    full = np.array([_column(mujoco, model, data, k) for k in range(6)])
+    full = np.zeros((6, 6))
+    for row, unit in zip(full, np.eye(6), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
     rate = 2.0 * np.pi * FEEDBACK
     positions = []
     for q, v, torque in zip(*given.motion[1:3], given.torque, strict=True):
@@ -137,13 +139,6 @@ def by_mujoco(arm: Simulated, given: Samples) -> Array:
         data.ctrl[:] = torque + np.diag(full) * wanted
         mujoco.mj_step(model, data)
     return np.array(positions)
-
-
-def _column(mujoco: object, model: object, data: object, k: int) -> Array:
-    """A column of MuJoCo's inertia matrix."""
-    out = np.zeros(6)
-    mujoco.mj_mulM(model, data, out, np.eye(6)[k])  # type: ignore[attr-defined]
-    return out
 
 
 class TestSlowResidual:
