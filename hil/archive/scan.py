@@ -225,10 +225,10 @@ class Scan(ABC):
     def _take_chunk(self, data: bytes, offset: int) -> None:
         """Decode the content of a chunk, or have it wait for others."""
         begin = self._waiting[-1][1].stop if self._waiting else 0
-        if begin + len(data) > len(self._buffer):
+        if begin + len(data) >= len(self._buffer):
             self.flush()
             begin = 0
-        if len(data) > len(self._buffer):
+        if len(data) >= len(self._buffer):
             self._decode(data, offset)
             self.chunks += 1
         else:

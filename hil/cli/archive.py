@@ -103,15 +103,10 @@ def repair(
     if done.output is None:
         typer.echo(_shown([f"{file}: whole, nothing to repair"]))
     else:
-        saved = _saved(done.samples, done.samples_lost)
-        typer.echo(_shown([f"wrote {done.output}: {saved}"]))
+        lost = {0: ", none lost", None: "; how many are lost is not known"}
+        end = lost.get(done.samples_lost, f", {done.samples_lost} lost")
+        typer.echo(_shown([f"wrote {done.output}: {done.samples} samples{end}"]))
     raise typer.Exit(LOST if done.losses else 0)
-
-
-def _saved(samples: int, lost: int | None) -> str:
-    if lost is None:
-        return f"{samples} samples; how many are lost is not known"
-    return f"{samples} samples, {lost} lost" if lost else f"{samples} samples, none lost"
 
 
 def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
@@ -160,41 +155,30 @@ def _check_dict(found: Check) -> dict[str, Any]:
 
 def _info_lines(found: Overview) -> list[str]:
     rate = "" if found.period is None else f" at {1.0 / found.period:g} Hz"
-    lines = [
-        f"{found.path}",
-        *_table(
-            {
-                "kind": found.title,
-                "outcome": found.outcome,
-                "recorded": f"{found.samples} samples, {found.duration:.3f} s{rate}",
-                "lost": found.lost,
-                "joints": ", ".join(found.joint_names),
-                "file": f"{_size(found.size)}, {found.chunks} chunks"
-                + (f", {_size(found.per_minute)} per minute" if found.per_minute else ""),
-                "damage": found.damage or "none",
-            }
-        ),
-        "  channels",
-    ]
-    lines += [f"    {topic:<26} {count:>9}  {kind}" for topic, kind, count in found.channels]
-    lines.append("  attachments")
-    lines += [f"    {name:<26} {_size(size):>9}" for name, size in found.attachments.items()]
-    lines.append("  metadata")
-    lines += [f"    {key:<26} {value}" for key, value in found.metadata.items()]
-    if found.events:
-        lines.append("  events")
-        lines += [f"    {time:>10.3f} s  {name}: {text}" for time, name, text in found.events]
+    size = f"{_size(found.size)}, {found.chunks} chunks"
+    facts = {
+        "kind": found.title,
+        "outcome": found.outcome,
+        "recorded": f"{found.samples} samples, {found.duration:.3f} s{rate}",
+        "lost": found.lost,
+        "joints": ", ".join(found.joint_names),
+        "file": size + (f", {_size(found.per_minute)} per minute" if found.per_minute else ""),
+        "damage": found.damage or "none",
+    }
+    parts = {
+        "channels": [f"{topic:<26} {count:>9}  {kind}" for topic, kind, count in found.channels],
+        "attachments": [f"{name:<26} {_size(n):>9}" for name, n in found.attachments.items()],
+        "metadata": [f"{key:<26} {value}" for key, value in found.metadata.items()],
+        "events": [f"{time:>10.3f} s  {name}: {text}" for time, name, text in found.events],
+    }
+    lines = [f"{found.path}", *(f"  {key:<10} {text}" for key, text in facts.items() if text)]
+    for title, content in parts.items():
+        if content or title != "events":
+            lines += [f"  {title}", *(f"    {line}" for line in content)]
     if found.damage:
-        lines.append(f"  to mend it: hil archive repair {found.path}, {_mended(found.path)}")
+        name = repaired_name(found.path).name
+        lines.append(f"  to mend it: hil archive repair {found.path}, which writes {name}")
     return lines
-
-
-def _mended(path: Path) -> str:
-    return f"which writes {repaired_name(path).name}"
-
-
-def _table(rows: dict[str, str]) -> Sequence[str]:
-    return [f"  {key:<10} {value}" for key, value in rows.items() if value]
 
 
 def _size(size: float) -> str:

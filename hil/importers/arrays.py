@@ -147,6 +147,11 @@ class ArrayFile:
     stored: Mapping[str, Stored]
     _loaded: dict[str, NDArray[Any]] = field(default_factory=dict)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its arrays."""
+        return tuple(self.stored)
+
     @classmethod
     def read(cls, path: Path) -> ArrayFile:
         """Look into a file; its suffix says what it is.
@@ -221,16 +226,42 @@ class ArrayFile:
             )
         return np.asarray(whole[:, column])
 
+    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
+        """Times as whole nanoseconds; dates as they are.
+
+        Args:
+            column: name or index; an index without `array` is of the only array there is.
+            decimals: decimal places between the unit and the second.
+            array: the matrix that an index counts in.
+
+        Raises:
+            SourceError: no such array or column, or a time that is not finite.
+        """
+        if isinstance(column, int) and array is None:
+            times: NDArray[Any] = self.matrix(None, "time").ravel()
+        else:
+            times = self.column(column, "time", array)
+        factor = 10 ** (9 - decimals)
+        if times.dtype.kind in "mM":
+            kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
+            return [int(one) for one in times.astype(kind).astype(np.int64)]
+        if times.dtype.kind in "iu":
+            return [int(one) * factor for one in times.tolist()]
+        values = times.astype(np.float64)
+        if not np.isfinite(values).all():
+            sample = int(np.argmin(np.isfinite(values)))
+            problem = f"is {values[sample]} in sample {sample}"
+            raise SourceError(self.path, problem, field="time")
+        # Apart, since an epoch in nanoseconds has more digits than a float.
+        whole = np.floor(values)
+        part = np.rint((values - whole) * float(factor))
+        return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
+
     def _named(self, name: str | None, field: str) -> NDArray[Any]:
         if name is None and len(self.stored) == 1:
             (name,) = self.stored
         if name is None or name not in self.stored:
-            problem, there = self._absent(name)
-            shapes = [f"{key} {self.stored[key].shape}" for key in there]
-            if len(shapes) > _MOST_NAMED:
-                shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
-            remedy = f"its arrays are {', '.join(shapes)}"
-            raise SourceError(self.path, problem, field=field, remedy=remedy)
+            raise self._absent(name, field)
         if name not in self._loaded:
             stored = self.stored[name]
             if math.prod(stored.shape) > MOST_NUMBERS:
@@ -246,18 +277,19 @@ class ArrayFile:
             self._loaded[name] = array
         return self._loaded[name]
 
-    def _absent(self, name: str | None) -> tuple[str, list[str]]:
-        """What is wrong with a name, and the arrays that could have been meant."""
+    def _absent(self, name: str | None, field: str) -> SourceError:
+        """That an array is not there, with those that could have been meant."""
         if name is None:
-            return "which of its arrays is not said", list(self.stored)
-        for end in range(len(name), 0, -1):  # a struct or cell array that is there
-            heads = (f"{name[:end]}.", f"{name[:end]}(")
-            inside = [key for key in self.stored if key.startswith(heads)]
-            if inside and end == len(name):
-                return f"{name!r} is a struct, no array", inside
-            if inside and name[end] in ".(":
-                return f"there is no array {name[end:].lstrip('.')!r} in {name[:end]!r}", inside
-        return f"there is no array {name!r}", list(self.stored)
+            problem, near = "which of its arrays is not said", [*self.stored]
+        else:
+            problem = f"there is no array {name!r}"
+            heads = (f"{name}.", f"{name}(", f"{name.rpartition('.')[0]}.")
+            near = [key for key in self.stored if key.startswith(heads)] or [*self.stored]
+        shapes = [f"{key} {self.stored[key].shape}" for key in near]
+        if len(shapes) > _MOST_NAMED:
+            shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
+        remedy = f"its arrays are {', '.join(shapes)}"
+        return SourceError(self.path, problem, field=field, remedy=remedy)
 
 
 @contextmanager

@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 from xml.sax.saxutils import quoteattr
 
 from hil.errors import InputError
-from hil.reading import remedy_of, text_of
+from hil.reading import named_text
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: Final[tuple[Convention, ...]] = get_args(Convention)
 
 _NAMES: Final = ("joint", "type", "a", "alpha", "d", "theta_offset")
-_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
-    "a": {"a": 1.0, "a_mm": 1e-3},
-    "d": {"d": 1.0, "d_mm": 1e-3},
-    "alpha": {"alpha": 1.0, "alpha_deg": math.pi / 180.0},
-    "theta_offset": {"theta_offset": 1.0, "theta_offset_deg": math.pi / 180.0},
+_NUMBERS: Final = _NAMES[2:]
+_OTHER: Final = {
+    "a": ("a_mm", 1e-3),
+    "d": ("d_mm", 1e-3),
+    "alpha": ("alpha_deg", math.pi / 180.0),
+    "theta_offset": ("theta_offset_deg", math.pi / 180.0),
 }
+"""What a column in another unit is called, and that unit in m or rad."""
 _TYPES: Final = {"revolute": "continuous", "prismatic": "prismatic"}
 _LARGEST: Final = {"a": 20.0, "d": 20.0, "alpha": 2.0 * math.pi, "theta_offset": 2.0 * math.pi}
 """m and rad; what is larger is in mm or degrees."""
 
 
-@dataclass(frozen=True)
-class _Row:
+class _Row(NamedTuple):
     """A joint and its link, in m and rad."""
 
     joint: str
@@ -134,12 +133,7 @@ def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
 
 
 def _rows(path: Path) -> list[_Row]:
-    try:
-        lines = text_of(path).removeprefix("\ufeff").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        remedy = remedy_of(error, "name a table of DH parameters")
-        raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
+    lines = named_text(path, "name a table of DH parameters").removeprefix("\ufeff").splitlines()
     filled = [
         (number, line)
         for number, line in enumerate(lines, 1)
@@ -147,10 +141,13 @@ def _rows(path: Path) -> list[_Row]:
     ]
     if len(filled) < 2:
         raise InputError(path, "has no row of a joint", remedy=f"write {','.join(_NAMES)} and rows")
-    header = filled[0][1]
-    delimiter = ";" if ";" in header else ","
-    columns = _columns(path, _cells(header, delimiter))
-    rows = [_row(path, number, _cells(line, delimiter), columns) for number, line in filled[1:]]
+    delimiter = ";" if ";" in filled[0][1] else ","
+    cells = [
+        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))])
+        for number, line in filled
+    ]
+    columns = _columns(path, cells[0][1])
+    rows = [_row(path, number, row, columns) for number, row in cells[1:]]
     names = [row.joint for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -158,16 +155,12 @@ def _rows(path: Path) -> list[_Row]:
     return rows
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
-
-
 def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
     """Place and unit of each quantity."""
     columns = {}
     for name in _NAMES:
-        spellings = _UNITS.get(name, {name: 1.0})
-        found = [spelling for spelling in spellings if spelling in header]
+        other, unit = _OTHER.get(name, (name, 1.0))
+        found = [spelling for spelling in dict.fromkeys((name, other)) if spelling in header]
         if len(found) != 1:
             raise InputError(
                 path,
@@ -176,38 +169,30 @@ def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
                 remedy=f"its columns are {','.join(_NAMES)}; lengths in m (a_mm, d_mm: in mm), "
                 "angles in rad (alpha_deg, theta_offset_deg: in degrees)",
             )
-        columns[name] = header.index(found[0]), spellings[found[0]]
+        columns[name] = header.index(found[0]), 1.0 if found[0] == name else unit
     return columns
 
 
-def _row(path: Path, number: int, cells: list[str], columns: dict[str, tuple[int, float]]) -> _Row:
+def _row(path: Path, line: int, cells: list[str], columns: dict[str, tuple[int, float]]) -> _Row:
     texts = {name: cells[k] if k < len(cells) else "" for name, (k, _) in columns.items()}
-    kind = texts["type"].lower()
-    if kind not in _TYPES:
-        raise InputError(
-            path,
-            f"line {number} has the type {texts['type']!r}",
-            field="type",
-            remedy=f"write {' or '.join(_TYPES)}",
-        )
+
+    def refusal(field: str, problem: str, remedy: str) -> InputError:
+        return InputError(path, f"line {line} has {problem}", field=field, remedy=remedy)
+
+    kind = _TYPES.get(texts["type"].lower())
+    if kind is None:
+        raise refusal("type", f"the type {texts['type']!r}", f"write {' or '.join(_TYPES)}")
     if not texts["joint"]:
-        raise InputError(path, f"line {number} has no name", field="joint", remedy="write one")
-    values = {name: _number(path, number, name, texts[name], columns[name][1]) for name in _UNITS}
-    return _Row(texts["joint"], _TYPES[kind], **values)
-
-
-def _number(path: Path, line: int, name: str, text: str, unit: float) -> float:
-    try:
-        value = float(text) * unit
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _LARGEST[name]:
-        other = next(spelling for spelling, u in _UNITS[name].items() if u != 1.0)
-        largest = f"{_LARGEST[name]:.3g} {'m' if name in 'ad' else 'rad'}"
-        raise InputError(
-            path,
-            f"line {line} has {repr(text) if text else 'nothing'}",
-            field=name,
-            remedy=f"write a number of at most {largest}, or call the column {other}",
-        )
-    return value
+        raise refusal("joint", "no name", "write one")
+    values = {}
+    for name in _NUMBERS:
+        try:
+            values[name] = float(texts[name]) * columns[name][1]
+        except ValueError:
+            values[name] = math.nan
+        if not abs(values[name]) <= _LARGEST[name]:
+            largest = f"{_LARGEST[name]:.3g} {'m' if name in 'ad' else 'rad'}"
+            problem = repr(texts[name]) if texts[name] else "nothing"
+            remedy = f"write a number of at most {largest}, or call the column {_OTHER[name][0]}"
+            raise refusal(name, problem, remedy)
+    return _Row(texts["joint"], kind, **values)

@@ -8,16 +8,19 @@ a position is outside the limits of the URDF.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
-from xml.etree.ElementTree import Element
+from itertools import permutations
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Findings, Samples
+from hil.errors import SourceError
+from hil.importers.column_map import ANGLES, RATES
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 
@@ -32,42 +35,9 @@ _HARDLY: Final = 0.1  # rad or m of travel, less than which excites nothing
 # Between the velocity and the slope of the position: filters take a few per cent.
 _ALIKE: Final = 0.1
 _FOLLOWS: Final = 0.7  # correlation
-_NOTHING_TO_FIT: Final = (
-    "there is neither torque nor motor current in the log: it can be looked at, not identified from"
-)
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
 _NO_LIMIT: Final = 1e4  # what some URDFs write for "none"
-_DEGREE: Final = math.pi / 180.0
-
-
-class _Slip(NamedTuple):
-    """What makes velocities a factor too large, in words."""
-
-    velocity: str
-    position: str = ""
-    time: str = ""
-
-
-_SLIPS: Final = {
-    1.0 / _DEGREE: _Slip("velocities in deg/s read as rad/s", "positions in rad read as deg"),
-    _DEGREE: _Slip("velocities in rad/s read as deg/s", "positions in deg read as rad"),
-    30.0 / math.pi: _Slip("velocities in rpm read as rad/s"),
-    math.pi / 30.0: _Slip("velocities in rad/s read as rpm"),
-    6.0: _Slip("velocities in deg/s read as rpm"),
-    1.0 / 6.0: _Slip("velocities in rpm read as deg/s"),
-    2.0 * math.pi: _Slip("velocities in rad/s read as rev/s", "positions in rev read as rad"),
-    0.5 / math.pi: _Slip("velocities in rev/s read as rad/s", "positions in rad read as rev"),
-    1e3: _Slip(
-        "velocities in mm/s read as m/s", "positions in m (rad) read as mm (mrad)",
-        "a time in ms read as s",
-    ),
-    1e-3: _Slip(
-        "velocities in m/s read as mm/s", "positions in mm (mrad) read as m (rad)",
-        "a time in s read as ms",
-    ),
-    -1.0: _Slip("the sign of the velocities", "the sign of the positions"),
-}  # fmt: skip
-"""By how many times too large the velocities then are."""
+_LENGTHS: Final = frozenset(("m", "mm", "m/s", "mm/s"))
 
 
 @dataclass(frozen=True)
@@ -81,39 +51,40 @@ class Limits:
     revolute: bool = True
 
 
-class ClockFault(NamedTuple):
-    """Why a time base is that of no motion, and what would help."""
+def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
+    """Check that stamps (m,) [ns] of a file can be those of a motion.
 
-    problem: str
-    remedy: str
-
-
-def clock_fault(stamp: NDArray[np.int64]) -> ClockFault | None:
-    """What forbids to use stamps (m,) [ns]; None where nothing does, or there is but one."""
+    Raises:
+        SourceError: they run backwards, are all the same, or come too seldom.
+    """
     steps = np.diff(stamp)
-    if not steps.size:
-        return None
     backward = np.flatnonzero(steps < 0)
     if backward.size:
         first = int(backward[0]) + 1
-        return ClockFault(
+        raise SourceError(
+            path,
             f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
             f"({backward.size} such steps)",
-            "cut the recording where its clock runs backwards, or name another time column",
+            field="time",
+            remedy="cut the recording where its clock runs backwards, or name another time column",
         )
-    if not steps.any():
-        return ClockFault(
+    if steps.size and not steps.any():
+        raise SourceError(
+            path,
             f"all {len(stamp)} samples have the same time",
-            "name the column of the time, or give sample_rate in its place",
+            field="time",
+            remedy="name the column of the time, or give sample_rate in its place",
         )
-    rate = 1e9 / float(np.median(steps[steps > 0]))
-    if rate >= _NO_MOTION:
-        return None
-    return ClockFault(
-        f"there would be {rate:.2g} samples a second, in which no motion can be seen",
-        f"check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds would "
-        f"make it {1e3 * rate:.4g} samples a second; at least {SLOWEST:g} are needed",
-    )
+    rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
+    if rate < _NO_MOTION:
+        raise SourceError(
+            path,
+            f"there would be {rate:.2g} samples a second, in which no motion can be seen",
+            field="time",
+            remedy="check its unit ([time] unit, or sample_rate in Hz): milliseconds read as "
+            f"seconds would make it {1e3 * rate:.4g} samples a second; at least {SLOWEST:g} are "
+            "needed",
+        )
 
 
 def examine(
@@ -131,67 +102,50 @@ def examine(
         urdf: their description.
         locked: positions [rad or m] of joints that are none of the model, by name.
     """
-    time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
-    limits = [urdf_limits(urdf).get(name, Limits()) for name in joint_names]
-    held = [f"{name} at {position:.4g}" for name, position in (locked or {}).items()]
+    time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), samples.position
+    known = urdf_limits(urdf)
+    limits = [known.get(name, Limits()) for name in joint_names]
+    held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
     if len(time) < 2:
         return Findings(lines=(f"{len(time)} samples", *lines), warnings=())
     base = time_base(time)
     lines = [f"time: {'; '.join(base.describe())}", *lines]
+    lines += map(_range, joint_names, position.T, limits)
     warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
-        warnings.append(
-            f"{base.rate:.3g} samples a second is unusual: is the unit of the time right?"
-        )
-    lines += [
-        _range(name, samples.position[:, joint], limits[joint])
-        for joint, name in enumerate(joint_names)
-    ]
-    warnings += _beyond_limits(samples.position, joint_names, limits)
-    warnings += _motionless(samples.position, limits)
-    warnings += _speeds(time, samples.position, joint_names, limits)
+        text = f"{base.rate:.3g} samples a second is unusual: is the unit of the time right?"
+        warnings.append(text)
+    warnings += _positions(time, position, joint_names, limits)
     if samples.velocity is not None:
-        warnings += _velocities(
-            time, base.rate, samples.position, samples.velocity, joint_names, limits
-        )
+        warnings += _velocities(time, base.rate, position, samples.velocity, joint_names, limits)
     warnings += _torques(samples, joint_names, limits)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
 
 
 def urdf_limits(urdf: str) -> dict[str, Limits]:
-    """Limits by joint name."""
+    """Limits by joint name; what a macro left behind is no number, and no limit."""
     found = {}
     for joint in urdf_tree(urdf).iter("joint"):
         kind, limit = joint.get("type"), joint.find("limit")
         if kind not in ("revolute", "continuous", "prismatic"):
             continue
-        given = {} if limit is None else _numbers(limit)
+        given = {}
+        for key, text in ({} if limit is None else limit.attrib).items():
+            try:
+                given[key] = float(text)
+            except ValueError:
+                continue
         bounded = kind != "continuous" and given.get("lower", 0.0) < given.get("upper", 0.0)
+        velocity, effort = (given.get(key, 0.0) for key in ("velocity", "effort"))
         found[joint.get("name", "")] = Limits(
-            lower=given["lower"] if bounded and "lower" in given else -np.inf,
-            upper=given["upper"] if bounded and "upper" in given else np.inf,
-            velocity=_real(given.get("velocity")),
-            effort=_real(given.get("effort")),
+            lower=given.get("lower", -np.inf) if bounded else -np.inf,
+            upper=given.get("upper", np.inf) if bounded else np.inf,
+            velocity=velocity if 0.0 < velocity < _NO_LIMIT else np.inf,
+            effort=effort if 0.0 < effort < _NO_LIMIT else np.inf,
             revolute=kind != "prismatic",
         )
     return found
-
-
-def _numbers(limit: Element) -> dict[str, float]:
-    """What of a limit is a number; what a macro left behind is none."""
-    found = {}
-    for key in ("lower", "upper", "velocity", "effort"):
-        try:
-            found[key] = float(limit.get(key, ""))
-        except ValueError:
-            continue
-    return found
-
-
-def _real(limit: float | None) -> float:
-    """A limit, infinite where it is a placeholder."""
-    return limit if limit is not None and 0.0 < limit < _NO_LIMIT else np.inf
 
 
 def _range(name: str, position: Array, limits: Limits) -> str:
@@ -204,42 +158,12 @@ def _range(name: str, position: Array, limits: Limits) -> str:
     return text
 
 
-def _outside(position: Array, limits: Sequence[Limits]) -> float:
+def _outside(position: Array, limits: Sequence[Limits]) -> str:
     """Share of the rows (m, n) in which a joint is outside its limits [%]."""
     lower = np.array([one.lower for one in limits]) - _TOLERANCE
     upper = np.array([one.upper for one in limits]) + _TOLERANCE
-    return 100.0 * float(np.mean(((position < lower) | (position > upper)).any(axis=1)))
-
-
-def _beyond_limits(position: Array, names: Sequence[str], limits: Sequence[Limits]) -> list[str]:
-    """Positions outside the limits, and whether another unit or order has none."""
-    fits = _fits(position, limits)
-    beyond = [joint for joint in range(len(names)) if not fits[joint, joint]]
-    if not beyond:
-        return []
-    ranges = ", ".join(
-        f"{names[j]}: {position[:, j].min():.3g} .. {position[:, j].max():.3g}" for j in beyond
-    )
-    text = (
-        f"as mapped, {_outside(position, limits):.3g} % of the rows leave the limits of the URDF "
-        f"({ranges})"
-    )
-    turning = np.array([one.revolute for one in limits])
-    far = any(
-        np.abs(position[:, j]).max() > 3.0 * max(abs(limits[j].lower), abs(limits[j].upper))
-        for j in beyond
-    )
-    check = "check unit, sign and zero in the column map"
-    if far and np.diag(_fits(np.where(turning, position * _DEGREE, position), limits)).all():
-        return [f'{text}; as degrees read as radians, none would: write unit = "deg"']
-    columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
-    if fits[np.arange(len(names)), columns].all():
-        order = ", ".join(names[int(j)] for j in np.argsort(columns))
-        return [
-            f"{text}; with the columns those of {order}, none would: is that the order of the "
-            f"joints? Otherwise {check}"
-        ]
-    return [f"{text}: {check}"]
+    share = np.mean(((position < lower) | (position > upper)).any(axis=1))
+    return f"{100.0 * float(share):.3g} %"
 
 
 def _fits(position: Array, limits: Sequence[Limits]) -> NDArray[np.bool_]:
@@ -250,48 +174,53 @@ def _fits(position: Array, limits: Sequence[Limits]) -> NDArray[np.bool_]:
     )
 
 
-def _motionless(position: Array, limits: Sequence[Limits]) -> list[str]:
-    travel = float(np.ptp(position, axis=0).max())
-    if travel >= _HARDLY:
-        return []
-    text = f"no joint moves further than {travel:.2g} rad or m"
-    larger = position / _DEGREE
-    if travel / _DEGREE < _HARDLY:
-        return [f"{text}: if one did, the unit of the positions is wrong"]
-    return [
-        f"{text}; were they radians read as degrees, the joints would move up to "
-        f"{travel / _DEGREE:.2g} rad, and {_outside(larger, limits):.3g} % of the rows leave the "
-        "limits of the URDF: is the unit of the positions right?"
-    ]
-
-
-def _speeds(
+def _positions(
     time: Array, position: Array, names: Sequence[str], limits: Sequence[Limits]
-) -> list[str]:
-    """Whether a robot could move so."""
-    usual = [_usual_speed(time, column) for column in position.T]
-    ratio = [speed / one.velocity for speed, one in zip(usual, limits, strict=True)]
-    worst = int(np.argmax(ratio))
-    if ratio[worst] <= _TOO_FAST:
-        return []
-    others = sum(one > _TOO_FAST for one in ratio) - 1
-    return [
-        f"{names[worst]}{f' (and {others} more)' if others else ''} would move at "
-        f"{usual[worst]:.3g} rad/s (or m/s), its limit in the URDF is "
-        f"{limits[worst].velocity:.3g}; with degrees read as radians it would be "
-        f"{usual[worst] * _DEGREE:.3g}, with seconds read as milliseconds "
-        f"{usual[worst] * 1e-3:.3g}: is the unit of the position or of the time right?"
-    ]
-
-
-def _usual_speed(time: Array, position: Array) -> float:
-    """A high but not the highest speed, over stretches long enough for noise not to matter."""
-    stride = max(1, len(time) // 2000)
-    steps = np.diff(time[::stride])
-    if not np.any(steps > 0.0):
-        return 0.0
-    speed = np.abs(np.diff(position[::stride]))[steps > 0.0] / steps[steps > 0.0]
-    return float(np.quantile(speed, 0.9))
+) -> Iterator[str]:
+    """Whether a robot could be there, and move so."""
+    fits, joints = _fits(position, limits), range(len(names))
+    beyond = [joint for joint in joints if not fits[joint, joint]]
+    low, high = position.min(axis=0), position.max(axis=0)
+    if beyond:
+        ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
+        text = (
+            f"as mapped, {_outside(position, limits)} of the rows leave the limits of the URDF "
+            f"({ranges})"
+        )
+        turning = np.array([one.revolute for one in limits])
+        radians = np.where(turning, np.radians(position), position)
+        farthest = np.array([3.0 * max(-one.lower, one.upper) for one in limits])
+        far = (np.maximum(-low, high) > farthest)[beyond].any()
+        columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
+        check = "check unit, sign and zero in the column map"
+        if far and np.diag(_fits(radians, limits)).all():
+            yield f'{text}; as degrees read as radians, none would: write unit = "deg"'
+        elif fits[joints, columns].all():
+            order = ", ".join(names[int(j)] for j in np.argsort(columns))
+            yield (
+                f"{text}; with the columns those of {order}, none would: is that the order of the "
+                f"joints? Otherwise {check}"
+            )
+        else:
+            yield f"{text}: {check}"
+    travel = float((high - low).max())
+    if travel < _HARDLY:
+        yield (
+            f"no joint moves further than {travel:.2g} rad or m, {math.degrees(travel):.2g} were "
+            "they degrees: is the unit of the positions right?"
+        )
+    stride = max(1, len(time) // 2000)  # noise does not matter over longer steps
+    steps = np.diff(time[::stride])[:, None]
+    moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
+    if not len(moved):
+        return
+    usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
+    for name, speed, one in zip(names, usual, limits, strict=True):
+        if speed > _TOO_FAST * one.velocity:
+            yield (
+                f"{name} would move at {speed:.3g} rad/s (or m/s), its limit in the URDF is "
+                f"{one.velocity:.3g}: are degrees read as radians, or seconds as milliseconds?"
+            )
 
 
 def _velocities(
@@ -301,11 +230,11 @@ def _velocities(
     velocity: Array,
     names: Sequence[str],
     limits: Sequence[Limits],
-) -> list[str]:
+) -> Iterator[str]:
     """Whether the velocities are the slopes of the positions: in this order, in these units."""
     moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _HARDLY]
     if not moving:
-        return []
+        return
     factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
     columns = linear_sum_assignment(-correlation)[1]
@@ -314,51 +243,51 @@ def _velocities(
         theirs = list(names)
         for joint, column in zip(moving, columns, strict=True):
             theirs[moving[column]] = names[joint]
-        return [
+        yield (
             "the velocities are in another order than the positions: as mapped they miss their "
             f"slopes by {_missed(itself):.0f} %, as those of {', '.join(theirs)} by "
             f"{_missed(best):.0f} %: name the columns of both in the same order"
-        ]
-    follow = dict(zip(moving, itself, strict=True))
-    factors = dict(zip(moving, factor, strict=True))
-    warnings = [
-        f"the velocity of {names[joint]} does not follow its position (correlation "
-        f"{follow[joint]:.2f}): are the joints in the same order?"
-        for joint in moving
-        if follow[joint] < _FOLLOWS
-    ]
-    off: dict[float, list[int]] = {}
-    for joint in moving:
-        if follow[joint] >= _FOLLOWS and abs(factors[joint] - 1.0) > _ALIKE:
-            off.setdefault(_nearest_slip(factors[joint]), []).append(joint)
-    for slip, joints in off.items():
-        subject = "every joint" if joints == moving else ", ".join(names[j] for j in joints)
-        text = (
-            f"the velocity of {subject} is {float(np.median([factors[j] for j in joints])):.4g} "
-            "times the slope of the position"
         )
-        if slip not in _SLIPS:
-            warnings.append(f"{text}: check units and gears")
-            continue
-        changed = position.copy()
-        changed[:, joints] *= slip
-        words = _SLIPS[slip]
-        readings = [
-            f"{words.velocity} (with {_outside(position, limits):.3g} % of the rows outside the "
-            "limits of the URDF)"
-        ]
-        if words.position:
-            readings.append(f"{words.position} (with {_outside(changed, limits):.3g} %)")
-        if words.time and joints == moving:
-            readings.append(f"{words.time} (with {slip * rate:.3g} samples a second)")
-        warnings.append(f"{text}: {', or '.join(readings)}?")
-    return warnings
+        return
+    off: dict[tuple[tuple[str, float], ...], list[int]] = {}
+    for k, joint in enumerate(moving):
+        if itself[k] < _FOLLOWS:
+            yield (
+                f"the velocity of {names[joint]} does not follow its position (correlation "
+                f"{itself[k]:.2f}): are the joints in the same order?"
+            )
+        elif abs(factor[k] - 1.0) > _ALIKE:
+            off.setdefault(tuple(_readings(factor[k])), []).append(k)
+    for readings, group in off.items():
+        joints = [moving[k] for k in group]
+        everyone = joints == moving and readings
+        subject = "every joint" if everyone else ", ".join(names[j] for j in joints)
+        shown = []
+        for words, scale in readings:
+            changed = position.copy()
+            changed[:, joints] *= scale if "positions" in words else 1.0
+            if "time" not in words:
+                error = f"{_outside(changed, limits)} of the rows outside the limits of the URDF"
+                shown.append(f"{words} (with {error})")
+            elif everyone:
+                shown.append(f"{words} (with {scale * rate:.3g} samples a second)")
+        yield (
+            f"the velocity of {subject} is {float(np.median(factor[group])):.4g} times the slope "
+            "of the position: " + (f"{', or '.join(shown)}?" if shown else "check units and gears")
+        )
 
 
-def _nearest_slip(factor: float) -> float:
-    """The slip that makes about this factor; the factor itself where none does."""
-    known = min(_SLIPS, key=lambda slip: abs(factor / slip - 1.0))
-    return known if abs(factor / known - 1.0) < _ALIKE else factor
+def _readings(factor: float) -> Iterator[tuple[str, float]]:
+    """What makes velocities about a factor too large, and the factor that it makes exactly."""
+    slips = {f"the sign of the {what}": -1.0 for what in ("velocities", "positions")}
+    slips |= {"a time in ms read as s": 1e3, "a time in s read as ms": 1e-3}
+    for what, units, power in (("velocities", RATES, 1), ("positions", ANGLES, -1)):
+        for unit, read in permutations(units, 2):
+            if (unit in _LENGTHS) == (read in _LENGTHS):
+                slips[f"{what} in {unit} read as {read}"] = (units[read] / units[unit]) ** power
+    for words, exact in slips.items():
+        if abs(factor / exact - 1.0) < _ALIKE:
+            yield words, exact
 
 
 def _missed(correlation: Array) -> float:
@@ -387,17 +316,19 @@ def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Ar
     return factor, correlation
 
 
-def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -> list[str]:
+def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -> Iterator[str]:
+    if samples.torque is None and samples.motor_current is None:
+        yield (
+            "there is neither torque nor motor current in the log: it can be looked at, not "
+            "identified from"
+        )
     if samples.torque is None:
-        return [] if samples.motor_current is not None else [_NOTHING_TO_FIT]
-    largest = np.abs(samples.torque).max(axis=0)
-    warnings = [
-        f"the torque of {name} reaches {largest[j]:.3g}, its limit in the URDF is "
-        f"{limits[j].effort:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
-        for j, name in enumerate(names)
-        if largest[j] > _TOO_FAST * limits[j].effort
-    ]
-    for j, name in enumerate(names):
-        if largest[j] == 0.0:
-            warnings.append(f"the torque of {name} is zero throughout")
-    return warnings
+        return
+    for name, largest, one in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
+        if largest == 0.0:
+            yield f"the torque of {name} is zero throughout"
+        elif largest > _TOO_FAST * one.effort:
+            yield (
+                f"the torque of {name} reaches {largest:.3g}, its limit in the URDF is "
+                f"{one.effort:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
+            )

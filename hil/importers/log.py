@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 from os import PathLike
@@ -128,10 +129,11 @@ class _Log:
         """The samples' stamps [ns], and what was subtracted to make them storable."""
         if self._map.sample_rate is not None:
             return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
-        first, *others = self._clocks()
-        times = self._times(first)
+        time, (first, *others) = self._map.time, self._clocks()
+        assert time is not None
+        times = first.times(time.column, TIMES[time.unit], time.array)
         for other in others:
-            if self._times(other) != times:
+            if other.times(time.column, TIMES[time.unit], time.array) != times:
                 raise SourceError(
                     other.path,
                     f"has other times than {first.path.name}",
@@ -161,78 +163,56 @@ class _Log:
             return self._file_per_joint(position.files, "position.files")
         return [self._file(time.file or position.file, "time.file")]
 
-    def _times(self, file: Table | ArrayFile) -> list[int]:
-        """The times in a file [ns]."""
-        time = self._map.time
-        assert time is not None
-        if isinstance(file, Table):
-            return file.times(time.column, TIMES[time.unit])
-        if isinstance(time.column, int) and time.array is None:
-            return _nanoseconds(file.matrix(None, "time").ravel(), TIMES[time.unit], file.path)
-        column = file.column(time.column, "time", time.array)
-        return _nanoseconds(column, TIMES[time.unit], file.path)
-
     def _numbers(self, name: str, quantity: Quantity) -> Array:
         """The numbers of a quantity as in the file, (m, k)."""
+        field, columns, array = f"{name}.columns", quantity.columns, quantity.array
         if quantity.files is not None:
             return self._joint_by_joint(name, quantity, quantity.files)
-        file, field = self._file(quantity.file, f"{name}.file"), f"{name}.columns"
-        columns, arrays = quantity.columns, isinstance(file, ArrayFile)
-        pattern = isinstance(columns, str) and "{}" in columns
-        if columns is None or (isinstance(columns, str) and arrays and not pattern):
-            matrix = file.matrix(columns or quantity.array, field)
-            return self._upright(matrix, quantity, file.path, name)
+        file = self._file(quantity.file, f"{name}.file")
+        if isinstance(columns, str) and "{}" in columns:
+            columns = tuple(self._numbered(columns, file.names, "columns", field))
+        if columns is None or (isinstance(columns, str) and isinstance(file, ArrayFile)):
+            return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
         if isinstance(columns, str):
-            known = file.names if isinstance(file, Table) else tuple(file.stored)
-            if not pattern or not known:
-                raise SourceError(
-                    file.path,
-                    f"its columns have no names like {columns!r}"
-                    if pattern
-                    else f"the pattern {columns!r} has no place for the joint's number",
-                    field=field,
-                    remedy="count them from 0: columns = [1, 2, ...]"
-                    if pattern
-                    else 'write {} there, as in "q{}"',
-                )
-            columns = tuple(self._numbered(columns, known, "columns", field))
+            problem = f"the pattern {columns!r} has no place for the joint's number"
+            remedy = 'write {} there, as in "q{}"'
+            raise SourceError(file.path, problem, field=field, remedy=remedy)
         self._check_length(columns, field)
-        if quantity.joints_along == "rows" and isinstance(file, ArrayFile):
-            rows = [column for column in columns if isinstance(column, int)]
-            if len(rows) < len(columns):
-                problem = "rows of a matrix have no names"
-                raise SourceError(file.path, problem, field=field, remedy="count them from 0")
-            return np.asarray(file.matrix(quantity.array, field)[rows].T)
-        return file.numbers(columns, field, quantity.array)
+        if quantity.joints_along != "rows" or isinstance(file, Table):
+            return file.numbers(columns, field, array)
+        rows = file.matrix(array, field)
+        chosen = [row for row in columns if isinstance(row, int) and row < len(rows)]
+        if len(chosen) < len(columns):
+            remedy = f"it has {len(rows)}, counted from 0"
+            problem = f"the matrix has not all of the rows {', '.join(map(str, columns))}"
+            raise SourceError(file.path, problem, field=field, remedy=remedy)
+        return np.asarray(rows[chosen].T)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
         """The numbers of a quantity that has a file per joint, (m, k)."""
         files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
-        field = f"{name}.columns"
+        field, found = f"{name}.columns", []
         if isinstance(columns, str):
             columns = tuple(columns.replace("{}", str(k)) for k in range(1, len(files) + 1))
-        elif columns is not None:
-            columns = columns * len(files) if len(columns) == 1 else columns
+        elif columns is not None and len(columns) == 1:
+            columns *= len(files)
+        if columns is not None:
             self._check_length(columns, field)
-        found = []
         for joint, file in enumerate(files):
             if columns is not None:
-                found.append(file.numbers([columns[joint]], field, quantity.array)[:, 0])
-                continue
-            matrix = file.matrix(quantity.array, field)
-            if 1 not in matrix.shape:
+                values = file.numbers([columns[joint]], field, quantity.array)
+            else:
+                values = file.matrix(quantity.array, field)
+            if 1 not in values.shape:
                 raise SourceError(
                     file.path,
-                    f"has the shape {matrix.shape}, where one column is wanted",
+                    f"has the shape {values.shape}, where one column is wanted",
                     field=field,
                     remedy="say which one of each file, by name or by index from 0: columns = [1]",
                 )
-            found.append(matrix.ravel())
-        self.check_alike(
-            {file.path.name: column for file, column in zip(files, found, strict=True)},
-            "files",
-            f"{name}.files",
-        )
+            found.append(values.ravel())
+        places = [os.path.relpath(file.path, self._folder) for file in files]
+        self.check_alike(dict(zip(places, found, strict=True)), "files", f"{name}.files")
         return np.column_stack(found)
 
     def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
@@ -379,25 +359,6 @@ class _Log:
                 field=field,
                 remedy=f"one for each of the joints {', '.join(self.joints)}",
             )
-
-
-def _nanoseconds(times: NDArray[np.generic], decimals: int, path: Path) -> list[int]:
-    """Whole nanoseconds of times (m,) in a unit of 10^-decimals s; dates as they are."""
-    if times.dtype.kind in "mM":
-        kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
-        return [int(one) for one in times.astype(kind).astype(np.int64)]
-    if times.dtype.kind in "iu":
-        factor = 10 ** (9 - decimals)
-        return [int(one) * factor for one in times.tolist()]
-    values = times.astype(np.float64)
-    if not np.isfinite(values).all():
-        sample = int(np.argmin(np.isfinite(values)))
-        raise SourceError(path, f"is {values[sample]} in sample {sample}", field="time")
-    # Apart, since an epoch in nanoseconds has more digits than a float.
-    whole = np.floor(values)
-    part = np.rint((values - whole) * 10.0 ** (9 - decimals))
-    factor = 10 ** (9 - decimals)
-    return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
 
 
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:

@@ -20,9 +20,9 @@ from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
 from hil.importers.dh import Convention, urdf_of_dh
-from hil.importers.findings import Limits, clock_fault, examine, urdf_limits
+from hil.importers.findings import Limits, check_clock, examine, urdf_limits
 from hil.io import file_digest
-from hil.reading import remedy_of, text_of
+from hil.reading import named_text
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
@@ -86,11 +86,12 @@ class Robot:
             InputError: the file cannot be read, is no usable URDF, or has no such joint.
         """
         path = Path(path)
-        urdf = _urdf_text(path) if convention is None else urdf_of_dh(path, convention)
+        otherwise = "name a URDF file"
+        urdf = named_text(path, otherwise) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
         except ModelError as error:  # about this file, and not about a cell that nobody wrote
-            raise SourceError(path, str(error), remedy="name a URDF file") from error
+            raise SourceError(path, str(error), remedy=otherwise) from error
         held = _held(urdf, locked or {}, recorded, path)
         law = friction or IMPORTED_LAW
         text = _cell_text(path.stem, law, gravity, rotor_inertia, held)
@@ -152,15 +153,6 @@ class Robot:
         return {"cell.toml": self.cell.encode(), "robot.urdf": self.urdf.encode()}
 
 
-def _urdf_text(path: Path) -> str:
-    try:
-        return text_of(path)
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        remedy = remedy_of(error, "name a URDF file")
-        raise SourceError(path, f"cannot be read ({why})", remedy=remedy) from error
-
-
 def _cell_text(
     name: str,
     friction: FrictionLaw,
@@ -205,16 +197,13 @@ def _held(
             "map of a log, --rename RECORDED=URDF of a bag)",
         )
     limits = urdf_limits(urdf)
-    others = {
-        name: _rest_position(limits.get(name, Limits())) for name in names if name not in recorded
-    }
+    others = {}
+    for name in names:
+        one = limits.get(name, Limits())
+        if name not in recorded:
+            zero = one.lower <= 0.0 <= one.upper
+            others[name] = 0.0 if zero else 0.5 * (one.lower + one.upper)
     return {**others, **locked}
-
-
-def _rest_position(limits: Limits) -> float:
-    """Zero, or the middle of a range that zero is outside of."""
-    inside = limits.lower <= 0.0 <= limits.upper
-    return 0.0 if inside else 0.5 * (limits.lower + limits.upper)
 
 
 def _vector(values: Sequence[float]) -> str:
@@ -270,8 +259,7 @@ def write_imported(
         ArchiveWriteError: the archive cannot be written.
     """
     _check(samples, source[0], robot.joint_names)
-    if (fault := clock_fault(samples.stamp)) is not None:
-        raise SourceError(clock or source[0], fault.problem, field="time", remedy=fault.remedy)
+    check_clock(samples.stamp, clock or source[0])
     unknown = [name for name in held_joints if name not in robot.joint_names]
     if unknown:
         raise SourceError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import cache
 from itertools import chain
@@ -228,12 +228,9 @@ def import_rosbag2(
         ArchiveWriteError: the archive cannot be written.
     """
     files = bag_files(Path(source))
-    states = _States(files[0], robot.joint_names, joint_names or {})
     with _messages(files, topic) as (topic, messages):
-        for stamp, data in messages:
-            states.add(stamp, data)
-    samples = states.samples(effort)
-    metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": states.clock}
+        samples, clock = _samples(messages, files[0], robot.joint_names, joint_names or {}, effort)
+    metadata = {"importer": "rosbag2", "topic": str(topic), "effort": effort, "clock": clock}
     return write_imported(
         output,
         samples,
@@ -333,102 +330,80 @@ def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
     return topic or fitting[0]
 
 
-class _States:
-    """Collects joint state messages, joints in the order wanted.
-
-    Args:
-        source: the bag, for errors.
-        joints: the joints wanted, by their names in the URDF.
-        renamed: name in the URDF by name in the bag.
-    """
-
-    def __init__(self, source: Path, joints: Sequence[str], renamed: Mapping[str, str]) -> None:
-        self._source, self._joints, self._renamed = source, joints, renamed
-        self._header_stamps: list[int] = []
-        self._bag_stamps: list[int] = []
-        self._rows: dict[str, list[Array]] = {"position": [], "velocity": [], "effort": []}
-        self._orders: dict[tuple[str, ...], list[int]] = {}
-
-    @property
-    def clock(self) -> str:
-        """Whose stamps the samples have."""
-        return "header" if any(self._header_stamps) else "bag"
-
-    def add(self, bag_stamp: int, data: bytes) -> None:
-        """Take a message in, unless it has none of the joints."""
-        number = len(self._bag_stamps)
-        message = _decoded(data, self._source, number)
+def _samples(
+    messages: Iterable[tuple[int, bytes]],
+    source: Path,
+    joints: Sequence[str],
+    renamed: Mapping[str, str],
+    effort: Effort,
+) -> tuple[Samples, str]:
+    """Joint states with the joints in this order, and whose stamps they have: header or bag."""
+    stamps: dict[str, list[int]] = {"header": [], "bag": []}
+    rows: dict[str, list[Array]] = {"position": [], "velocity": [], "effort": []}
+    orders: dict[tuple[str, ...], list[int]] = {}
+    for number, (stamp, data) in enumerate(messages):
+        message = _decoded(data, source, number)
         names = tuple(message.name)
-        if names not in self._orders:
-            self._orders[names] = self._order(names)
-        order = self._orders[names]
-        if not order:
-            return
-        stamp = message.header.stamp
-        self._header_stamps.append(stamp.sec * 10**9 + stamp.nanosec)
-        self._bag_stamps.append(bag_stamp)
-        for name, rows in self._rows.items():
+        if names not in orders:
+            orders[names] = _order(names, source, joints, renamed)
+        if not orders[names]:
+            continue  # such as a gripper on the same topic
+        time = message.header.stamp
+        stamps["header"].append(time.sec * 10**9 + time.nanosec)
+        stamps["bag"].append(stamp)
+        for name, column in rows.items():
             values = getattr(message, name)
             if len(values) == len(names):
-                rows.append(values[order])
+                column.append(values[orders[names]])
             elif len(values):
-                raise SourceError(
-                    self._source,
-                    f"message {number} has {len(values)} values for {len(names)} joints",
-                    field=name,
-                )
-
-    def samples(self, effort: Effort) -> Samples:
-        """Everything that was read."""
-        if not self._bag_stamps:
-            seen = dict.fromkeys(name for names in self._orders for name in names)
-            recorded = f"recorded are {', '.join(seen)}" if seen else "it is empty"
-            raise SourceError(
-                self._source,
-                f"none of the joints {', '.join(self._joints)} was recorded; {recorded}",
-                field="joints",
-                remedy="give the URDF of this robot, or say which joint is which: --rename "
-                "RECORDED=URDF",
-            )
-        position = self._column("position")
-        if position is None:
-            raise SourceError(self._source, "the messages have no positions", field="position")
-        strength = None if effort == "ignore" else self._column("effort")
-        stamps = self._header_stamps if self.clock == "header" else self._bag_stamps
-        return Samples(
-            stamp=np.array(stamps, np.int64),
-            position=position,
-            velocity=self._column("velocity"),
-            torque=strength if effort == "torque" else None,
-            motor_current=strength if effort == "motor_current" else None,
+                problem = f"message {number} has {len(values)} values for {len(names)} joints"
+                raise SourceError(source, problem, field=name)
+    count = len(stamps["bag"])
+    if not count:
+        seen = dict.fromkeys(name for names in orders for name in names)
+        recorded = f"recorded are {', '.join(seen)}" if seen else "it is empty"
+        raise SourceError(
+            source,
+            f"none of the joints {', '.join(joints)} was recorded; {recorded}",
+            field="joints",
+            remedy="give the URDF of this robot, or say which joint is which: --rename "
+            "RECORDED=URDF",
         )
+    columns: dict[str, Array | None] = {}
+    if effort == "ignore":
+        rows["effort"] = []
+    for name, column in rows.items():
+        # NaN is what ros2_control publishes for an interface that the hardware does not have.
+        recorded_at_all = not all(np.isnan(row).all() for row in column)
+        if recorded_at_all and len(column) != count:
+            problem = f"only {len(column)} of {count} messages have it"
+            raise SourceError(source, problem, field=name, remedy="record it throughout")
+        columns[name] = np.array(column, np.float64) if recorded_at_all else None
+    position, strength = columns["position"], columns["effort"]
+    if position is None:
+        raise SourceError(source, "the messages have no positions", field="position")
+    clock = "header" if any(stamps["header"]) else "bag"
+    samples = Samples(
+        stamp=np.array(stamps[clock], np.int64),
+        position=position,
+        velocity=columns["velocity"],
+        torque=strength if effort == "torque" else None,
+        motor_current=strength if effort == "motor_current" else None,
+    )
+    return samples, clock
 
-    def _column(self, name: str) -> Array | None:
-        """A quantity that all messages have; None when none has it, or NaN alone.
 
-        NaN is what ros2_control publishes for an interface that the hardware does not have.
-        """
-        rows = self._rows[name]
-        if all(np.isnan(row).all() for row in rows):
-            return None
-        if len(rows) != len(self._bag_stamps):
-            raise SourceError(
-                self._source,
-                f"only {len(rows)} of {len(self._bag_stamps)} messages have it",
-                field=name,
-                remedy="record it throughout",
-            )
-        return np.array(rows, np.float64)
-
-    def _order(self, names: tuple[str, ...]) -> list[int]:
-        """Where the wanted joints stand in a message; empty when it has none of them."""
-        ours = [self._renamed.get(name, name) for name in names]
-        missing = [joint for joint in self._joints if joint not in ours]
-        if missing and len(missing) < len(self._joints):
-            raise SourceError(
-                self._source,
-                f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
-                field="joints",
-                remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
-            )
-        return [] if missing else [ours.index(joint) for joint in self._joints]
+def _order(
+    names: tuple[str, ...], source: Path, joints: Sequence[str], renamed: Mapping[str, str]
+) -> list[int]:
+    """Where the wanted joints are in a message; empty when it has none of them."""
+    ours = [renamed.get(name, name) for name in names]
+    missing = [joint for joint in joints if joint not in ours]
+    if missing and len(missing) < len(joints):
+        raise SourceError(
+            source,
+            f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
+            field="joints",
+            remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
+        )
+    return [] if missing else [ours.index(joint) for joint in joints]

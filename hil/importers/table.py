@@ -136,16 +136,18 @@ class Table:
         self._no_arrays(name, field)
         return self.numbers(range(self.width), field)
 
-    def times(self, column: Column, decimals: int) -> list[int]:
+    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
         """A column of times as whole nanoseconds, exactly as written; of a single line, the line.
 
         Args:
             column: name or index.
             decimals: decimal places between the column's unit and the second.
+            array: None, since text has none.
 
         Raises:
             SourceError: no such column, or a time that is no number.
         """
+        self._no_arrays(array, "time")
         index = self._index(column, "time")
         alone = len(self.lines) == 1 and not self.names
         texts = (

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from hil.archive import container
+from tests.hil.mcap_bytes import chunks
 
 SECTORS: Final = (512, 4096)
 _CHUNK_CRC: Final = 9 + 24  # bytes from the beginning of a chunk's record
@@ -170,17 +171,3 @@ KINDS: Final[dict[str, Callable[[random.Random, Path, Files], tuple[Files, str]]
     "no checksum of the index": _index_unchecked,
     "names swapped": _swapped_names,
 }
-
-
-def chunks(data: bytes) -> list[tuple[int, int]]:
-    """Where each chunk begins and ends."""
-    found, at = [], len(container.MAGIC)
-    while at < len(data):
-        opcode, length = container.RECORD.unpack_from(data, at)
-        end = at + container.RECORD.size + length
-        if opcode == container.CHUNK:
-            found.append((at, end))
-        if opcode == container.DATA_END:
-            break
-        at = end
-    return found

@@ -17,8 +17,9 @@ from hil.errors import ArchiveError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from tests.disk.damage import campaign, main, play
-from tests.disk.harm import KINDS, chunks
+from tests.disk.harm import KINDS
 from tests.disk.laws import Undamaged, broken
+from tests.hil.mcap_bytes import chunks
 
 
 @pytest.fixture(scope="module")

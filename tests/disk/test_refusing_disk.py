@@ -20,6 +20,9 @@ from hil.campaign import Campaign, CampaignPlan
 from hil.cell import Cell
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
 from hil.progress import Silent
+from hil.study import study_settings
+from hil.study.records import Record, read_record, write_record
+from hil.study.settings import StudyFolder
 from tests.disk.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, Rule
 from tests.disk.mounted import Disk, NoFuseError, fuse_disk, planted_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -209,3 +212,47 @@ def test_many_refusals_cost_the_motion_and_no_more(
     disk: Disk, designed: tuple[Cell, CampaignPlan]
 ) -> None:
     assert rounds(disk, designed, range(100, 140)) > 20
+
+
+REFUSED = [
+    pytest.param(Rule((operation,), error=error), id=f"{error} at {operation}")
+    for operation in (SYNC, RENAME)
+    for error in sorted(REFUSALS)
+]
+TOLD = r"cannot be written \(.+\).*nothing there was changed: make room"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+class TestStudy:
+    """What a study writes: whole or not at all, and made good by the next session."""
+
+    @pytest.mark.parametrize("rule", REFUSED)
+    def test_one_that_cannot_be_begun_leaves_an_empty_folder(
+        self, disk: Disk, tmp_path: Path, rule: Rule
+    ) -> None:
+        folder, settings = StudyFolder(disk.root / tmp_path.name), study_settings(quick=True)
+        folder.root.mkdir()
+        disk.do_wrong(rule)
+        with pytest.raises(OutputError, match=rf"study\.json {TOLD}"):
+            folder.begin(settings)
+        assert disk.do_wrong()
+        assert names(folder.root) == []
+        folder.begin(settings)
+        assert names(folder.root) == ["study.json"]
+
+    @pytest.mark.parametrize("rule", REFUSED)
+    def test_a_record_is_written_whole_or_not_at_all(
+        self, disk: Disk, tmp_path: Path, rule: Rule
+    ) -> None:
+        path, record = disk.root / tmp_path.name / "a.json", Record(inputs="these archives")
+        disk.do_wrong(rule)
+        with pytest.raises(OutputError, match=rf"a\.json {TOLD}"):
+            write_record(path, record)
+        disk.do_wrong()
+        assert names(path.parent) == []
+        assert read_record(path, Record, "these archives") is None
+        write_record(path, record)
+        assert read_record(path, Record, "these archives") == record

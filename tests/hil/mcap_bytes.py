@@ -59,6 +59,17 @@ def heads(chunk: bytes) -> Iterator[Head]:
             yield Head(channel, sequence, log_time, item.offset, start + head.size)
 
 
+def chunks(data: bytes) -> list[tuple[int, int]]:
+    """Where each chunk of a file begins and ends."""
+    found, at = [], len(container.MAGIC)
+    while at < len(data) and data[at] != container.DATA_END:
+        opcode, end = container.bounds(data, at, 0)
+        if opcode == container.CHUNK:
+            found.append((at, end))
+        at = end
+    return found
+
+
 def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     """A copy with other words, of the same length, in an attachment; its checksum is right."""
     assert len(old.encode()) == len(new.encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hil.archive import ArchiveHeader, Findings, Samples, open_archive
 from hil.cli import app
 from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
-from hil.importers.findings import clock_fault, examine
+from hil.importers.findings import check_clock, examine
 from tests.hil.simulated_logs import Simulated, simulate
 
 DEGREES = 57.29578
@@ -134,27 +135,29 @@ class TestClock:
 
     @pytest.mark.parametrize("rate", [10.0, 125.0, 1000.0, 50_000.0])
     def test_usual_rates_pass(self, rate: float) -> None:
-        assert clock_fault(self.stamps(*(np.arange(50) / rate))) is None
+        check_clock(self.stamps(*(np.arange(50) / rate)), Path("x"))
 
-    def test_milliseconds_read_as_seconds_are_refused(self) -> None:
-        fault = clock_fault(self.stamps(*range(0, 1000, 10)))
-        assert fault is not None
-        assert fault.problem.startswith("there would be 0.1 samples a second")
-        assert "milliseconds read as seconds would make it 100 samples a second" in fault.remedy
+    @pytest.mark.parametrize("seconds", [(3.0,), (0.0, 0.01, 0.01, 0.02)])
+    def test_single_stamps_and_repeats_pass(self, seconds: tuple[float, ...]) -> None:
+        check_clock(self.stamps(*seconds), Path("x"))
 
-    def test_a_clock_that_runs_backwards_is_refused_by_its_sample(self) -> None:
-        fault = clock_fault(self.stamps(0.0, 0.01, 0.02, 0.005, 0.015))
-        assert fault is not None
-        assert fault.problem == "sample 3 is 0.015 s older than the one before it (1 such steps)"
-
-    def test_a_clock_that_stands_still_is_refused(self) -> None:
-        fault = clock_fault(self.stamps(3.0, 3.0, 3.0))
-        assert fault is not None
-        assert fault.problem == "all 3 samples have the same time"
-
-    def test_single_stamps_and_repeats_pass(self) -> None:
-        assert clock_fault(self.stamps(3.0)) is None
-        assert clock_fault(self.stamps(0.0, 0.01, 0.01, 0.02)) is None
+    @pytest.mark.parametrize(
+        ("seconds", "sentence"),
+        [
+            (
+                range(0, 1000, 10),
+                r"x: time: there would be 0\.1 samples .* would make it 100 samples a second",
+            ),
+            (
+                (0.0, 0.01, 0.02, 0.005, 0.015),
+                r"sample 3 is 0\.015 s older than the one before it \(1 such steps\)",
+            ),
+            ((3.0, 3.0, 3.0), "all 3 samples have the same time"),
+        ],
+    )
+    def test_that_of_no_motion_is_refused(self, seconds: Sequence[float], sentence: str) -> None:
+        with pytest.raises(SourceError, match=sentence):
+            check_clock(self.stamps(*seconds), Path("x"))
 
     def test_the_file_with_the_times_is_named(self, arm: Simulated, tmp_path: Path) -> None:
         np.savetxt(tmp_path / "q.txt", arm.position)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,8 @@ from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.column_map import UNITS
 from hil.recordings import open_recording
-from tests.hil.three_joints import imported, three_joint_robot
+from tests.hil.three_joints import column_map, three_joint_robot
+from tests.hil.three_joints import imported as read
 
 
 @pytest.fixture
@@ -29,11 +29,6 @@ def log(path: Path, values: NDArray[np.float64], header: str = "", delimiter: st
     return path
 
 
-def column_map(**entries: object) -> ColumnMap:
-    base: dict[str, object] = {"position": {"columns": "q{}"}, "sample_rate": 100.0}
-    return ColumnMap.model_validate({**base, **entries})
-
-
 VALUES = np.random.default_rng(0).normal(size=(20, 7))
 HEADER = "t,q1,q2,q3,tau1,tau2,tau3"
 VALUES[:, 0] = 0.01 * np.arange(20)
@@ -42,10 +37,6 @@ VALUES[:, 0] = 0.01 * np.arange(20)
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     return log(tmp_path / "a.csv", VALUES, HEADER)
-
-
-def read(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:
-    return imported(source, robot, **{"position": {"columns": "q{}"}, **entries})
 
 
 class TestColumns:
@@ -91,7 +82,7 @@ class TestTime:
     def test_a_time_column_is_exact_to_the_nanosecond(self, tmp_path, robot, unit, times, expected):
         lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
         (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
-        columns = column_map(time={"column": "t", "unit": unit}, sample_rate=None)
+        columns = column_map(time={"column": "t", "unit": unit})
         path = import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
         stamp = open_archive(path).columns["stamp"]
         assert (stamp - stamp[0]).tolist() == expected
@@ -172,7 +163,7 @@ class TestBadInput:
             ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
             ({"drive": {"gear_ratio": (1, 2)}}, "drive.gear_ratio: has 2 entries"),
             ({"drive": {"gear_ratio": (1, 0, 2)}}, "would not be moved by any motor"),
-            ({"time": {"column": "time"}, "sample_rate": None}, "time: there is no column 'time'"),
+            ({"time": {"column": "time"}}, "time: there is no column 'time'"),
             ({"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
         ],
     )
@@ -205,7 +196,7 @@ class TestBadInput:
     def test_a_time_that_is_no_number_is_named(self, tmp_path, robot, time):
         (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
         with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
-            read(tmp_path / "a.csv", robot, time={"column": "t"}, sample_rate=None)
+            read(tmp_path / "a.csv", robot, time={"column": "t"})
 
     def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
         """Which of the numbers have no name cannot be known: the first, as pandas writes them?"""
@@ -273,7 +264,7 @@ class TestFilePerJoint:
 
     def test_the_time_stands_in_each_of_them_or_in_its_own(self, folder, robot):
         for time in ({"column": 0}, {"file": "t.txt"}):
-            columns = column_map(**QUANTITIES, time=time, sample_rate=None)
+            columns = column_map(**QUANTITIES, time=time)
             path = import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
             assert open_recording(path).time == pytest.approx(VALUES[:, 0])
             path.unlink()
@@ -281,7 +272,7 @@ class TestFilePerJoint:
     def test_joints_with_clocks_of_their_own_are_refused(self, folder, robot):
         np.savetxt(folder / "q_2.txt", VALUES[:, [0, 2]] + [0.001, 0.0])
         with pytest.raises(SourceError, match=r"q_2\.txt: time: has other times than q_1\.txt"):
-            read(folder, robot, **QUANTITIES, time={"column": 0}, sample_rate=None)
+            read(folder, robot, **QUANTITIES, time={"column": 0})
 
     @pytest.mark.parametrize(
         ("position", "sentence"),

@@ -156,17 +156,12 @@ def imported(tmp_path: Path, robot: Robot) -> Import:
 
 
 class TestRobot:
-    def test_its_cell_file_gives_the_model_that_was_asked_for(self, robot):
-        cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
-        assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
-        assert cell.joint_names == robot.joint_names == ("hip", "ankle")
-
-    def test_without_a_law_it_has_offset_coulomb_and_viscous_friction(self, tmp_path):
-        """A term in v² makes the prediction of other motions worse on average."""
-        (tmp_path / "two.urdf").write_text(URDF)
-        robot = Robot.from_urdf(tmp_path / "two.urdf")
-        cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
-        assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
+    def test_its_cell_file_gives_the_model_that_was_asked_for(self, tmp_path, robot):
+        """Without a law: a term in v² makes the prediction of other motions worse on average."""
+        for one in (robot, Robot.from_urdf(tmp_path / "two.urdf")):
+            cell = Cell.from_texts(one.cell, one.urdf, Path("cell.toml"))
+            assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
+            assert cell.joint_names == one.joint_names == ("hip", "ankle")
 
     def test_gravity_and_rotor_inertia_are_kept(self, tmp_path):
         (tmp_path / "two.urdf").write_text(URDF)
@@ -175,9 +170,11 @@ class TestRobot:
         assert model.gravity.tolist() == [0, 9.81, 0]
         assert not model.rotor_inertia
 
-    def test_gravity_replaces_that_of_a_cell(self, tmp_path, robot):
+    def test_a_cell_file_serves_as_well(self, tmp_path, robot):
         (tmp_path / "robot.urdf").write_text(robot.urdf)
         (tmp_path / "cell.toml").write_text(robot.cell)
+        again = Robot.from_cell(tmp_path / "cell.toml")
+        assert (again.cell, again.urdf) == (robot.cell, robot.urdf)
         turned = Robot.from_cell(tmp_path / "cell.toml", gravity=(0, 0, 1.62))
         model = Cell.from_texts(turned.cell, turned.urdf, Path("cell.toml")).model
         assert model.gravity.tolist() == [0, 0, 1.62]
@@ -207,14 +204,12 @@ class TestRobot:
         with pytest.raises(InputError, match=r"none of its joints hip.* recorded are a, b"):
             Robot.from_urdf(path, recorded=["a", "b"])
 
-    def test_a_transmission_of_the_same_name_does_not_hide_a_fixed_joint(self, tmp_path):
-        again = '<transmission name="t"><joint name="ankle"/></transmission></robot>'
-        (tmp_path / "two.urdf").write_text(URDF.replace("</robot>", again))
-        held = Robot.from_urdf(tmp_path / "two.urdf", locked={"ankle": 0.0})
-        assert held.joint_names == ("hip",)
-
-    def test_a_fixed_joint_is_no_joint_any_more(self, tmp_path):
-        (tmp_path / "two.urdf").write_text(URDF)
+    @pytest.mark.parametrize(
+        "more", ["", '<transmission name="t"><joint name="ankle"/></transmission>']
+    )
+    def test_a_fixed_joint_is_no_joint_any_more(self, tmp_path, more):
+        """Nor where a transmission has its name."""
+        (tmp_path / "two.urdf").write_text(URDF.replace("</robot>", f"{more}</robot>"))
         held = Robot.from_urdf(tmp_path / "two.urdf", locked={"ankle": 0.0})
         assert held.joint_names == ("hip",)
         with pytest.raises(InputError, match=r"'knee'.*hip, ankle"):
@@ -226,12 +221,6 @@ class TestRobot:
             Robot.from_urdf(tmp_path / "bad.urdf")
         with pytest.raises(InputError, match=r"none\.urdf.*cannot be read"):
             Robot.from_urdf(tmp_path / "none.urdf")
-
-    def test_a_cell_file_serves_as_well(self, tmp_path, robot):
-        (tmp_path / "robot.urdf").write_text(robot.urdf)
-        (tmp_path / "cell.toml").write_text(robot.cell)
-        again = Robot.from_cell(tmp_path / "cell.toml")
-        assert (again.cell, again.urdf) == (robot.cell, robot.urdf)
 
 
 class TestImport:
@@ -464,48 +453,33 @@ def joint_states(path: Path, **options: Any) -> Path:
     return mcap(path, {"/joint_states": (STATE, DEFINITION, "cdr", many())}, **options)
 
 
-def assert_imported(path: Path, *, torque: bool = True) -> None:
+def assert_imported(path: Path) -> None:
     archive = open_archive(path)
     assert archive.complete, archive.missing
     columns = archive.columns
     assert columns["stamp"].tolist() == STAMPS.tolist()
     assert columns["position"].tobytes() == POSITION.tobytes()
     assert columns["velocity"].tobytes() == VELOCITY.tobytes()
-    assert ("torque" in columns) == torque
-    effort = columns["torque" if torque else "motor_current"]
-    assert effort.tobytes() == EFFORT.tobytes()
+    assert columns["torque"].tobytes() == EFFORT.tobytes()
 
 
-@pytest.mark.parametrize("compression", list(CompressionType))
-@pytest.mark.parametrize("use_chunking", [True, False])
+BARE = ("enable_crcs", "use_statistics", "repeat_schemas", "repeat_channels")
+"""What a file without index or checksums lacks."""
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"compression": one, "chunk_size": 20_000} for one in CompressionType),
+        {"use_chunking": False, "use_summary_offsets": False},
+        dict.fromkeys(BARE, False),
+    ],
+)
 def test_joint_states_of_any_mcap_file(
-    tmp_path: Path, robot: Robot, compression: CompressionType, use_chunking: bool
+    tmp_path: Path, robot: Robot, options: dict[str, Any]
 ) -> None:
-    source = joint_states(
-        tmp_path / "x.mcap",
-        compression=compression,
-        chunk_size=20_000,
-        use_chunking=use_chunking,
-        use_summary_offsets=False,
-    )
+    source = joint_states(tmp_path / "x.mcap", **options)
     assert_imported(import_rosbag2(source, tmp_path / "out.mcap", robot=robot))
-
-
-def test_a_file_without_index_or_checksums_is_read_as_well(tmp_path: Path, robot: Robot) -> None:
-    source = joint_states(
-        tmp_path / "x.mcap",
-        enable_crcs=False,
-        use_statistics=False,
-        repeat_schemas=False,
-        repeat_channels=False,
-    )
-    assert_imported(import_rosbag2(source, tmp_path / "out.mcap", robot=robot))
-
-
-def test_efforts_may_be_motor_currents(tmp_path: Path, robot: Robot) -> None:
-    source = joint_states(tmp_path / "x.mcap")
-    out = import_rosbag2(source, tmp_path / "out.mcap", robot=robot, effort="motor_current")
-    assert_imported(out, torque=False)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

@@ -27,8 +27,14 @@ def three_joint_robot(folder: Path) -> Robot:
     return Robot.from_urdf(path)
 
 
+def column_map(**entries: object) -> ColumnMap:
+    """Of positions called q1, q2 ... at 100 Hz, unless the entries say else."""
+    rate = {} if "time" in entries else {"sample_rate": 100.0}
+    return ColumnMap.model_validate({"position": {"columns": "q{}"}, **rate, **entries})
+
+
 def imported(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:
-    """The columns of a log's archive, which lies beside it, at 100 Hz unless the map says else."""
-    columns = ColumnMap.model_validate({"sample_rate": 100.0, **entries})
-    path = import_log(source, source.with_suffix(".mcap"), robot=robot, columns=columns)
+    """The columns of a log's archive, which lies beside it; entries as of `column_map`."""
+    path = source.with_suffix(".mcap")
+    import_log(source, path, robot=robot, columns=column_map(**entries))
     return dict(open_archive(path).columns)

@@ -6,10 +6,10 @@ Read as `hil status`, `hil run` and `hil identify` read it: its status, and how 
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -144,24 +144,6 @@ def test_a_dry_run_is_read_back_as_it_was(folder: Path) -> None:
     assert repr(found) == repr(made)  # NaN is like no other
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("override", "x"), ("archives", 3), ("current_share", [0.1]), ("current_share", ["x", 1]),
-        ("missed", "x"), ("against_gravity", 3), ("against_gravity", [3]),
-        ("joint_names", 3), ("accepted", {"by": "\ud800", "at": "x"}), ("accepted", []),
-        ("simulated", 1), ("format_version", [2]),
-    ],
-)  # fmt: skip
-def test_dry_run(key: str, value: object, folder: Path) -> None:
-    dry_run(folder).save(folder / "dry_run.json")
-    doctored(folder / "dry_run.json", key, value=value)
-    with pytest.raises(CampaignFolderError, match=r"dry_run\.json is damaged"):
-        DryRun.load(CampaignFolder(folder))
-    assert not conduct_of(CampaignFolder(folder)).steps[1].done
-    read(folder)
-
-
 def warm_up(folder: Path) -> WarmUp:
     return (
         WarmUp(CampaignFolder(folder).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
@@ -177,64 +159,74 @@ def test_a_warm_up_is_read_back_as_it_was(folder: Path) -> None:
     assert WarmUp.load(folder / "warmup.json", made.plan_hash) == made
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("outcome", 3), ("outcome", "\ud800"), ("outcome", "hot"), ("threshold", "x"),
-        ("motions", [{"archive": "w", "friction": ["x", 1]}]),
-        ("motions", [{"archive": "w", "friction": [1.0]}]),
-        ("moved_at", "now"), ("earlier", 3),
+BROKEN: dict[str, list[tuple[tuple[str, ...], object]]] = {
+    "dry_run.json": [
+        (("override",), "x"), (("archives",), 3), (("current_share",), [0.1]),
+        (("current_share",), ["x", 1]), (("missed",), "x"), (("against_gravity",), 3),
+        (("against_gravity",), [3]), (("joint_names",), 3), (("accepted",), []),
+        (("accepted",), {"by": "\ud800", "at": "x"}), (("simulated",), 1),
+        (("format_version",), [2]),
     ],
-)  # fmt: skip
-def test_warm_up(key: str, value: object, folder: Path) -> None:
-    made = warm_up(folder)
-    made.save(folder / "warmup.json")
-    doctored(folder / "warmup.json", key, value=value)
-    with pytest.raises(CampaignFolderError, match=r"warmup\.json is damaged"):
-        WarmUp.load(folder / "warmup.json", made.plan_hash)
-    read(folder)
+    "warmup.json": [
+        (("outcome",), 3), (("outcome",), "\ud800"), (("outcome",), "hot"), (("threshold",), "x"),
+        (("motions",), [{"archive": "w", "friction": ["x", 1]}]),
+        (("motions",), [{"archive": "w", "friction": [1.0]}]),
+        (("moved_at",), "now"), (("earlier",), 3),
+    ],
+    "plan.json": [
+        (("excitation", "seed"), float("inf")), (("excitation", "fly"), HUGE),
+        (("excitation", "speed"), [HUGE, 1]), (("excitation", "speed"), ["0.1", "0.2"]),
+        (("excitation", "via_points"), []), (("excitation", "via_points"), 5.0),
+        (("excitation", "criteria", "log10_det"), "x"), (("excitation", "trajectory"), []),
+        (("excitation", "trajectory", "knots"), [[0, HUGE], [0, 1]]),
+        (("excitation", "rejected"), {"a": []}), (("excitation",), []),
+        (("validation",), 3), (("validation",), {"a": 1}), (("moves",), 3),
+    ],
+}  # fmt: skip
+HUGE_NUMBERS = [
+    ("dry_run.json", "missed", HUGE),
+    ("dry_run.json", "duration", HUGE),
+    ("warmup.json", "motions", [{"archive": "w", "friction": [HUGE, 1]}] * 3),
+    ("warmup.json", "moved_at", HUGE),
+    ("warmup.json", "threshold", HUGE),
+]
+LOADED: dict[str, Callable[[Path], object]] = {
+    "dry_run.json": lambda folder: DryRun.load(CampaignFolder(folder)),
+    "warmup.json": lambda folder: WarmUp.load(
+        folder / "warmup.json", CampaignFolder(folder).plan_hash
+    ),
+    "plan.json": lambda folder: Campaign.open(folder).status(),
+}
 
 
-@pytest.mark.parametrize(
-    ("file", "key", "value"),
-    [
-        ("dry_run.json", "missed", HUGE),
-        ("dry_run.json", "duration", HUGE),
-        ("warmup.json", "motions", [{"archive": "w", "friction": [HUGE, 1]}] * 3),
-        ("warmup.json", "moved_at", HUGE),
-        ("warmup.json", "threshold", HUGE),
-    ],
-)
-def test_numbers_beyond_all_others(file: str, key: str, value: object, folder: Path) -> None:
+@pytest.fixture
+def done(folder: Path) -> Path:
+    """The folder with a dry run and a warm-up."""
     dry_run(folder).save(folder / "dry_run.json")
     warm_up(folder).save(folder / "warmup.json")
-    doctored(folder / file, key, value=value)
-    read(folder)
+    return folder
 
 
 @pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (("excitation", "seed"), float("inf")),
-        (("excitation", "fly"), HUGE),
-        (("excitation", "speed"), [HUGE, 1]),
-        (("excitation", "speed"), ["0.1", "0.2"]),
-        (("excitation", "via_points"), []),
-        (("excitation", "via_points"), 5.0),
-        (("excitation", "criteria", "log10_det"), "x"),
-        (("excitation", "trajectory"), []),
-        (("excitation", "trajectory", "knots"), [[0, HUGE], [0, 1]]),
-        (("excitation", "rejected"), {"a": []}),
-        (("excitation",), []),
-        (("validation",), 3),
-        (("validation",), {"a": 1}),
-        (("moves",), 3),
-    ],
+    ("file", "place", "value"), [(f, *case) for f, cases in BROKEN.items() for case in cases]
 )
-def test_plan(place: tuple[str, ...], value: Any, folder: Path) -> None:
-    with suppress(FileNotFoundError):
-        (folder / "manifest.json").unlink()
-    doctored(folder / "plan.json", *place, value=value)
-    with pytest.raises(InputError, match="is not a campaign plan"):
-        Campaign.open(folder).status()
-    read(folder)
+def test_a_changed_value_is_refused_by_its_file(
+    file: str, place: tuple[str, ...], value: object, done: Path
+) -> None:
+    if file == "plan.json":
+        (done / "manifest.json").unlink(missing_ok=True)
+    doctored(done / file, *place, value=value)
+    said = "is not a campaign plan" if file == "plan.json" else f"{file} is damaged"
+    with pytest.raises(InputError, match=re.escape(said)) as refused:
+        LOADED[file](done)
+    if file != "plan.json":
+        assert isinstance(refused.value, CampaignFolderError)
+    if file == "dry_run.json":
+        assert not conduct_of(CampaignFolder(done)).steps[1].done
+    read(done)
+
+
+@pytest.mark.parametrize(("file", "key", "value"), HUGE_NUMBERS)
+def test_numbers_beyond_all_others(file: str, key: str, value: object, done: Path) -> None:
+    doctored(done / file, key, value=value)
+    read(done)

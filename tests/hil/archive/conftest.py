@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +15,11 @@ from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, container, open_archive
 from hil.archive.container import Record
 
+NAME = "validation_003_a1.mcap"
+ATTACHMENTS = {"robot.urdf": b"<robot name='x'/>", "cell.toml": b"[cell]\nname = 'x'\n"}
+FIRST = 5000
+"""Number of the first cycle."""
+
 
 @dataclass(frozen=True, repr=False)
 class Written:
@@ -21,7 +28,7 @@ class Written:
     Attributes:
         path: the file.
         data: its bytes.
-        rows: the cycles; the first has number `first`.
+        rows: the cycles; the first has number `FIRST`.
         torque: joint torques of the cycles.
         attachments: content by name.
     """
@@ -31,7 +38,6 @@ class Written:
     rows: NDArray[np.void]
     torque: NDArray[np.float64]
     attachments: dict[str, bytes]
-    first: int = 5000
 
     def __repr__(self) -> str:
         return "the small archive"
@@ -39,13 +45,16 @@ class Written:
     @property
     def records(self) -> list[Record]:
         """Its records up to DataEnd."""
-        with self.path.open("rb") as stream:
-            return list(container.records(stream, len(self.data)))
+        return records_of(self.path)
 
     @property
     def chunks(self) -> list[Record]:
         """Its chunks."""
         return [record for record in self.records if record.opcode == container.CHUNK]
+
+    def first(self, opcode: int) -> Record:
+        """The first record of a kind."""
+        return next(record for record in self.records if record.opcode == opcode)
 
     def changed(self, record: Record, at: int, mask: int = 0xFF) -> bytes:
         """The file with one byte of a record's body changed; `at` may count from its end."""
@@ -58,7 +67,7 @@ class Written:
         """Each sample in an archive is one that was written, and they are in order."""
         if archive.n_samples:
             cycles = archive.cycles()
-            index = cycles["cycle"] - self.first
+            index = cycles["cycle"] - FIRST
             assert (np.diff(index) > 0).all()
             for name in self.rows.dtype.names or ():
                 assert cycles[name].tobytes() == self.rows[name][index].tobytes(), name
@@ -69,30 +78,65 @@ class Written:
         assert archive.joint_names == ("a", "b")
 
 
+def records_of(path: Path) -> list[Record]:
+    """The records of a file up to DataEnd."""
+    with path.open("rb") as stream:
+        return list(container.records(stream, path.stat().st_size))
+
+
+def write(
+    path: Path, rows: NDArray[np.void], torque: NDArray[np.float64] | None = None, events: int = 0
+) -> bytes:
+    """An archive of two joints, ten cycles in a chunk; with `events` one before so many cycles."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    step = events or len(rows)
+    with ArchiveWriter(
+        path,
+        joint_names=("a", "b"),
+        period=0.01,
+        metadata={"campaign": "c"},
+        attachments=ATTACHMENTS,
+        durable=False,
+    ) as archive:
+        for start in range(0, len(rows), step):
+            part = slice(start, start + step)
+            if events:
+                archive.event(FIRST + start, "tick", "text", data={"start": start})
+            archive.write(rows[part], None if torque is None else torque[part])
+        archive.close("completed")
+    return path.read_bytes()
+
+
+def peak(action: Callable[[], object]) -> int:
+    """Most bytes that an action had allocated at a time."""
+    tracemalloc.start()
+    try:
+        held = action()
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    del held
+    return most
+
+
 @pytest.fixture(scope="session")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     random = np.random.default_rng(1)
     rows = np.zeros(43, cycle_dtype(2))
     cycle = np.arange(43)
-    rows["cycle"] = 5000 + cycle
+    rows["cycle"] = FIRST + cycle
     rows["number"] = cycle
     rows["position"] = np.round(np.sin(0.01 * cycle[:, None] + [0.0, 1.0]), 4)
     rows["target_current"] = np.round(random.normal(size=(43, 2)), 2)
     rows["commanded_position"] = rows["position"] + 0.001
     torque = 80.0 * rows["target_current"]
-    attachments = {"robot.urdf": b"<robot name='x'/>", "cell.toml": b"[cell]\nname = 'x'\n"}
-    path = tmp_path_factory.mktemp("written") / "validation_003_a1.mcap"
-    with ArchiveWriter(
-        path,
-        joint_names=("a", "b"),
-        period=0.01,  # ten cycles in a chunk keep the file small
-        metadata={"campaign": "c"},
-        attachments=attachments,
-        durable=False,
-    ) as archive:
-        for start in range(0, 43, 15):
-            archive.event(5000 + start, "tick", "text", data={"start": start})
-            archive.write(rows[start : start + 15], torque[start : start + 15])
-        archive.close("completed")
+    path = tmp_path_factory.mktemp("written") / NAME
+    data = write(path, rows, torque, events=15)
     assert open_archive(path).complete
-    return Written(path, path.read_bytes(), rows, torque, attachments)
+    return Written(path, data, rows, torque, ATTACHMENTS)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / NAME

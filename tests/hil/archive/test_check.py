@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from hil.archive import Samples, container, header, schema, write_samples
+from hil.archive import Samples, container, header, open_archive, schema, write_samples
 from hil.archive.check import ASPECTS, check_archive
 from hil.errors import NotAnArchiveError
 
@@ -51,7 +51,7 @@ class Content:
         with path.open("wb") as stream:
             writer = Writer(stream, 1 << 40, compression=self.compression, index_types=self.indexes)
             writer.start(self.profile, self.library)
-            self._describe(writer, "hil", self.metadata)
+            writer.add_metadata("hil", header.sealed(self.metadata))
             for name, data in sorted(self.attachments.items()):
                 writer.add_attachment(0, 0, name, "text/plain", data)
             channels: dict[str, int] = {}
@@ -65,21 +65,12 @@ class Content:
                     if cycles and cycles % self.cycles_per_chunk == 0:
                         writer.flush()
                     cycles += 1
-                writer.add_message(
-                    channels[message.topic],
-                    message.log_time,
-                    message.data,
-                    message.publish_time,
-                    message.sequence,
-                )
+                times = message.log_time, message.data, message.publish_time, message.sequence
+                writer.add_message(channels[message.topic], *times)
             writer.flush()
-            self._describe(writer, "hil.outcome", self.outcome)
+            writer.add_metadata("hil.outcome", header.sealed(self.outcome))
             writer.finish()
         return path
-
-    @staticmethod
-    def _describe(writer: Any, name: str, entries: dict[str, str]) -> None:
-        writer.add_metadata(name, {**entries, "checksum": header.checksum(entries)})
 
 
 @pytest.fixture
@@ -88,16 +79,11 @@ def content(written) -> Content:
         reader = make_reader(stream)
         messages = [
             Message(
-                channel.topic,
-                kind.name,
-                kind.data.decode(),
-                message.log_time,
-                message.publish_time,
-                message.sequence,
-                message.data,
+                channel.topic, kind.name, kind.data.decode(),
+                one.log_time, one.publish_time, one.sequence, one.data,
             )
-            for kind, channel, message in reader.iter_messages(log_time_order=False)
-        ]
+            for kind, channel, one in reader.iter_messages(log_time_order=False)
+        ]  # fmt: skip
         metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
     for entries in metadata.values():
         entries.pop("checksum")
@@ -249,12 +235,11 @@ class TestAnotherFile:
         with pytest.raises(NotAnArchiveError, match=r"an MCAP file .*'ros1'.*'some recorder'"):
             check_archive(path)
 
-    def test_anything_else_is_no_mcap_file(self, tmp_path):
-        (tmp_path / "x").write_bytes(b"hello" * 9)
-        with pytest.raises(NotAnArchiveError, match="is not an MCAP file"):
-            check_archive(tmp_path / "x")
-
-    def test_an_empty_file_is_empty(self, tmp_path):
-        (tmp_path / "x").write_bytes(b"")
-        with pytest.raises(NotAnArchiveError, match="is empty"):
-            check_archive(tmp_path / "x")
+    @pytest.mark.parametrize(
+        ("data", "sentence"), [(b"hello" * 9, "is not an MCAP file"), (b"", "is empty")]
+    )
+    def test_anything_else_is_no_mcap_file(self, tmp_path, data, sentence):
+        (tmp_path / "x").write_bytes(data)
+        for read in (check_archive, open_archive):
+            with pytest.raises(NotAnArchiveError, match=sentence):
+                read(tmp_path / "x")

@@ -1,4 +1,4 @@
-"""Archives that a stranger wrote: sound by their checksums, and odd or hostile all the same.
+"""Archives that somebody else wrote: sound by their checksums, and odd or hostile all the same.
 
 Whoever opens one gets an error of ours that names file and field, or an archive that says what it
 lost; in memory that the file itself does not choose.
@@ -7,8 +7,8 @@ lost; in memory that the file itself does not choose.
 from __future__ import annotations
 
 import json
+import os
 import struct
-import tracemalloc
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,9 +33,9 @@ from hil.cli import app
 from hil.errors import ArchiveError
 from hil.identify.sources import cell_of, gather_sources
 from tests.hil import mcap_bytes
+from tests.hil.archive.conftest import NAME, peak, records_of
 
 MEMORY = 60_000_000  # bytes; the small archive needs one million
-NAME = "validation_003_a1.mcap"
 IMPORTED = "imported.mcap"
 READERS: dict[str, Callable[[Path], object]] = {
     "open_archive": open_archive,
@@ -47,36 +47,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-class Stranger(mcap_bytes.Indexed):
-    """Writes records anew, all checksums and the index fitting them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._described = ""
-
-    def metadata(self, record: Record, given: Mapping[str, Mapping[str, str]]) -> None:
-        name, entries = container.metadata(record)
-        del entries["checksum"]
-        if header.CHUNKS in entries:
-            entries[header.CHUNKS] = chunk_list(self.checksums)
-        entries |= given[name]
-        if name == "hil":
-            self._described = header.checksum(entries)
-        elif header.DESCRIPTION in entries:
-            entries[header.DESCRIPTION] = self._described
-        self.put(mcap_bytes.metadata(name, {**entries, "checksum": header.checksum(entries)}))
-
-    def chunk(self, record: Record, change: Callable[[bytes], bytes]) -> None:
-        head = container.chunk(record)
-        plain = change(container.chunk_data(head, record.offset))
-        self.put(mcap_bytes.chunk(plain, (head.message_start_time, head.message_end_time)))
-
-    def attachment(self, record: Record, given: Mapping[str, bytes]) -> None:
-        found = container.attachment(record)
-        self.put(mcap_bytes.attachment(found.name, given.get(found.name, found.data)))
-
-
-def stranger(
+def forged(
     written,
     path: Path,
     *,
@@ -86,16 +57,29 @@ def stranger(
     chunk: Callable[[bytes], bytes] = bytes,
 ) -> Path:
     """The small archive with other content, all checksums and the index fitting it."""
-    made = Stranger()
+    made, described = mcap_bytes.Indexed(), ""
+    given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
     for record in written.records:
+        data = record.data
+        if record.opcode in (container.MESSAGE_INDEX, container.DATA_END):
+            continue
         if record.opcode == container.METADATA:
-            made.metadata(record, {"hil": metadata or {}, "hil.outcome": outcome or {}})
+            name, entries = container.metadata(record)
+            del entries["checksum"]
+            seals = {header.CHUNKS: chunk_list(made.checksums), header.DESCRIPTION: described}
+            entries |= {key: seals[key] for key in seals.keys() & entries.keys()}
+            entries |= given[name]
+            described = described or header.checksum(entries)
+            data = mcap_bytes.metadata(name, header.sealed(entries))
         elif record.opcode == container.CHUNK:
-            made.chunk(record, chunk)
+            head = container.chunk(record)
+            content = chunk(container.chunk_data(head, record.offset))
+            data = mcap_bytes.chunk(content, (head.message_start_time, head.message_end_time))
         elif record.opcode == container.ATTACHMENT:
-            made.attachment(record, attachments or {})
-        elif record.opcode not in (container.MESSAGE_INDEX, container.DATA_END):
-            made.put(record.data)
+            found = container.attachment(record)
+            content = (attachments or {}).get(found.name, found.data)
+            data = mcap_bytes.attachment(found.name, content)
+        made.put(data)
     path.write_bytes(made.ended())
     return path
 
@@ -121,17 +105,8 @@ def outcomes(path: Path) -> dict[str, str]:
     return said
 
 
-def peak(action: Callable[[], object]) -> int:
-    tracemalloc.start()
-    try:
-        action()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-def test_the_same_content_written_by_a_stranger_is_as_good(written, tmp_path):
-    path = stranger(written, tmp_path / NAME)
+def test_the_same_content_written_by_others_is_as_good(written, path):
+    path = forged(written, path)
     assert check_archive(path).keeps
     assert set(outcomes(path).values()) == {""}
 
@@ -151,7 +126,7 @@ ODD = {
 
 @pytest.mark.parametrize(("field", "text"), [(f, t) for f, texts in ODD.items() for t in texts])
 def test_an_entry_that_cannot_be_used_is_named(field, text, written, tmp_path):
-    path = stranger(written, tmp_path / NAME, metadata={field: text})
+    path = forged(written, tmp_path / NAME, metadata={field: text})
     said = outcomes(path)
     for way in READERS.keys() - {"check"}:
         assert f"{NAME}: {field}: " in said[way], way
@@ -168,8 +143,8 @@ def test_a_missing_period_is_a_fault_of_a_recorded_archive_alone():
         ArchiveHeader.of({**entries, "period": "soon"})
 
 
-def test_the_command_line_says_it_in_a_sentence(written, tmp_path):
-    path = stranger(written, tmp_path / NAME, metadata={"joint_names": DEEP})
+def test_the_command_line_says_it_in_a_sentence(written, path):
+    path = forged(written, path, metadata={"joint_names": DEEP})
     for command, status in (("info", 2), ("check", 5), ("repair", 1)):
         result = CliRunner().invoke(app, ["archive", command, str(path)])
         assert result.exit_code == status, command
@@ -178,10 +153,10 @@ def test_the_command_line_says_it_in_a_sentence(written, tmp_path):
 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "\N{SUPERSCRIPT TWO}", "-1", "1e3", ""])
-def test_what_is_written_for_a_number_stops_no_reader(number, written, tmp_path):
-    path = stranger(
+def test_what_is_written_for_a_number_stops_no_reader(number, written, path):
+    path = forged(
         written,
-        tmp_path / NAME,
+        path,
         metadata=dict.fromkeys(("index", "attempt"), number),
         outcome=dict.fromkeys(("first_cycle", "last_cycle", "late_answers"), number),
     )
@@ -191,14 +166,14 @@ def test_what_is_written_for_a_number_stops_no_reader(number, written, tmp_path)
 
 
 @pytest.mark.parametrize("count", ["samples", "events", "lost_packets"])
-def test_a_count_that_is_no_number_is_a_fault(count, written, tmp_path):
-    path = stranger(written, tmp_path / NAME, outcome={count: "many"})
+def test_a_count_that_is_no_number_is_a_fault(count, written, path):
+    path = forged(written, path, outcome={count: "many"})
     assert "outcome" in check_archive(path).faults
 
 
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
 def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
-    path = stranger(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
+    path = forged(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
     with pytest.raises(ArchiveError, match=f"{name}: is no text in UTF-8"):
         cell_of(open_archive(path))
     result = CliRunner().invoke(app, ["identify", str(path), "--in-sample", "-o", str(tmp_path)])
@@ -207,18 +182,17 @@ def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
         gather_sources([path], 0.3, in_sample=True)
 
 
-def test_joints_that_the_cycles_do_not_have_are_damage(written, tmp_path):
-    path = stranger(written, tmp_path / NAME, metadata={"joint_names": '["a", "b", "c"]'})
+def test_joints_that_the_cycles_do_not_have_are_damage(written, path):
+    path = forged(written, path, metadata={"joint_names": '["a", "b", "c"]'})
     assert "not that of 3 joints" in str(open_archive(path).damage)
     assert "holds no sample" in outcomes(path)["open_recording"]
     assert not check_archive(path).keeps
 
 
-def test_a_second_description_is_not_believed(written, tmp_path):
+def test_a_second_description_is_not_believed(written, path):
     entries = {"kind": "move", "joint_names": '["x"]', "attachments": "[]", "format_version": "1"}
     second = mcap_bytes.metadata("hil", {**entries, "checksum": header.checksum(entries)})
     end = written.records[-1]
-    path = tmp_path / NAME
     path.write_bytes(written.data[: end.offset] + second + written.data[end.offset :])
     archive = open_archive(path)
     assert archive.joint_names == ("a", "b")
@@ -226,10 +200,10 @@ def test_a_second_description_is_not_believed(written, tmp_path):
 
 
 @pytest.mark.parametrize("losses", ["no", "[1]", DEEP])
-def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, tmp_path):
-    path = stranger(
+def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, path):
+    path = forged(
         written,
-        tmp_path / NAME,
+        path,
         outcome={"samples": "9" * 5000, "repaired.losses": losses, "repaired.samples_lost": "٣"},
     )
     done = repair(path)
@@ -242,16 +216,16 @@ def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, tmp_pat
 
 
 class TestEvents:
-    def test_data_nested_without_end_stay_text(self, written, tmp_path):
+    def test_data_nested_without_end_stay_text(self, written, path):
         def nested(plain: bytes) -> bytes:
             return plain.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
 
-        assert open_archive(stranger(written, tmp_path / NAME, chunk=nested)).events[0].data == {}
+        assert open_archive(forged(written, path, chunk=nested)).events[0].data == {}
 
-    def test_texts_do_not_steer_the_terminal(self, written, tmp_path):
-        path = stranger(
+    def test_texts_do_not_steer_the_terminal(self, written, path):
+        path = forged(
             written,
-            tmp_path / NAME,
+            path,
             metadata={"campaign": "\x1b]0;owned\x07\r<b>"},
             chunk=lambda plain: plain.replace(b"text\n", b"\x1b[2J\n"),
         )
@@ -309,9 +283,9 @@ class TestAnnouncements:
         # Where cycles are counted, a gap shows, and what is behind it stands.
         self.assert_first_alone(written, tmp_path, [bytes, second], why, repaired=33)
 
-    def test_announced_again_as_it_was(self, written, tmp_path):
+    def test_announced_again_as_it_was(self, written, path):
         again = channel(CYCLE, schema.CYCLE)
-        path = stranger(written, tmp_path / NAME, chunk=lambda chunk: again + chunk)
+        path = forged(written, path, chunk=lambda chunk: again + chunk)
         assert check_archive(path).keeps
 
     def test_cycles_that_begin_behind_other_samples(self, written, tmp_path):
@@ -323,7 +297,7 @@ class TestAnnouncements:
         written, folder: Path, changes: list[Callable[[bytes], bytes]], why: str, *, repaired: int
     ) -> None:
         """Nothing behind the first chunk counts, and no column is longer than another."""
-        path = stranger(written, folder / NAME, chunk=in_turn(*changes))
+        path = forged(written, folder / NAME, chunk=in_turn(*changes))
         archive = open_archive(path)
         assert why in str(archive.damage)
         assert {len(column) for column in archive.columns.values()} == {10}
@@ -355,8 +329,7 @@ def imported(tmp_path) -> Imported:
         file.add(sample_messages(["a", "b"], stamps, {"position": values}, -values))
         file.flush()
     file.finish({"outcome": "completed", "reason": "", "samples": "60", "events": "0"})
-    with path.open("rb") as stream:
-        return Imported([*container.records(stream, path.stat().st_size)])
+    return Imported(records_of(path))
 
 
 class Imported(NamedTuple):
@@ -367,20 +340,20 @@ class TestImported:
     """Two channels make the samples: each at the time of the other, or not at all."""
 
     def test_as_it_was(self, imported, tmp_path):
-        path = stranger(imported, tmp_path / IMPORTED)
+        path = forged(imported, tmp_path / IMPORTED)
         assert check_archive(path).keeps
         assert open_archive(path).n_samples == 60
 
     def test_currents_of_other_times_than_the_positions(self, imported, tmp_path):
         change = in_turn(bytes, self.later_currents)
-        path = stranger(imported, tmp_path / IMPORTED, chunk=change)
+        path = forged(imported, tmp_path / IMPORTED, chunk=change)
         assert "channels of different times" in str(open_archive(path).damage)
         self.assert_equally_long(path, 20)
 
     def test_cycles_that_are_announced_and_never_come(self, imported, tmp_path):
         change = in_turn(bytes, lambda chunk: channel(ELSEWHERE, schema.CYCLE) + chunk)
         outcome = {"samples": "20"}
-        path = stranger(imported, tmp_path / IMPORTED, chunk=change, outcome=outcome)
+        path = forged(imported, tmp_path / IMPORTED, chunk=change, outcome=outcome)
         assert "other channels than those before" in str(open_archive(path).damage)
         self.assert_equally_long(path, 20)
 
@@ -411,13 +384,9 @@ class TestNames:
         folder.mkdir()
         name = "../../etc/evil.toml"
         listed = json.dumps([*sorted(written.attachments), name])
-        path = stranger(written, folder / NAME, metadata={"attachments": listed})
-        data, end = path.read_bytes(), 0
-        with path.open("rb") as stream:
-            for record in container.records(stream, len(data)):
-                end = record.offset
-        record = mcap_bytes.attachment(name, b"x")
-        path.write_bytes(data[:end] + record + data[end:])
+        path = forged(written, folder / NAME, metadata={"attachments": listed})
+        data, end = path.read_bytes(), records_of(path)[-1].offset
+        path.write_bytes(data[:end] + mcap_bytes.attachment(name, b"x") + data[end:])
         assert open_archive(path).attachments[name] == b"x"
         assert repair(path).samples == 43
         assert "evil.toml" in CliRunner().invoke(app, ["archive", "info", str(path)]).output
@@ -429,50 +398,38 @@ class TestNames:
 class TestSizes:
     """Claims of gigabytes in a file of a few thousand bytes."""
 
-    def test_a_chunk_that_claims_four_gigabytes(self, written, tmp_path):
-        chunk = written.chunks[0]
+    def test_a_chunk_that_claims_four_gigabytes(self, written, path):
         data = bytearray(written.data)
-        struct.pack_into("<Q", data, chunk.offset + container.RECORD.size + 16, 4 << 30)
-        path = tmp_path / NAME
+        struct.pack_into("<Q", data, written.chunks[0].offset + container.RECORD.size + 16, 4 << 30)
         path.write_bytes(data)
         self.assert_small(path, "claims 4294967296 bytes")
 
-    def test_a_chunk_of_zeros_that_is_as_large_as_it_says(self, written, tmp_path):
-        plain = bytes(1 << 26)
-        bomb = mcap_bytes.chunk(plain, level=19)
+    def test_a_chunk_of_zeros_that_is_as_large_as_it_says(self, written, path):
+        bomb = mcap_bytes.chunk(bytes(1 << 26), level=19)
         assert len(bomb) < 10_000
-        at = written.chunks[0].offset
-        path = tmp_path / NAME
-        path.write_bytes(written.data[:at] + bomb * 50 + written.data[at:])
-        del plain
+        path.write_bytes(self.before_the_chunks(written, bomb * 50))
         self.assert_small(path, "claims 67108864 bytes")
 
     @pytest.mark.parametrize(
         ("stated", "reason"), [(True, "another length than it claims"), (False, "decompressed")]
     )
-    def test_a_frame_that_is_larger_than_its_chunk_says(self, stated, reason, written, tmp_path):
+    def test_a_frame_that_is_larger_than_its_chunk_says(self, stated, reason, written, path):
         """Whether the frame states its own size or not, it is not decompressed, or not far."""
         frame = zstandard.ZstdCompressor(write_content_size=stated).compress(bytes(1 << 27))
         head = struct.pack("<QQQI", 0, 0, 1000, 0) + mcap_bytes.text("zstd")
         bomb = mcap_bytes.record(container.CHUNK, head + struct.pack("<Q", len(frame)) + frame)
-        at = written.chunks[0].offset
-        path = tmp_path / NAME
-        path.write_bytes(written.data[:at] + bomb + written.data[at:])
+        path.write_bytes(self.before_the_chunks(written, bomb))
         self.assert_small(path, reason)
 
-    def test_a_record_as_long_as_a_sparse_file(self, written, tmp_path):
+    def test_a_record_as_long_as_a_sparse_file(self, written, path):
         at = written.chunks[0].offset
-        path = tmp_path / NAME
         path.write_bytes(written.data[:at] + container.RECORD.pack(container.CHUNK, 1 << 40))
-        with path.open("r+b") as stream:
-            stream.truncate((1 << 40) + at + container.RECORD.size)
+        os.truncate(path, (1 << 40) + at + container.RECORD.size)
         self.assert_small(path, "claims 1099511627776 bytes")
 
-    def test_a_tail_as_long_as_a_sparse_file(self, written, tmp_path):
-        path = tmp_path / NAME
+    def test_a_tail_as_long_as_a_sparse_file(self, written, path):
         path.write_bytes(written.data)
-        with path.open("r+b") as stream:
-            stream.truncate(1 << 26)
+        os.truncate(path, 1 << 26)
         assert open_archive(path).n_samples == 43
         assert not open_archive(path).complete
 
@@ -516,6 +473,11 @@ class TestSizes:
         crc = struct.pack("<I", zlib.crc32(summary))
         path.write_bytes(data[:start] + summary + crc + container.MAGIC)
         return path
+
+    @staticmethod
+    def before_the_chunks(written, record: bytes) -> bytes:
+        at = written.chunks[0].offset
+        return written.data[:at] + record + written.data[at:]
 
     @staticmethod
     def assert_small(path: Path, reason: str) -> None:
