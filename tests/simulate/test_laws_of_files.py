@@ -18,7 +18,7 @@ from hil import Campaign
 from hil.campaign.errors import MotionFailedError
 from hil.campaign.status import CampaignStatus
 from hil.errors import ControllerFault
-from tests.disk.harm import chunks
+from tests.hil.mcap_bytes import chunks
 from tests.simulate.altered import found, played, with_life
 from tests.simulate.laws.archived import read
 from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
