@@ -18,8 +18,11 @@ from hil.files import make_folder, write_together
 from hil.identify import Identification
 from hil.identify.exports import provenance_of
 from hil.identify.surroundings import torque_limits
-from identification.estimators.consistent import ConsistentEstimate
-from identification.estimators.ensemble import Ensemble, sample_ensemble
+from identification.estimators.consistent import (
+    ConsistentEstimate,
+    Ensemble,
+    sample_ensemble,
+)
 from identification.export.simulators import (
     FORMATS,
     STATES,

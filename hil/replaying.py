@@ -16,7 +16,7 @@ from hil.identify.surroundings import nominal_of
 from hil.plots.style import RULE, bare, page
 from hil.progress import Reporter
 from hil.report import ReportSeries
-from identification.estimators.ensemble import sample_ensemble
+from identification.estimators.consistent import sample_ensemble
 from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 
 Array = NDArray[np.float64]

@@ -2,11 +2,7 @@
 
 # ruff: noqa: F401
 from identification.errors import IdentificationError, ModelError, ShapeError
-from identification.estimators.consistent import (
-    Consistency,
-    ConsistentEstimate,
-    consistent_estimate,
-)
+from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.delay import (
     DelayEstimate,

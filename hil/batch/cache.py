@@ -38,7 +38,7 @@ from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.io import digest, json_digest
 from hil.reading import opened
-from identification.estimators.shrinkage import Shrinkage
+from identification.estimators.consistent import Shrinkage
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
 from identification.selection.inner_prediction import Choice

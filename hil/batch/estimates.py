@@ -15,11 +15,15 @@ from hil.cell import Cell
 from hil.identify.estimating import cad_prior, fit_of, required
 from hil.identify.settings import Settings
 from identification import IdentificationError
-from identification.estimators.consistent import SolverError
+from identification.estimators.consistent import (
+    Shrinkage,
+    SolverError,
+    consistent_estimate,
+    fit_shrunk,
+)
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.least_squares import Weighting, no_narrower
 from identification.estimators.prior import with_prior
-from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
 from identification.factor.factor import (
     QR_CONDITION,
     Estimate,
@@ -80,9 +84,12 @@ class Estimator:
             return None
         weight = self._shrinkage.prior_weight
         try:
-            return consistent_centre(self.model, total, self.weights(total), weight).estimate.values
+            found = consistent_estimate(
+                self.model, total, weights=self.weights(total), prior_weight=weight
+            )
         except SolverError:
             return None  # least squares, as `hil identify` does it
+        return found.estimate.values
 
     def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
         """The estimate from one archive alone, shrunk towards the centre of all.

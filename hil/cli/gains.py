@@ -15,7 +15,6 @@ from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
 from hil.progress import reporter as make_reporter
-from identification.estimators.gains import GainMethod
 from identification.model.payload import Payload
 
 
@@ -26,7 +25,6 @@ def gains(
     centre: str = "0,0,0",
     inertia: str = "0,0,0,0,0,0",
     frame: str | None = None,
-    method: GainMethod = "weighted",
     delay: float | None = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -45,7 +43,6 @@ def gains(
         inertia: Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of the
             frame.
         frame: Link of the URDF whose frame that is; the last joint's if left out.
-        method: weighted or total (least squares with errors in the currents).
         delay: Time in s by which currents lag positions; the cell's if left out.
     """
     if delay is not None and not abs(delay) <= LONGEST_DELAY:
@@ -60,7 +57,6 @@ def gains(
         archives,
         dict.fromkeys(loaded or [], payload) if payload is not None else {},
         make_reporter(quiet=quiet or json),
-        method=method,
         delay=delay,
     )
     typer.echo(json_module.dumps(_as_json(found), indent=1) if json else _as_toml(found))
@@ -107,9 +103,9 @@ def _numbers(text: str, count: int, field: str) -> list[float]:
 
 
 def _as_toml(found: GainsFound) -> str:
-    gains, side = found.gains, "motor side" if found.motor_side else "joint side, gears included"
+    side = "motor side" if found.motor_side else "joint side, gears included"
     lines = [
-        f"# N·m/A ({side}), 95 % intervals, {gains.method} least squares",
+        f"# N·m/A ({side}), 95 % intervals, weighted least squares",
         "torque_constant = [",
     ]
     # What is not determined has its place in the list; a cell or map refuses it by name.
@@ -145,6 +141,5 @@ def _as_json(found: GainsFound) -> dict[str, object]:
         "motors": _motors(found),
         "unit": "N·m/A",
         "side": "motor" if found.motor_side else "joint",
-        "method": found.gains.method,
         "payload_kg": loads,
     }

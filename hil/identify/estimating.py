@@ -15,7 +15,12 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification import IdentificationError, RobotModel
-from identification.estimators.consistent import SolverError, consistent_estimate
+from identification.estimators.consistent import (
+    Shrinkage,
+    SolverError,
+    consistent_estimate,
+    fit_shrunk,
+)
 from identification.estimators.delay import rate_products, with_uncertain_delay
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
@@ -37,8 +42,7 @@ from identification.estimators.prior import (
     nominal_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.estimators.shrinkage import Shrinkage, consistent_centre, fit_shrunk
-from identification.factor.factor import QR_CONDITION, Estimate, joint_weights, nothing_usable
+from identification.factor.factor import QR_CONDITION, Estimate, nothing_usable
 from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
@@ -248,9 +252,8 @@ def _by_factor(
     centre, warnings, free = None, list[str](), name == "consistent"
     if name == "auto" and shrinkage.strength > 0.0:
         total = total_phase(model, fitted).total
-        weight = shrinkage.prior_weight
         try:
-            found = consistent_centre(model, total, joint_weights(total), weight)
+            found = consistent_estimate(model, total, prior_weight=shrinkage.prior_weight)
             centre, free = found.estimate.values, math.isinf(shrinkage.strength)
         except SolverError as error:
             warnings = [f"least squares is reported, for {error}"]

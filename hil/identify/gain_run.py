@@ -13,7 +13,7 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from identification.estimators.gains import GainMethod, Gains, identify_gains
+from identification.estimators.gains import Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
@@ -49,7 +49,6 @@ def find_gains(
     loaded: Mapping[Path, Payload],
     reporter: Reporter,
     *,
-    method: GainMethod = "weighted",
     delay: float | None = None,
 ) -> GainsFound:
     """Identify the gain of every motor.
@@ -60,7 +59,6 @@ def find_gains(
         archives: recordings as their cells say.
         loaded: further recordings, each with what the robot carried.
         reporter: receives the progress.
-        method: see :mod:`identification.estimators.gains`.
         delay: time by which currents lag positions [s]; None takes it from the cell.
 
     Raises:
@@ -100,7 +98,7 @@ def find_gains(
             task.advance(1, path.name)
     assert first is not None
     cell, model, turns = first
-    gains = identify_gains(joined(factors), model.joint_names, method=method)
+    gains = identify_gains(joined(factors), model.joint_names)
     return GainsFound(gains, cell, loads, not np.array_equal(turns, np.eye(len(turns))))
 
 

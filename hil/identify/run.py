@@ -19,7 +19,6 @@ from hil.reading import lies_there
 from hil.report import ReportSeries
 from hil.results import Results
 from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.consistent import Consistency
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
@@ -99,7 +98,6 @@ def consistency_of(
     model: RobotModel,
     training: PhaseFactor,
     held_out: Factor,
-    options: Consistency = Consistency(),  # noqa: B008 - frozen
 ) -> ConsistencyCheck | str:
     """Weighted least squares with the inequalities of a machine and without.
 
@@ -109,7 +107,7 @@ def consistency_of(
     try:
         weights = joint_weights(total)
         free = with_block_covariance(estimate(model, total, weights), training, weights)
-        return check_consistency(model, total, held_out, free, weights=weights, options=options)
+        return check_consistency(model, total, held_out, free, weights=weights)
     except IdentificationError as error:
         return str(error)
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from identification.estimators.consistent import Shrinkage
 from identification.estimators.delay import compensate
-from identification.estimators.shrinkage import Shrinkage
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare

@@ -38,8 +38,8 @@ from hil.results import (
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel
+from identification.estimators.consistent import Shrinkage, fitted_values
 from identification.estimators.least_squares import RepeatedEstimate
-from identification.estimators.shrinkage import Shrinkage, fitted_values
 from identification.excitation import (
     Criteria,
     Excitation,

@@ -1,7 +1,7 @@
-r"""The physically consistent estimate: full standard parameters that some machine can have.
+r"""Physically consistent estimates: standard parameters that some machine can have.
 
-Over the standard parameters :math:`\pi_s` and the friction f, one semidefinite program on the
-torque objective itself (never a projection of an estimate, link by link):
+Over the standard parameters :math:`\pi_s` and the friction f, one convex program on the torque
+objective itself (never a projection of an estimate, link by link):
 
 .. math:: \min\; \|R\,[G\pi_s;\, f] - z\|^2
           + w \left( \sum_i D(J_i \,\|\, J_i^0) + \ldots \right)
@@ -13,34 +13,45 @@ nominal (CAD) bodies (Lee, Wensing and Park 2020), the dots are squares of rotor
 nominal, where there is one) and friction in units that make them small. The data alone leave many
 standard parameters open; there the nominal decides, elsewhere it weighs as much as `prior_weight`
 rows of data: next to nothing. D is infinite at the edge of what is possible, so the result is
-strictly inside.
+strictly inside, and Newton's method finds it.
 
 Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
 diagonal, has to be positive definite in place of I_im >= 0. What friction needs to take energy says
 :mod:`identification.model.friction`: signs of the third friction term and of the offset are left
 open.
+
+:class:`Shrinkage` draws least squares towards this solution :math:`\pi_c`:
+
+.. math:: \hat\pi = \pi_c + (A + \lambda D)^{-1}\,(b - A\,\pi_c), \qquad D = \mathrm{diag}(A)
+
+the mean of a Gaussian posterior whose prior has the information :math:`\lambda` of each column's
+own. What the motion determines well follows the data, even where no rigid machine would (gains a
+few per cent apart); what it hardly determines follows the machine.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
+from identification.estimators.covariance import block_covariance
 from identification.factor.factor import (
-    WORST_CONDITION,
     Estimate,
     Factor,
     NormalEquations,
+    estimate,
     joint_weights,
+    rows_of,
+    solve,
+    undetermined_names,
 )
+from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.friction import dissipation
 from identification.model.pseudo_inertia import (
     ReferenceBodies,
@@ -50,6 +61,7 @@ from identification.model.pseudo_inertia import (
 )
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 
@@ -58,7 +70,7 @@ _HALVINGS: Final = 40
 # Of all weights on the way together. Data that machines fit need some hundred; those that none fits
 # have ended after 1400 steps, or in none of 40 000.
 _PATH_STEPS: Final = 3000
-# Of a variable whose reference is one: on the bound, for a solver with a tolerance of 1e-8.
+# Of a variable whose reference is one: on the bound.
 _ON_BOUND: Final = 1e-6
 _CONVERGED: Final = 1e-13
 # How far above the minimum, as a share of the prior's weight and of the objective.
@@ -66,6 +78,7 @@ _SMALL: Final = 1e-6
 # Ratio of Cholesky pivots at which a matrix counts as singular: its inverse would be rounding.
 _SINGULAR: Final = 1e-7
 _ROUNDING: Final = 1e-12
+_VANISHING: Final = 1e-30
 _ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
 _WEIGHT_STEP: Final = 10.0
 _SAME_WEIGHT: Final = 1e-9
@@ -75,22 +88,18 @@ _N_LINK: Final = len(LINK_SYMBOLS)
 # deviation by less than half a per cent of that.
 _ROTOR_BARRIER: Final = 1e-2
 # Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
-# more than the solver's error, so that the result can be relied on to be inside.
+# more than rounding, so that the result can be relied on to be inside.
 _INSIDE: Final = 1e-6
 # Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
 # a pseudo-inertia at the edge is singular to rounding then.
 _MOST_ROWS: Final = 100_000
-# A solution outside by more than this is no solution.
-_TOLERANCE: Final = 1e-4
-# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
-# so near the conic solver is quicker; and the change of that weight at which they end.
-_NEAR_STEPS: Final = 10
-_NEAR_NEWTON: Final = 20
+# From a near solution: steps in all, and the change of the prior's weight at which they end.
+_NEAR_STEPS: Final = 200
 _NEAR_WEIGHT: Final = 0.01
 
 
 class SolverError(IdentificationError):
-    """The semidefinite program has no usable solution."""
+    """No physically consistent parameters were found."""
 
 
 class Cone(NamedTuple):
@@ -109,14 +118,14 @@ class Cone(NamedTuple):
     pull: float = 1.0
     barrier: float = 1.0
 
-    def matrices(self, u: Array) -> Array:
-        """Return the S_i (b, k, k)."""
-        return np.asarray(np.tensordot(u[self.places], self.entries, axes=1))
-
     @property
     def unit(self) -> Array:
         """Variables of the unit matrix (d,)."""
         return np.asarray(np.einsum("kaa->k", self.entries))
+
+    def matrices(self, u: Array) -> Array:
+        """Return the S_i (b, k, k)."""
+        return np.asarray(np.tensordot(u[self.places], self.entries, axes=1))
 
     def value(self, u: Array) -> float:
         """Return ``sum_i pull tr S_i - barrier log det S_i``, infinite outside."""
@@ -159,12 +168,16 @@ class Smooth(NamedTuple):
     centre: Array
     not_negative: NDArray[np.intp]
 
+    def excess(self, u: Array) -> float:
+        """Weighted squared error above that of least squares."""
+        error = self.R @ u - self.z
+        return float(error @ error)
+
     def value(self, u: Array) -> float:
         """Return the objective, infinite outside."""
         prior = sum(cone.value(u) for cone in self.cones)
         rest = u[len(u) - len(self.centre) :] - self.centre
-        error = self.R @ u - self.z
-        return float(error @ error + self.weight * (prior + rest @ rest))
+        return self.excess(u) + float(self.weight * (prior + rest @ rest))
 
     def derivatives(self, u: Array) -> tuple[Array, Array]:
         """Return gradient (v,) and Hessian (v, v)."""
@@ -172,9 +185,8 @@ class Smooth(NamedTuple):
         hessian = 2.0 * self.R.T @ self.R
         for cone in self.cones:
             cone.add_derivatives(u, self.weight, gradient, hessian)
-        first = len(u) - len(self.centre)
-        gradient[first:] += 2.0 * self.weight * (u[first:] - self.centre)
-        rest = np.arange(first, len(u))
+        rest = np.arange(len(u) - len(self.centre), len(u))
+        gradient[rest] += 2.0 * self.weight * (u[rest] - self.centre)
         hessian[rest, rest] += 2.0 * self.weight
         return gradient, hessian
 
@@ -190,7 +202,7 @@ class Minimum(NamedTuple):
 
     u: Array
     converged: bool
-    steps: int = 0
+    steps: int = 1
 
 
 def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
@@ -200,63 +212,40 @@ def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
     u[bounded] = np.maximum(u[bounded], 0.0)
     if not np.isfinite(problem.value(u)):
         return Minimum(start, converged=False)
-    decrement, steps = np.inf, 0
-    while steps < most_steps:
+    decrement, steps, change = np.inf, 0, np.inf
+    while steps < most_steps and change >= _CONVERGED:
         steps += 1
-        gradient, hessian = problem.derivatives(u)
-        held = bounded[(u[bounded] <= _ON_BOUND) & (gradient[bounded] > 0.0)]
-        u[held] = 0.0
-        step = _newton_step(gradient, hessian, held)
-        # One that is on its bound, and would leave it by itself but not with the others, stays.
-        while len(
-            pushed := np.setdiff1d(bounded[(u[bounded] <= 0.0) & (step[bounded] < 0.0)], held)
-        ):
-            held = np.union1d(held, pushed)
+        try:
+            gradient, hessian = problem.derivatives(u)
+            held = bounded[(u[bounded] <= _ON_BOUND) & (gradient[bounded] > 0.0)]
+            u[held] = 0.0
             step = _newton_step(gradient, hessian, held)
+            # One on its bound that would leave it by itself, but not with the others, stays.
+            while len(
+                pushed := np.setdiff1d(bounded[(u[bounded] <= 0.0) & (step[bounded] < 0.0)], held)
+            ):
+                held = np.union1d(held, pushed)
+                step = _newton_step(gradient, hessian, held)
+        except np.linalg.LinAlgError:  # at the edge of what is possible
+            break
         decrement = -float(gradient @ step)
         moved = _descend(problem, u, step, decrement)
         if moved is None:
             break
         change = np.abs(moved - u).max() / max(1.0, float(np.abs(u).max()))
         u = moved
-        if change < _CONVERGED:
-            break
     allowed = _SMALL * problem.weight + _ROUNDING * abs(problem.value(u))
     return Minimum(u, converged=abs(decrement) <= allowed, steps=steps)
-
-
-def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float]) -> Minimum:
-    """Return the minimum from far away: the weight of the prior falls in steps (a barrier method).
-
-    With much weight the minimum is near the reference; each of the following is near the one
-    before. The weight to end with may depend on where that is.
-
-    Args:
-        problem: its own weight does not matter.
-        start: inside (v,), as the reference is.
-        weight: the weight to end with, from u.
-    """
-    error = problem.R @ start - problem.z
-    now = max(float(error @ error), weight(start))
-    found, steps = Minimum(start, converged=False), 0
-    while steps < _PATH_STEPS:
-        found = polish(problem._replace(weight=now), found.u)
-        steps += max(found.steps, 1)
-        last = weight(found.u)
-        if found.converged and abs(last - now) <= _SAME_WEIGHT * now:
-            return found
-        now = max(last, now / _WEIGHT_STEP)
-    return found._replace(converged=False)
 
 
 def _newton_step(gradient: Array, hessian: Array, held: NDArray[np.intp]) -> Array:
     """Return the step to the minimum of the quadratic model, variables in `held` at rest."""
     free = np.setdiff1d(np.arange(len(gradient)), held)
-    scale = 1.0 / np.sqrt(np.diag(hessian)[free])
-    curvature = hessian[np.ix_(free, free)] * np.outer(scale, scale)
+    diagonal = np.diag(hessian)[free]
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, _VANISHING * diagonal.max()))
     step = np.zeros(len(gradient))
-    with suppress(np.linalg.LinAlgError):
-        step[free] = scale * np.linalg.solve(curvature, -scale * gradient[free])
+    curvature = hessian[np.ix_(free, free)] * np.outer(scale, scale)
+    step[free] = scale * np.linalg.solve(curvature, -scale * gradient[free])
     return step
 
 
@@ -272,61 +261,53 @@ def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array 
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class Consistency:
-    """What a consistent estimate is drawn to where the data leave it open.
+def follow_path(
+    problem: Smooth,
+    start: Array,
+    weight: Callable[[Array], float],
+    first: float,
+    most_steps: int = _PATH_STEPS,
+    same: float = _SAME_WEIGHT,
+) -> Minimum:
+    """Return the minimum from far away: the weight of the prior falls in steps (a barrier method).
 
-    Attributes:
-        prior_weight: how many rows of data (each at its noise) the nominal parameters count for.
-        nominal: standard parameters to stay close to, shape (s,), those of the model without it.
-            Rotor inertias count; a URDF has none, so the model's are zero.
+    With much weight the minimum is near the reference; each of the following is near the one
+    before. The weight to end with may depend on where that is.
+
+    Args:
+        problem: its own weight does not matter.
+        start: inside (v,), as the reference is.
+        weight: the weight to end with, from u.
+        first: the weight to begin with.
+        most_steps: of Newton's method, in all.
+        same: relative change of the weight at which it is the one to end with.
     """
-
-    prior_weight: float = 1.0
-    nominal: Array | None = None
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.prior_weight) and self.prior_weight > 0.0):
-            raise IdentificationError(
-                f"the prior weight is {self.prior_weight!r}; it must be finite and positive, for"
-                " the data alone leave standard parameters open"
-            )
-
-    def of(self, model: RobotModel) -> Array:
-        """The nominal standard parameters (s,) for a model."""
-        return model.nominal if self.nominal is None else model.layout.checked(self.nominal)
+    found, steps, now = Minimum(start, converged=False), 0, first
+    while steps < most_steps:
+        found = polish(problem._replace(weight=now), found.u, min(_STEPS, most_steps))
+        steps += found.steps
+        last = weight(found.u)
+        if found.converged and abs(last - now) <= same * now:
+            return found
+        now = max(last, now / _WEIGHT_STEP)
+    return found._replace(converged=False)
 
 
-class SquareRoot(NamedTuple):
-    """``||R x - z||²`` is the weighted squared error above its minimum.
-
-    Attributes:
-        R: (r, p), one row per direction that the data determine.
-        z: (r,).
-    """
-
-    R: Array
-    z: Array
-
-    def excess(self, values: Array) -> float:
-        """Weighted squared error of parameters (p,) above the minimum."""
-        return float(np.sum((self.R @ values - self.z) ** 2))
+def _symmetric_basis() -> Array:
+    """Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4)."""
+    rows, columns = np.triu_indices(4)
+    basis = np.zeros((_N_LINK, 4, 4))
+    basis[np.arange(_N_LINK), rows, columns] = 1.0
+    basis[np.arange(_N_LINK), columns, rows] = 1.0
+    return basis
 
 
-def square_root(equations: NormalEquations) -> SquareRoot:
-    """Take the square root of normal equations, without directions they do not determine."""
-    length = np.sqrt(np.diag(equations.A))
-    scale = np.where(length > 0.0, length, 1.0)
-    eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    significant = eigenvalues > eigenvalues[-1] / WORST_CONDITION**2
-    basis, root = vectors[:, significant].T, np.sqrt(eigenvalues[significant])
-    # Times the length itself: a column without data stays exactly zero, without rounding.
-    return SquareRoot(R=root[:, None] * basis * length, z=basis @ (equations.b / scale) / root)
+_SYMMETRIC: Final = _symmetric_basis()
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """The semidefinite program in variables u for which the reference is of size one.
+    """The program in variables u for which the reference is of size one.
 
     Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit
     matrix; then rotors and coupling inertias; then friction, springs and balancers.
@@ -344,16 +325,11 @@ class Program:
     smooth: Smooth
 
     @classmethod
-    def of(cls, model: RobotModel, root: SquareRoot, options: Consistency) -> Program:
-        """Set up the program for weighted normal equations.
-
-        Raises:
-            ShapeError: nominal parameters do not fit the model.
-        """
-        nominal = options.of(model)
-        bodies = reference_bodies(nominal[model.layout.links], model.chain.translation)
+    def of(cls, model: RobotModel, rows: Array, target: Array, prior_weight: float) -> Program:
+        """Set up the program for rows (r, p) of least squares and their target (r,)."""
         n, b = model.n_joints, model.base.rank
-        layout, losses = model.layout, dissipation(model.friction)
+        layout, losses, nominal = model.layout, dissipation(model.friction), model.nominal
+        bodies = reference_bodies(nominal[layout.links], model.chain.translation)
         others = np.concatenate([layout.rotors, layout.couplings])
         s, k = layout.size, model.n_parameters - b
         v = s + k
@@ -362,156 +338,92 @@ class Program:
             entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
             span = slice(_N_LINK * link, _N_LINK * (link + 1))
             to_standard[places, span] = inertial_from_pseudo(entries).T
-        rotors = np.arange(_N_LINK * n, s)
-        unit = _rotor_units(model, root, nominal)
+
+        def units(directions: Array) -> Array:
+            """Multiples of directions (p or b, k) that would make all the torque there is.
+
+            In such units the parameters are far below one: a prior on their squares says little.
+            """
+            columns = np.linalg.norm(rows[:, : len(directions)] @ directions, axis=0)
+            whole = float(np.linalg.norm(target))
+            usable = (columns > 0.0) & (whole > 0.0)
+            return np.where(usable, whole / np.where(usable, columns, 1.0), 1.0)
+
+        # A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed. A
+        # coupling's unit is the mean of its joints', so that the rotors' matrix is only scaled.
+        known = nominal[layout.rotors]
+        own = np.where(known > 0.0, known, units(model.base.grouping[:, layout.rotors]))
+        unit = np.concatenate([own, [np.sqrt(own[i] * own[j]) for i, j in layout.pairs]])
+        rotors, rest = np.arange(_N_LINK * n, s), np.arange(s, v)
         to_standard[others, rotors] = unit
-        rest = np.arange(s, v)
         combine = np.eye(k)  # springs and balancers are free
         combine[: len(losses.combine), : len(losses.combine)] = losses.combine
-        directions = np.vstack([np.zeros((b, k)), combine])
-        to_others[:, rest] = combine * _whole_torque_units(root, directions)
-        mapping = np.vstack([model.base.grouping @ to_standard, to_others])
-        coupled = _coupled_rotors(model, _N_LINK * n)
+        to_others[:, rest] = combine * units(np.vstack([np.zeros((b, k)), combine]))
+        cones = [Cone(np.arange(_N_LINK * n).reshape(n, _N_LINK), _SYMMETRIC)]
         alone = rotors[: len(layout.rotors)]
-        if coupled is not None:
-            alone = np.setdiff1d(alone, coupled.places)
-        links = Cone(np.arange(_N_LINK * n).reshape(n, _N_LINK), _SYMMETRIC)
+        if layout.pairs:
+            cones.append(_coupled_rotors(model, _N_LINK * n))
+            alone = np.setdiff1d(alone, cones[1].places)
         positive = rest[: len(losses.combine)][losses.not_negative]
         smooth = Smooth(
-            R=root.R @ mapping,
-            z=root.z,
-            weight=options.prior_weight,
-            cones=(links,) if coupled is None else (links, coupled),
+            R=rows @ np.vstack([model.base.grouping @ to_standard, to_others]),
+            z=target,
+            weight=prior_weight,
+            cones=tuple(cones),
             centre=np.concatenate([nominal[others] / unit, np.zeros(k)]),
             not_negative=np.concatenate([alone, positive]),
         )
         return cls(bodies, to_standard, to_others, smooth)
 
     def physical(self, u: Array) -> tuple[Array, Array]:
-        """Return standard parameters (s,) and those of friction, springs and balancers (k,).
-
-        A solver holds inequalities to its tolerance. What is left beyond them is moved back.
-        """
-        u, (links, *coupled) = u.copy(), self.smooth.cones
-        u[self.smooth.not_negative] = np.maximum(u[self.smooth.not_negative], 0.0)
+        """Return standard parameters (s,) and those of friction, springs and balancers (k,)."""
+        u, links = u.copy(), self.smooth.cones[0]
         smallest = np.linalg.eigvalsh(links.matrices(u))[:, :1]
-        lift = np.where(smallest > -_TOLERANCE, np.maximum(_INSIDE - smallest, 0.0), 0.0)
-        u[links.places] += lift * links.unit
-        for cone in coupled:
-            below = -np.linalg.eigvalsh(cone.matrices(u))[:, :1]
-            lift = np.where(below < _TOLERANCE, np.maximum(below, 0.0), 0.0)
-            u[cone.places] += lift * cone.unit
+        u[links.places] += np.maximum(_INSIDE - smallest, 0.0) * links.unit
         return self.to_standard @ u, self.to_others @ u
 
+    def solve(self, n_rows: int, near: Array | None = None) -> tuple[Array, str]:
+        """Return the solution u to rounding, and a status in words.
 
-def _symmetric_basis() -> Array:
-    """Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4)."""
-    rows, columns = np.triu_indices(4)
-    basis = np.zeros((_N_LINK, 4, 4))
-    basis[np.arange(_N_LINK), rows, columns] = 1.0
-    basis[np.arange(_N_LINK), columns, rows] = 1.0
-    return basis
+        The prior counts for its weight of rows at their noise. Where no machine fits the data to
+        their noise, the error of the best one is the noise, and the weight grows with it.
 
+        Args:
+            n_rows: rows in the weighted normal equations.
+            near: solution of much the same program (v,): Newton's method starts there, and ends
+                when the prior's weight has settled to a hundredth; good for comparisons.
 
-_SYMMETRIC: Final = _symmetric_basis()
+        Raises:
+            SolverError: Newton's method found no answer.
+        """
+        smooth, rows = self.smooth, min(max(n_rows, 1), _MOST_ROWS)
 
+        def weight(u: Array) -> float:
+            return smooth.weight * max(1.0, smooth.excess(u) / rows)
 
-def solve_program(program: Program, rows: int, near: Array | None = None) -> tuple[Array, str]:
-    """Return the solution u to rounding, and how it was found: a status in words.
-
-    The prior counts for its weight of rows at their noise. Where no machine fits the data to
-    their noise, the error of the best one is the noise, and the weight grows with it.
-
-    Args:
-        program: what to solve.
-        rows: number of rows in the weighted normal equations.
-        near: solution of much the same program (v,): Newton's method starts there, and ends when
-            the prior's weight has settled to a hundredth; quick, and good for comparisons.
-
-    Raises:
-        SolverError: neither the solver nor Newton's method found an answer.
-    """
-    smooth = program.smooth
-
-    def weight(u: Array) -> float:
-        excess = float(np.sum((smooth.R @ u - smooth.z) ** 2)) / min(max(rows, 1), _MOST_ROWS)
-        return smooth.weight * max(1.0, excess)
-
-    if near is not None:
-        found = Minimum(near, converged=True)
-        for _ in range(_NEAR_STEPS):
-            last = weight(found.u)
-            found = polish(smooth._replace(weight=last), found.u, _NEAR_NEWTON)
-            if not found.converged:
-                break
-            if abs(weight(found.u) - last) <= _NEAR_WEIGHT * last:
-                return found.u, "optimal (Newton, from a near solution)"
-    start, status = _solve_cone(smooth)
-    if start is not None:
-        found = polish(smooth, start)
+        if near is not None:
+            found = follow_path(smooth, near, weight, weight(near), _NEAR_STEPS, _NEAR_WEIGHT)
+            if found.converged:
+                return found.u, "near optimal"
+        reference = np.zeros(smooth.R.shape[1])
+        for cone in smooth.cones:
+            reference[cone.places] = cone.unit
+        first = max(smooth.excess(reference), weight(reference))
+        found = follow_path(smooth, reference, lambda _: smooth.weight, first)
         if found.converged and weight(found.u) == smooth.weight:
             return found.u, "optimal"
-    reference = np.zeros(smooth.R.shape[1])
-    for cone in smooth.cones:
-        reference[cone.places] = cone.unit
-    found = follow_path(smooth, reference, weight)
-    if found.converged:
-        return found.u, "optimal (Newton: no machine fits these data to their noise)"
-    raise SolverError(
-        f"no solution was found, the conic solver stopped with: {status}; with a prior weight"
-        f" above {smooth.weight:g} there may be one"
-    )
+        found = follow_path(smooth, reference, weight, first)
+        if found.converged:
+            return found.u, "optimal (no machine fits these data to their noise)"
+        raise SolverError(
+            f"no solution was found in {_PATH_STEPS} steps of Newton's method; with a prior weight"
+            f" above {smooth.weight:g} there may be one"
+        )
 
 
-def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
-    """Return the conic solver's solution u, if it has one, and its word for it."""
-    import cvxpy  # a third of a second to import, and only this estimate needs it
-
-    cp: Any = cvxpy  # its names come from star imports, which a type checker does not follow
-    u = cp.Variable(smooth.R.shape[1])
-    first = len(smooth.centre)
-    prior: Any = cp.sum_squares(u[smooth.R.shape[1] - first :] - smooth.centre)
-    constraints: list[Any] = [u[smooth.not_negative] >= 0.0]
-    for cone in smooth.cones:
-        size = cone.entries.shape[1]
-        for places in cone.places:
-            entries = cone.entries.reshape(-1, size * size).T @ u[places]
-            matrix = cp.reshape(entries, (size, size), order="C")
-            prior = prior - cone.barrier * cp.log_det(matrix)
-            if cone.pull:
-                prior = prior + cone.pull * cp.trace(matrix)
-                constraints.append(matrix >> _INSIDE * np.eye(size))
-    error = cp.sum_squares(smooth.R @ u - smooth.z)
-    problem = cp.Problem(cp.Minimize(error + smooth.weight * prior), constraints)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is named by its status
-        try:
-            problem.solve(solver=cp.CLARABEL)
-        except cp.error.SolverError as failure:
-            return None, f"failed ({failure})"
-    usable = problem.status in ("optimal", "optimal_inaccurate") and u.value is not None
-    return (np.asarray(u.value, dtype=np.float64) if usable else None), str(problem.status)
-
-
-def _rotor_units(model: RobotModel, root: SquareRoot, nominal: Array) -> Array:
-    """Return the unit of each rotor and coupling inertia, in which it is small.
-
-    A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed. A
-    coupling's unit is the mean of its joints', so that the matrix of the rotors is only scaled.
-    """
-    layout = model.layout
-    unknown = _whole_torque_units(root, model.base.grouping[:, layout.rotors])
-    known = nominal[layout.rotors]
-    own = np.where(known > 0.0, known, unknown)
-    between = [np.sqrt(own[i] * own[j]) for i, j in layout.pairs]
-    return np.concatenate([own, between])
-
-
-def _coupled_rotors(model: RobotModel, first: int) -> Cone | None:
+def _coupled_rotors(model: RobotModel, first: int) -> Cone:
     """Return the inertia matrix of the rotors of coupled joints; variables from `first` on."""
     layout = model.layout
-    if not layout.pairs:
-        return None
     joints = sorted({joint for pair in layout.pairs for joint in pair})
     n, c, size = layout.n_joints, len(layout.pairs), len(joints)
     places = np.concatenate([first + np.array(joints), first + n + np.arange(c)])
@@ -521,17 +433,6 @@ def _coupled_rotors(model: RobotModel, first: int) -> Cone | None:
         i, j = (joints.index(joint) for joint in pair)
         entries[size + k, i, j] = entries[size + k, j, i] = 1.0
     return Cone(places[None], entries, pull=0.0, barrier=_ROTOR_BARRIER)
-
-
-def _whole_torque_units(root: SquareRoot, directions: Array) -> Array:
-    """Multiples of `directions` (p or b, k) that would make all the torque there is.
-
-    In such units the parameters are far below one, and a prior on their squares says little.
-    """
-    columns = np.linalg.norm(root.R[:, : len(directions)] @ directions, axis=0)
-    whole = float(np.linalg.norm(root.z))
-    usable = (columns > 0.0) & (whole > 0.0)
-    return np.where(usable, whole / np.where(usable, columns, 1.0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -545,12 +446,12 @@ class ConsistentEstimate:
         estimate: the parameters (p,) that follow from them, with springs and balancers. Its
             covariance is the one of the unconstrained estimate: an inequality that holds has no
             covariance of its own, and one that binds makes the true spread smaller.
-        unconstrained: the estimate without inequalities, as it was given.
+        unconstrained: the estimate without inequalities.
         margin: smallest eigenvalue of each link's pseudo-inertia (n,), SI units, positive.
         relative_error: ||tau - tau_hat|| / ||tau|| over all fitted rows.
         unconstrained_relative_error: the same of the unconstrained estimate.
         reference: per link, what stood for its nominal body, in words (n,).
-        status: "optimal", and how, where the conic solver alone did not get there.
+        status: "optimal", or that no machine fits the data to their noise.
         solution: in the coordinates of the program (v,).
     """
 
@@ -566,11 +467,6 @@ class ConsistentEstimate:
     solution: Array
 
     @property
-    def cost(self) -> float:
-        """What consistency costs on the fitted rows: difference of the relative errors."""
-        return self.relative_error - self.unconstrained_relative_error
-
-    @property
     def shift(self) -> Array:
         """How far each parameter was moved, in its standard deviations (p,); 0 if infinite."""
         moved = self.estimate.values - self.unconstrained.values
@@ -582,10 +478,10 @@ class ConsistentEstimate:
 def consistent_estimate(
     model: RobotModel,
     factor: Factor,
-    unconstrained: Estimate,
+    unconstrained: Estimate | None = None,
     *,
     weights: Array | None = None,
-    options: Consistency = Consistency(),
+    prior_weight: float = 1.0,
     near: Array | None = None,
 ) -> ConsistentEstimate:
     """Fit physically consistent standard parameters and friction to the samples.
@@ -595,30 +491,27 @@ def consistent_estimate(
         factor: the samples.
         unconstrained: the least-squares estimate of the same samples, to compare with.
         weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
-        options: the prior.
-        near: `solution` of much the same samples, see :func:`solve_program`.
+        prior_weight: how many rows of data (each at its noise) the nominal parameters count for.
+        near: `solution` of much the same samples, see :meth:`Program.solve`.
 
     Raises:
-        SolverError: the solver found no usable answer.
-        ShapeError: an array does not have the shape it should have.
+        IdentificationError: there are no rows, or the unconstrained estimate is of other
+            parameters.
+        SolverError: no such parameters were found.
     """
-    if unconstrained.names != model.parameter_names:
-        raise IdentificationError("the unconstrained estimate is of other parameters")
     if weights is None:
         weights = joint_weights(factor)
+    if unconstrained is None:
+        unconstrained = estimate(model, factor, weights)
+    if unconstrained.names != model.parameter_names:
+        raise IdentificationError("the unconstrained estimate is of other parameters")
     equations = factor.weighted(weights)
-    program = Program.of(model, square_root(equations), options)
-    solution, status = solve_program(program, equations.n, near)
+    program = Program.of(model, *rows_of(equations), prior_weight)
+    solution, status = program.solve(equations.n, near)
     standard, others = program.physical(solution)
-    found = margin(standard[model.layout.links])
-    if not np.all(found > 0.0):
-        worst = model.joint_names[int(np.argmin(found))]
-        raise SolverError(
-            f"the solver ({status}) left the link of joint {worst!r} impossible, its pseudo-inertia"
-            f" has the eigenvalue {found.min():.3g}"
-        )
     values = np.concatenate([model.base.grouping @ standard, others])
     rms = np.sqrt(factor.squared_errors(values) / np.maximum(factor.samples, 1))
+    free = factor.relative_error(unconstrained.values)
     return ConsistentEstimate(
         standard=standard,
         friction=values[model.friction_part],
@@ -630,12 +523,172 @@ def consistent_estimate(
             f" covariance of the unconstrained estimate: {unconstrained.method}",
         ),
         unconstrained=unconstrained,
-        margin=found,
+        margin=margin(standard[model.layout.links]),
         relative_error=float(np.nan_to_num(factor.relative_error(values))),
-        unconstrained_relative_error=float(
-            np.nan_to_num(factor.relative_error(unconstrained.values))
-        ),
+        unconstrained_relative_error=float(np.nan_to_num(free)),
         reference=program.bodies.words,
         status=status,
         solution=solution,
     )
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How far an estimate is drawn towards the consistent solution.
+
+    Attributes:
+        strength: information of the prior, as a share of the data's in each column; zero for
+            least squares, infinite for the consistent solution itself.
+        prior_weight: rows of data that the nominal bodies count for in the consistent solution.
+    """
+
+    strength: float = 0.0
+    prior_weight: float = 0.1
+
+    def describe(self) -> str:
+        """The estimator in words."""
+        if self.strength == 0.0:
+            return "least squares"
+        nominal = f"nominal bodies weigh {self.prior_weight:g} rows"
+        if math.isinf(self.strength):
+            return f"physically consistent ({nominal})"
+        return f"regularised towards the consistent solution by {self.strength:g} ({nominal})"
+
+
+def shrunk_values(equations: NormalEquations, centre: Array, strength: float) -> Array:
+    """Parameters (p,) drawn towards the centre (p,); what has no data stays there."""
+    if math.isinf(strength):
+        return centre
+    prior = strength * np.diag(equations.A)
+    moved = equations._replace(A=equations.A + np.diag(prior), b=equations.b - equations.A @ centre)
+    return np.asarray(centre + solve(moved).values)
+
+
+def fitted_values(
+    model: RobotModel, factor: Factor, shrinkage: Shrinkage, centre: Array | None = None
+) -> Array:
+    """Parameters (p,) of a factor drawn towards a centre, its consistent solution by default.
+
+    Raises:
+        IdentificationError: no consistent parameters were found.
+    """
+    weights = joint_weights(factor)
+    equations = factor.weighted(weights)
+    if shrinkage.strength == 0.0:
+        return solve(equations).values
+    if centre is None:
+        found = consistent_estimate(
+            model, factor, weights=weights, prior_weight=shrinkage.prior_weight
+        )
+        centre = found.estimate.values
+    return shrunk_values(equations, centre, shrinkage.strength)
+
+
+def fit_shrunk(
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    shrinkage: Shrinkage,
+    *,
+    centre: Array | None = None,
+    phase: PhaseFactor | None = None,
+) -> Estimate:
+    """Fit recordings; the covariance is that of least squares, cluster-robust.
+
+    The consistent solution comes from the same samples: as a prior it knows no more than they do,
+    and where they leave parameters open the nominal bodies decide, whose errors nobody knows.
+
+    Args:
+        model: the robot.
+        recordings: the samples.
+        shrinkage: how far.
+        centre: what to draw towards (p,), by default the consistent solution of these samples.
+        phase: of the recordings, if it is known.
+
+    Raises:
+        IdentificationError: no usable row, or no consistent parameters were found.
+    """
+    phase = total_phase(model, recordings) if phase is None else phase
+    factor = phase.total
+    free = estimate(model, factor)
+    values = fitted_values(model, factor, shrinkage, centre)
+    found = block_covariance(phase, joint_weights(factor), free.values)
+    variance = factor.squared_errors(values) / np.maximum(factor.samples, 1)
+    return replace(
+        free,
+        values=values,
+        covariance=found.covariance,
+        noise_std=np.where(factor.samples > 0, np.sqrt(variance), np.nan),
+        interval_factor=found.interval_factor,
+        undetermined=undetermined_names(model.parameter_names, found.determined),
+        method=f"weighted least squares, {shrinkage.describe()}; {found.words}",
+    )
+
+
+# Smallest eigenvalue of the covariance in units of standard deviations, over the largest: in
+# directions that are known better the measure is as if they were not, lest it be singular.
+_BEST_KNOWN: Final = 1e-8
+# So many that the prior's weight stays: the covariance holds the errors of the model already.
+_ROWS: Final = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """N variants of an arm.
+
+    Attributes:
+        standard: standard parameters (N, s), every body and every rotor possible.
+        values: the parameters (N, p) that follow from them, with friction, springs and balancers.
+    """
+
+    standard: Array
+    values: Array
+
+
+def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int) -> Ensemble:
+    r"""Draw variants of an arm as far apart as its parameters are uncertain, all of them possible.
+
+    Least squares knows the parameters up to :math:`\delta \sim N(0, C)`. For each variant one
+    :math:`\delta` is added to the estimate, and the physically consistent parameters nearest to
+    the sum are looked for, in the measure :math:`C^{-1}` (randomise, then optimise). Where all
+    within the intervals is possible the variants have the covariance C; elsewhere they are closer
+    together. What the data say nothing about stays at the prior.
+
+    Args:
+        model: the robot.
+        estimate: of its parameters, with their covariance.
+        count: number N of variants.
+        seed: of the draws; the same one gives the same variants.
+
+    Raises:
+        SolverError: no possible parameters were found near some draw.
+    """
+    spread, measure = _roots(estimate.covariance)
+    program = Program.of(model, measure, measure @ estimate.values, 1.0)
+    near, _ = program.solve(_ROWS)
+    random = np.random.default_rng(seed)
+    standard, values = [], []
+    for _ in range(count):
+        aim = estimate.values + spread @ random.standard_normal(spread.shape[1])
+        one = replace(program, smooth=program.smooth._replace(z=measure @ aim))
+        bodies, others = one.physical(one.solve(_ROWS, near)[0])
+        standard.append(bodies)
+        values.append(np.concatenate([model.base.grouping @ bodies, others]))
+    return Ensemble(np.array(standard), np.array(values))
+
+
+def _roots(covariance: Array) -> tuple[Array, Array]:
+    """Return L (p, d) with ``L L'`` the covariance, and R (d, p) with ``R' R`` its inverse.
+
+    Both are zero for parameters of infinite variance.
+    """
+    known = np.isfinite(np.diag(covariance))
+    own = covariance[np.ix_(known, known)]
+    scale = np.sqrt(np.diag(own))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+    sizes = np.sqrt(np.maximum(eigenvalues, 0.0))
+    least = np.sqrt(_BEST_KNOWN) * sizes.max(initial=0.0)
+    spread, measure = np.zeros((2, len(covariance), len(own)))
+    spread[known] = scale[:, None] * vectors * sizes
+    measure[known] = vectors / np.maximum(sizes, least) / scale[:, None]
+    return spread, measure.T

@@ -2,16 +2,14 @@ r"""Current-to-torque gains of all drives at once, from a payload whose torque i
 
 Without a payload, parameters and gains can all be scaled by one number. A recording with a known
 payload fixes it (Gautier and Briot 2014, "Global identification of joint drive gains and dynamic
-parameters of robots"). Two estimators on one :func:`identification.factor.phases.gain_factor`:
-
-*weighted* least squares of what was measured, the current:
+parameters of robots"). Weighted least squares of what was measured, the current, on one
+:func:`identification.factor.phases.gain_factor`:
 
 .. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
 
-which is bilinear and solved by Gauss-Newton, each motor weighted by its inverse noise variance;
-and *total* least squares of :math:`K_m i_m - W_m \pi - t_m = 0`, whose errors are in the columns
-of the currents, the others assumed exact (Van Huffel and Vandewalle 1991). Plain least squares of
-the latter equation would shrink all gains, the more the noisier the currents.
+which is bilinear and solved by Gauss-Newton, each motor weighted by its inverse noise variance.
+Least squares of :math:`K_m i_m - W_m \pi = t_m` would shrink all gains, the more the noisier the
+currents.
 
 A motor's gain is determined only if the payload loads it, or if its torque shares parameters with
 motors that the payload does load. What is not determined is named, and has no number.
@@ -21,24 +19,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import cluster_covariance
-from identification.factor.factor import NormalEquations, Solution, mark_undetermined, solve
+from identification.factor.factor import NormalEquations, Solution, solve
 from identification.factor.phases import PhaseFactor
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import SHORTEST_STRETCH
 
 Array = NDArray[np.float64]
-
-
-GainMethod = Literal["weighted", "total"]
 
 # A gain is of use when it is better known than a maker's typical tolerance of a torque constant.
 WORST_RELATIVE_STD: Final = 0.05
@@ -47,7 +41,6 @@ _NO_LOAD: Final = 1e-9
 _ITERATIONS: Final = 50
 _VANISHING: Final = 1e-100
 _LEAST_NOISE: Final = 1e-6  # share of a current's length: rounding of the Gram matrix
-_LEAST_ERROR: Final = 1e-9  # of rounding, where the data have no noise
 _CONVERGED: Final = 1e-9
 
 
@@ -59,22 +52,14 @@ class Gains:
         motor_names: (n,).
         values: torque per current (n,) [N·m/A or N/A], NaN where not determined.
         std: standard deviations, cluster-robust (n,); infinite likewise.
-        covariance: of the gains (n, n); infinite variance likewise.
         reasons: per motor why its gain is not determined, None where it is.
-        parameters: the model's parameters that were estimated with them (p,).
-        noise_std: of the current (n,) [A].
-        method: "weighted" or "total".
         interval_factor: standard deviations in half a 95 % interval.
     """
 
     motor_names: tuple[str, ...]
     values: Array
     std: Array
-    covariance: Array
     reasons: tuple[str | None, ...]
-    parameters: Array
-    noise_std: Array
-    method: GainMethod
     interval_factor: float
 
     @property
@@ -82,33 +67,13 @@ class Gains:
         """Which gains the data determine (n,)."""
         return np.isfinite(self.values)
 
-    def describe(self) -> list[str]:
-        """One line per motor, in words."""
-        lines = []
-        for motor, name in enumerate(self.motor_names):
-            reason, half = self.reasons[motor], self.interval_factor * self.std[motor]
-            lines.append(
-                f"{name}: {self.values[motor]:.5g} ± {half:.2g}"
-                if reason is None
-                else f"{name}: gain not determined; {reason}"
-            )
-        return lines
 
-
-def identify_gains(
-    factor: PhaseFactor,
-    motor_names: Sequence[str],
-    *,
-    method: GainMethod = "weighted",
-    worst_relative_std: float = WORST_RELATIVE_STD,
-) -> Gains:
+def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
     """Estimate the gain of each motor, with its confidence.
 
     Args:
         factor: blocks of recordings with a known payload, and without or with another.
         motor_names: (n,), in the order of the factor.
-        method: see the module.
-        worst_relative_std: gains less well known than this are not determined.
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
@@ -123,41 +88,27 @@ def identify_gains(
             "no recording has a known payload: gains and parameters can be scaled together"
         )
     noise, inverses = _motor_by_motor(total, rows)
-    fit = _gauss_newton(total, noise, inverses)
-    if method == "total":
-        fit = _total_least_squares(total, rows, fit)
-        blocks = _errors_in_currents(grams, factor.samples, fit)
-    else:
-        blocks = _linearised(grams, fit.unknowns, fit.noise)[:2]
-    clustered = cluster_covariance(*blocks, fit.solution)
-    covariance = clustered.covariance
-    reasons = _reasons(total, rows, fit, np.sqrt(np.diag(covariance)[p:]), worst_relative_std)
+    unknowns, solution = _gauss_newton(total, noise, inverses)
+    clustered = cluster_covariance(*_linearised(grams, unknowns, noise)[:2], solution)
+    std = np.sqrt(np.diag(clustered.covariance)[p:])
+    reasons = _reasons(total, rows, unknowns[p:], solution.determined[p:], std)
     known = np.array([reason is None for reason in reasons])
-    gains, own = fit.unknowns[p:], covariance[p:, p:]
-    if method == "weighted":
-        # From the inverses, to first order.
-        gains = 1.0 / np.where(known, gains, 1.0)
-        own = own * np.outer(gains**2, gains**2)
-    mark_undetermined(own, known)
+    gains = 1.0 / np.where(known, unknowns[p:], 1.0)
     return Gains(
         motor_names=tuple(motor_names),
         values=np.where(known, gains, np.nan),
-        std=np.sqrt(np.diag(own)),
-        covariance=own,
+        # From the inverses, to first order.
+        std=np.where(known, std * gains**2, np.inf),
         reasons=reasons,
-        parameters=fit.unknowns[:p],
-        noise_std=fit.noise,
-        method=method,
         interval_factor=clustered.interval_factor,
     )
 
 
 def _reasons(
-    total: Array, rows: NDArray[np.intp], fit: _Fit, std: Array, worst: float
+    total: Array, rows: NDArray[np.intp], found: Array, determined: NDArray[np.bool_], std: Array
 ) -> tuple[str | None, ...]:
-    """Why each motor's gain is not determined, None where it is; std of gain or inverse (n,)."""
+    """Why each motor's gain is not determined, None where it is; from its inverse and std (n,)."""
     p = total.shape[1] - 2
-    found, determined = fit.unknowns[p:], fit.solution.determined[p:]
     size = np.abs(found)
     relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
     # Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding.
@@ -167,7 +118,7 @@ def _reasons(
     def why_not(m: int) -> str | None:
         if rows[m] == 0:
             return "the motor has no usable row"
-        if determined[m] and found[m] > 0.0 and relative[m] <= worst:
+        if determined[m] and found[m] > 0.0 and relative[m] <= WORST_RELATIVE_STD:
             return None
         if not loaded[m]:
             return "the payload does not load it, and nothing else fixes its scale"
@@ -175,22 +126,12 @@ def _reasons(
             return "the payload's torque on it looks like the robot's own"
         if not found[m] > 0.0:
             return "its best value is not positive: what the payload adds to its current is noise"
-        return f"its relative standard deviation would be {relative[m]:.0%}, more than {worst:.0%}"
+        return (
+            f"its relative standard deviation would be {relative[m]:.0%}, more than"
+            f" {WORST_RELATIVE_STD:.0%}"
+        )
 
     return tuple(why_not(m) for m in range(len(total)))
-
-
-class _Fit(NamedTuple):
-    """Parameters and gains, or their inverses (p + n,); current noise (n,); the last problem.
-
-    Total least squares adds its row weights (n,) and share of the noise removed.
-    """
-
-    unknowns: Array
-    noise: Array
-    solution: Solution
-    weights: Array = np.empty(0)
-    shrink: float = 1.0
 
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -200,100 +141,55 @@ def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]
     motor alone does not determine is given the others' typical value, to start from.
     """
     n, p = len(total), total.shape[1] - 2
-    noise, inverses = np.full(n, np.nan), np.full(n, np.nan)
-    for m, gram in enumerate(total):
-        if rows[m] == 0:
-            continue
+    noise, inverses = np.full((2, n), np.nan)
+    for m in np.flatnonzero(rows):
+        gram = total[m]
         own = solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1], gram[-1, -1], int(rows[m])))
         squares = gram[-1, -1] - own.values @ gram[:-1, -1]
         freedom = max(rows[m] - len(gram) + 1, 1)
         noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * gram[-1, -1]) / freedom)
         if own.determined[p] and own.values[p] > 0.0:
             inverses[m] = own.values[p]
-    known = inverses[np.isfinite(inverses)]
-    typical = float(np.median(known)) if known.size else 1.0
-    return noise, np.where(np.isfinite(inverses), inverses, typical)
+    known = np.isfinite(inverses)
+    return noise, np.where(known, inverses, np.median(inverses[known]) if known.any() else 1.0)
 
 
-def _total_least_squares(total: Array, rows: NDArray[np.intp], start: _Fit) -> _Fit:
-    """Mixed least squares and total least squares: only currents have errors.
-
-    A row's error is K_m times that of the current, so rows are weighted by (K_m noise_m)^-2,
-    with the gains of another estimate.
-    """
-    n, p = len(total), total.shape[1] - 2
-    noise, gains = start.noise, 1.0 / start.unknowns[p:]
-    weights = np.nan_to_num(1.0 / (gains * noise) ** 2, nan=0.0, posinf=0.0)
-    errors = weights * np.nan_to_num(noise) ** 2 * rows
-    full = _assemble(total, weights)
-    shrink = _smallest_error(full, errors, p)
-    corrected = full[:-1, :-1].copy()
-    corrected[np.arange(p, p + n), np.arange(p, p + n)] -= shrink * errors
-    solution = solve(
-        NormalEquations(corrected, -full[:-1, -1], float(full[-1, -1]), int(rows.sum()))
-    )
-    return _Fit(solution.values, noise, solution, weights, shrink)
-
-
-def _assemble(total: Array, weights: Array) -> Array:
-    """Weighted Gram matrix of [-W | i_1 .. i_n | -t] from those of [W | t | i] per motor."""
-    n, p = len(total), total.shape[1] - 2
-    full = np.zeros((p + n + 1, p + n + 1))
-    sign = np.concatenate([-np.ones(p + 1), [1.0]])
-    for m, gram in enumerate(total):
-        place = np.concatenate([np.arange(p), [p + n, p + m]])
-        full[np.ix_(place, place)] += weights[m] * gram * np.outer(sign, sign)
-    return full
-
-
-def _smallest_error(full: Array, errors: Array, p: int) -> float:
-    """Least ratio of squared residuals to what noise of the assumed size would leave.
-
-    The exact columns are projected out first.
-    """
-    exact = np.concatenate([np.arange(p), [len(full) - 1]])
-    noisy = p + np.flatnonzero(errors > 0.0)
-    projected = solve(NormalEquations(full[np.ix_(exact, exact)], np.zeros(p + 1), 0.0, 0)).inverse
-    cross = full[np.ix_(exact, noisy)]
-    left = full[np.ix_(noisy, noisy)] - cross.T @ projected @ cross
-    scale = np.sqrt(errors[noisy - p])
-    smallest = scipy.linalg.eigh(left / np.outer(scale, scale), eigvals_only=True)[0]
-    return float(max(smallest, _LEAST_ERROR))
-
-
-def _gauss_newton(total: Array, noise: Array, inverses: Array) -> _Fit:
-    """Weighted least squares of the currents; unknowns are pi and 1 / K (n,), here a start."""
+def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, Solution]:
+    """Parameters and inverse gains (p + n,), these from a start (n,); and the last problem."""
     p = total.shape[1] - 2
+
+    def problem(unknowns: Array) -> tuple[Array, Array, float]:
+        information, scores, squares = _linearised(total[None], unknowns, noise)
+        return information[0], scores[0], float(squares[0])
+
     unknowns = np.concatenate([np.zeros(p), inverses])
-    information, score, _ = _linearised(total[None], unknowns, noise)
-    unknowns[:p] = solve(NormalEquations(information[0, :p, :p], score[0, :p], 0.0, 0)).values
+    information, score, _ = problem(unknowns)
+    unknowns[:p] = solve(NormalEquations(information[:p, :p], score[:p], 0.0, 0)).values
     # Halved if the sum of squares does not fall: far from determined, steps overshoot.
     damping, cost = 1.0, np.inf
     best, step = unknowns, np.zeros_like(unknowns)
     for _ in range(_ITERATIONS):
-        information, score, squares = _linearised(total[None], unknowns, noise)
-        if squares.sum() > cost * (1.0 + 1e-12):
+        information, score, squares = problem(unknowns)
+        if squares > cost * (1.0 + 1e-12):
             damping *= 0.5
             unknowns = best + damping * step
             if damping < 1e-3:
                 break
             continue
-        solution = solve(NormalEquations(information[0], score[0], 0.0, 0))
-        best, cost, damping, step = unknowns, float(squares.sum()), 1.0, solution.values
+        step = solve(NormalEquations(information, score, 0.0, 0)).values
+        best, cost, damping = unknowns, squares, 1.0
         unknowns = best + step
-        if step @ information[0] @ step < _CONVERGED:
+        if step @ information @ step < _CONVERGED:
             break
-    information, score, _ = _linearised(total[None], best, noise)
-    solution = solve(NormalEquations(information[0], score[0], 0.0, 0))
-    return _Fit(best, noise, solution)
+    information, score, _ = problem(best)
+    return best, solve(NormalEquations(information, score, 0.0, 0))
 
 
 def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Array, Array]:
     """Information (B, k, k), scores (B, k) and weighted squares (B,) of the predicted currents."""
     blocks, n, width, _ = gram.shape
     p = width - 2
-    k = p + n
-    information, scores = np.zeros((blocks, k, k)), np.zeros((blocks, k))
+    information, scores = np.zeros((blocks, p + n, p + n)), np.zeros((blocks, p + n))
     squares = np.zeros(blocks)
     for m in np.flatnonzero(noise > 0.0):
         inverse = unknowns[p + m]
@@ -309,19 +205,6 @@ def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Arra
         scores[:, place] += own @ residual @ slope
         squares += np.einsum("i,bij,j->b", residual, own, residual)
     return information, scores, squares
-
-
-def _errors_in_currents(gram: Array, rows: NDArray[np.intp], fit: _Fit) -> tuple[Array, Array]:
-    """Information (B, k, k) and scores (B, k) of total least squares, block by block."""
-    p, n = gram.shape[2] - 2, gram.shape[1]
-    information, scores = [], []
-    for own, count in zip(gram, rows, strict=True):
-        full = _assemble(own, fit.weights)
-        errors = fit.shrink * fit.weights * np.nan_to_num(fit.noise) ** 2 * count
-        full[np.arange(p, p + n), np.arange(p, p + n)] -= errors
-        information.append(full[:-1, :-1])
-        scores.append(-(full[:-1] @ np.append(fit.unknowns, 1.0)))
-    return np.array(information), np.array(scores)
 
 
 # Where no torque constant is known, from the masses of the description: motor m of a robot with
@@ -412,10 +295,8 @@ def _columns(model: RobotModel, motion: Motion, turns: Array) -> tuple[Array, ND
 
 def _share(table: Array, current: Array) -> tuple[float, float]:
     """Coefficient of the first column, and its standard deviation; (0, inf) without any."""
-    if len(table) < _BLOCKS * SHORTEST_STRETCH:
-        return 0.0, np.inf
-    scale = np.sqrt(np.mean(table**2, axis=0))
-    if scale[0] <= _NO_LOAD:
+    scale = np.sqrt(np.mean(table**2, axis=0)) if len(table) else np.zeros(1)
+    if len(table) < _BLOCKS * SHORTEST_STRETCH or scale[0] <= _NO_LOAD:
         return 0.0, np.inf
     table = table[:, scale > 0.0] / scale[scale > 0.0]
     blocks = np.array_split(np.arange(len(table)), _BLOCKS)
@@ -424,11 +305,11 @@ def _share(table: Array, current: Array) -> tuple[float, float]:
     total, right = grams.sum(axis=0), scores.sum(axis=0)
     if np.linalg.cond(total) > 1e10:
         return 0.0, np.inf
-    best = float(np.linalg.solve(total, right)[0])
+    best = np.linalg.solve(total, right)[0]
     without = [
-        float(np.linalg.lstsq(total - gram, right - score, rcond=None)[0][0])
+        np.linalg.lstsq(total - gram, right - score, rcond=None)[0][0]
         for gram, score in zip(grams, scores, strict=True)
     ]
     # Jackknife over blocks: allows for noise that lasts.
     spread = np.sqrt((_BLOCKS - 1.0) / _BLOCKS * np.sum((np.array(without) - best) ** 2))
-    return best / float(scale[0]), float(spread) / float(scale[0])
+    return float(best / scale[0]), float(spread / scale[0])

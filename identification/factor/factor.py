@@ -382,7 +382,8 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
     singular = np.sqrt(eigenvalues[significant])
     basis = vectors[:, significant].T
-    return singular[:, None] * basis * scale, (basis @ (equations.b / scale)) / singular
+    # Times the length itself: a column without data stays exactly zero, without rounding.
+    return singular[:, None] * basis * length, (basis @ (equations.b / scale)) / singular
 
 
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:

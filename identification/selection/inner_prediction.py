@@ -22,8 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.consistent import SolverError
-from identification.estimators.shrinkage import Shrinkage, consistent_centre, shrunk_values
+from identification.estimators.consistent import (
+    Shrinkage,
+    SolverError,
+    consistent_estimate,
+    shrunk_values,
+)
 from identification.factor.factor import Factor, augmented_rows, joint_weights, solve
 from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
@@ -423,8 +427,12 @@ class _Trial:
             key = *machine, k
             if key not in self._centres:
                 near = self._near.get(settings.model.parameter_names)
-                found = consistent_centre(
-                    settings.model, factor, weights, shrinkage.prior_weight, near
+                found = consistent_estimate(
+                    settings.model,
+                    factor,
+                    weights=weights,
+                    prior_weight=shrinkage.prior_weight,
+                    near=near,
                 )
                 self._centres[key] = found.estimate.values
                 self._near[settings.model.parameter_names] = found.solution

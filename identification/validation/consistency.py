@@ -14,11 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.estimators.consistent import (
-    Consistency,
-    ConsistentEstimate,
-    consistent_estimate,
-)
+from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.factor.factor import Estimate, Factor
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
@@ -115,7 +111,6 @@ def check_consistency(
     unconstrained: Estimate,
     *,
     weights: Array | None = None,
-    options: Consistency = Consistency(),  # noqa: B008 - frozen
 ) -> ConsistencyCheck:
     """Find the physically consistent estimate and what it costs.
 
@@ -125,17 +120,16 @@ def check_consistency(
         held_out: samples that were not.
         unconstrained: the estimate to compare with, of the model's parameters.
         weights: per joint (n,); by default the inverse residual variances of an ordinary fit.
-        options: the prior.
 
     Raises:
         IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
     """
-    found = consistent_estimate(model, training, unconstrained, weights=weights, options=options)
+    found = consistent_estimate(model, training, unconstrained, weights=weights)
     ours, free = found.estimate.values, unconstrained.values
     shift, links = np.abs(found.shift), model.layout.links
     rise = held_out.relative_errors(ours) - held_out.relative_errors(free)
     # In axes in which the pseudo-inertia of the reference is the unit matrix.
-    frames = reference_bodies(options.of(model)[links], model.chain.translation).frames
+    frames = reference_bodies(model.nominal[links], model.chain.translation).frames
     inner = np.linalg.solve(frames, pseudo_inertia(found.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
     room = np.asarray(np.linalg.eigvalsh(inner)[:, 0])

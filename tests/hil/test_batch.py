@@ -53,7 +53,7 @@ from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.settings import Settings
 from hil.identify.sources import Sources, gather_sources
 from hil.progress import Reporter, Silent
-from identification.estimators.shrinkage import Shrinkage
+from identification.estimators.consistent import Shrinkage
 from identification.signals.samples import Preprocessing
 
 from .arm_histories import Load, steady, trend_of

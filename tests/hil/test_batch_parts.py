@@ -56,7 +56,7 @@ from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.errors import InputError
 from hil.identify.settings import Settings
 from hil.version import install_command
-from identification.estimators.shrinkage import Shrinkage
+from identification.estimators.consistent import Shrinkage
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape

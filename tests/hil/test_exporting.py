@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.exporting import arm_of, spread_of
 from hil.importers import ColumnMap, Robot, import_log
-from identification import IdentificationError
-from identification.estimators.ensemble import sample_ensemble
+from identification.estimators.consistent import sample_ensemble
 from identification.model.pseudo_inertia import margin
 
 from .identified_arm import IdentifiedArm, a_motion, identified_arm
@@ -90,11 +89,6 @@ class TestEnsemble:
         variants = sample_ensemble(still.cell.model, still.estimate, 5, 1)
         place = still.cell.model.parameter_names.index("f1_1")
         np.testing.assert_allclose(variants.values[:, place], variants.values[0, place])
-
-    @pytest.mark.parametrize("count", [0, 10_001])
-    def test_a_count_out_of_bounds_is_refused(self, arm: IdentifiedArm, count: int) -> None:
-        with pytest.raises(IdentificationError, match="ask for 1 to 10000"):
-            sample_ensemble(arm.cell.model, arm.estimate, count, 1)
 
 
 class TestCommand:

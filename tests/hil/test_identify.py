@@ -49,9 +49,8 @@ from hil.report.page import judgement_context
 from hil.results import SCHEMA_VERSION, JudgementResult, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
-from identification.estimators.consistent import SolverError
+from identification.estimators.consistent import Shrinkage, SolverError
 from identification.estimators.prior import GaussianPrior
-from identification.estimators.shrinkage import Shrinkage
 from sim_fixtures.ns16 import URDF_PATH
 
 from .identified_arm import TWO_LINK
@@ -514,10 +513,10 @@ class TestEstimators:
     ) -> None:
         """Data that no machine fits are estimated all the same, and the reason stands beside it."""
 
-        def none(*_: object) -> None:
+        def none(*_: object, **__: object) -> None:
             raise SolverError("no solution was found")
 
-        monkeypatch.setattr("hil.identify.estimating.consistent_centre", none)
+        monkeypatch.setattr("hil.identify.estimating.consistent_estimate", none)
         settings = replace(prepared.settings, shrinkage=Shrinkage(0.1))
         found = estimate_with(replace(prepared, settings=settings), Options(), Silent())
         expected = estimations["wls"].result.pooled.values

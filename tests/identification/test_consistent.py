@@ -1,7 +1,9 @@
+"""Physically consistent estimates: laws of what comes out, and of the method that finds it."""
+
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, distribution
-from pathlib import Path
+import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,65 +12,77 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from identification import Factor, FrictionLaw, IdentificationError, Motion, RobotModel, ShapeError
+from identification import Factor, FrictionLaw, IdentificationError, Motion, RobotModel
 from identification.estimators.consistent import (
     Cone,
-    Consistency,
     ConsistentEstimate,
+    Shrinkage,
     Smooth,
     consistent_estimate,
+    fit_shrunk,
     follow_path,
     polish,
-    square_root,
+    shrunk_values,
 )
-from identification.factor.factor import Estimate, estimate, joint_weights
+from identification.estimators.least_squares import fit_least_squares
+from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
+from identification.factor.factor import NormalEquations, estimate, joint_weights, rows_of
+from identification.factor.phases import total_phase
+from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
+from identification.signals.samples import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, table2, urdf_text
-from tests.identification.two_link import sine_motion
+from tests.identification.robots import robot_text
+from tests.identification.two_link import (
+    MODEL,
+    URDF,
+    gaussian,
+    recording,
+    sine_motion,
+    truth,
+)
+from tests.identification.two_link import a_motion as lively_motion
 
 Array = NDArray[np.float64]
 
-TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
-ROTORS = np.array([10, 21])
+
+def with_friction(*friction: float) -> Array:
+    """The planted parameters of the two links with other friction."""
+    return np.concatenate([truth()[: MODEL.base.rank], friction])
 
 
-@pytest.fixture(scope="module")
-def two_link() -> RobotModel:
-    return RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None))
-
-
-def two_link_truth(model: RobotModel, friction: tuple[float, ...] = (4.0, 2.0, 1.5, 0.8)) -> Array:
-    standard = model.nominal.copy()
-    standard[ROTORS] = 0.4, 0.1
-    return np.concatenate([model.base.grouping @ standard, friction])
-
-
-def a_motion(model: RobotModel, seed: int, samples: int = 2000, rate: float = 4.0) -> Motion:
+def a_motion(model: RobotModel, seed: int, samples: int = 2000) -> Motion:
     """Five sines per joint; another seed is another motion, about as far and as fast."""
     rng = np.random.default_rng(seed)
     shape = (5, model.n_joints)
     time = np.arange(samples) * 4e-3
     size = np.linspace(1.0, 0.2, 5)[:, None]
-    pace = np.linspace(0.5, rate, 5)[:, None] * rng.uniform(0.9, 1.1, shape)
+    pace = np.linspace(0.5, 4.0, 5)[:, None] * rng.uniform(0.9, 1.1, shape)
     return sine_motion(time, size, pace, rng.uniform(0.0, 6.0, shape))
 
 
-def measured(model: RobotModel, motion: Motion, truth: Array, noise: float, seed: int) -> Array:
+def measured(model: RobotModel, motion: Motion, values: Array, noise: float, seed: int) -> Array:
     """Torque with noise, a share of each joint's RMS."""
-    torque = model.torque(truth, *motion[1:])
+    torque = model.torque(values, *motion[1:])
     rms = np.sqrt((torque**2).mean(axis=0))
     return torque + noise * rms * np.random.default_rng(seed).standard_normal(torque.shape)
 
 
-def fitted(
-    model: RobotModel,
-    motion: Motion,
-    torque: Array,
-    options: Consistency = Consistency(),  # noqa: B008 - frozen
-    mask: NDArray[np.bool_] | None = None,
+def fitted(model: RobotModel, motion: Motion, torque: Array, **options: Any) -> ConsistentEstimate:
+    return consistent_estimate(model, Factor.from_samples(model, motion, torque), **options)
+
+
+def planted(
+    values: Array, noise: float, seed: int, *, model: RobotModel = MODEL, samples: int = 2000
 ) -> ConsistentEstimate:
-    factor = Factor.from_samples(model, motion, torque, mask)
-    return consistent_estimate(model, factor, estimate(model, factor), options=options)
+    """Estimate of an arm with these parameters."""
+    motion = a_motion(model, seed, samples)
+    return fitted(model, motion, measured(model, motion, values, noise, seed))
+
+
+def cost(found: ConsistentEstimate) -> float:
+    """Rise of the relative error on the fitted rows."""
+    return found.relative_error - found.unconstrained_relative_error
 
 
 def assert_possible(model: RobotModel, found: ConsistentEstimate) -> None:
@@ -85,63 +99,6 @@ def assert_possible(model: RobotModel, found: ConsistentEstimate) -> None:
         assert all(r >= 0.0 for r in rotor)
     for name, value in zip(found.estimate.names, found.estimate.values, strict=True):
         assert value >= 0.0 or not name.startswith(("f0", "f1"))
-
-
-def test_from_poor_data_comes_a_possible_machine(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 1, samples=150)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.5, 1)
-    found = fitted(two_link, motion, torque)
-    assert_possible(two_link, found)
-    assert found.status == "optimal"
-    assert np.all(found.margin > 0.0)
-
-
-def test_base_parameters_are_those_of_the_standard_ones(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 1, samples=300)
-    found = fitted(two_link, motion, measured(two_link, motion, two_link_truth(two_link), 0.3, 1))
-    rank = two_link.base.rank
-    np.testing.assert_allclose(
-        found.estimate.values[:rank], two_link.base.grouping @ found.standard, atol=1e-12
-    )
-    np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
-
-
-def test_where_least_squares_is_possible_it_is_hardly_moved(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 2)
-    found = fitted(two_link, motion, measured(two_link, motion, two_link_truth(two_link), 0.02, 2))
-    assert np.abs(found.shift).max() < 0.1
-    assert found.cost < 1e-5
-
-
-def test_exact_data_and_an_exact_nominal_give_every_standard_parameter_back(
-    two_link: RobotModel,
-) -> None:
-    """Also those that no torque depends on: they are the nominal's."""
-    standard = two_link.nominal.copy()
-    standard[ROTORS] = 0.4, 0.1
-    motion = a_motion(two_link, 3)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.0, 3)
-    found = fitted(two_link, motion, torque, Consistency(nominal=standard))
-    np.testing.assert_allclose(found.standard, standard, atol=1e-4)
-
-
-def test_friction_that_would_drive_is_none(two_link: RobotModel) -> None:
-    truth = two_link_truth(two_link, (-1.0, 2.0, 1.5, -0.3))
-    motion = a_motion(two_link, 4)
-    found = fitted(two_link, motion, measured(two_link, motion, truth, 0.01, 4))
-    assert found.unconstrained.value("f0_1") < 0.0
-    assert found.unconstrained.value("f1_2") < 0.0
-    assert found.estimate.value("f0_1") == pytest.approx(0.0, abs=1e-3)
-    assert found.estimate.value("f1_2") == pytest.approx(0.0, abs=1e-3)
-    assert_possible(two_link, found)
-
-
-def test_the_third_friction_term_may_have_either_sign() -> None:
-    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(offset=True))
-    standard = np.concatenate([model.base.grouping @ model.nominal, [4, 4, 2, 2, -0.1, 0.1, -1, 1]])
-    motion = a_motion(model, 5)
-    found = fitted(model, motion, measured(model, motion, standard, 0.001, 5))
-    np.testing.assert_allclose(found.friction, standard[model.base.rank :], rtol=0.05)
 
 
 LARGE = 1e2  # as many times the nominal bodies, kg m² of rotor, or N·m of friction
@@ -172,171 +129,6 @@ def largest_gain(gradient: Array, at: Array, nominal: Array) -> float:
     return float(gradient @ at) + LARGE * missing
 
 
-def test_no_other_possible_machine_fits_better(two_link: RobotModel) -> None:
-    truth = two_link_truth(two_link, (-1.0, 2.0, 1.5, 0.8))
-    truth[two_link.parameter_names.index("I2yy")] = -0.1  # no machine: the constraints bind
-    motion = a_motion(two_link, 6)
-    torque = measured(two_link, motion, truth, 0.4, 6)
-    found = fitted(two_link, motion, torque, Consistency(prior_weight=1e-4))
-    # The same objective from the samples, and its gradient.
-    factor = Factor.from_samples(two_link, motion, torque)
-    weights = joint_weights(factor)
-    excess = square_root(factor.weighted(weights)).excess(found.estimate.values)
-    assert excess > 100.0
-    rank, s = two_link.base.rank, len(two_link.standard_names)
-    mapping = np.zeros((two_link.n_parameters, s + 4))
-    mapping[:rank, :s] = two_link.base.grouping
-    mapping[rank:, s:] = np.eye(4)
-    rows = two_link.regressor(*motion[1:]).dense(two_link.n_parameters) @ mapping
-    x = np.concatenate([found.standard, found.friction])
-    error = rows @ x - torque
-    gradient = 2.0 * np.einsum("tj,j,tjk->k", error, weights, rows)
-    assert largest_gain(gradient, x, two_link.chain.inertial) < 1e-2 * excess
-
-
-@pytest.mark.parametrize("noise", [0.1, 0.01, 0.0])
-def test_data_that_no_machine_can_make_still_give_the_machine_that_is_closest(
-    two_link: RobotModel, noise: float
-) -> None:
-    """As after a wrong sign of one torque, however exact the data are."""
-    truth = two_link_truth(two_link, (-1.0, 2.0, 1.5, 0.8))
-    truth[two_link.parameter_names.index("I2yy")] = -0.3
-    motion = a_motion(two_link, 6)
-    found = fitted(two_link, motion, measured(two_link, motion, truth, noise, 6))
-    assert_possible(two_link, found)
-    assert "no machine fits" in found.status
-    assert found.cost > 0.02
-
-
-@given(st.integers(0, 2**16))
-@settings(max_examples=15)
-def test_excess_is_the_weighted_squared_error_above_its_minimum(seed: int) -> None:
-    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None))
-    rng = np.random.default_rng(seed)
-    motion = a_motion(model, seed, samples=100)
-    torque = rng.normal(size=(100, 2))
-    weights = rng.uniform(0.1, 10.0, 2)
-    factor = Factor.from_samples(model, motion, torque)
-    values = rng.normal(size=model.n_parameters)
-
-    def squares(x: Array) -> float:
-        return float(np.sum(weights * (model.torque(x, *motion[1:]) - torque) ** 2))
-
-    least = estimate(model, factor, weights).values
-    expected = squares(values) - squares(least)
-    assert square_root(factor.weighted(weights)).excess(values) == pytest.approx(expected, rel=1e-6)
-
-
-def test_errors_on_the_fitted_rows_are_those_of_the_samples(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 7, samples=300)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.3, 7)
-    found = fitted(two_link, motion, torque)
-    error = two_link.torque(found.estimate.values, *motion[1:]) - torque
-    np.testing.assert_allclose(
-        found.estimate.noise_std, np.sqrt((error**2).mean(axis=0)), rtol=1e-6
-    )
-    relative = np.linalg.norm(error) / np.linalg.norm(torque)
-    assert found.relative_error == pytest.approx(relative, rel=1e-6)
-
-
-def test_the_covariance_is_said_to_be_that_of_the_unconstrained(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 8, samples=300)
-    found = fitted(two_link, motion, measured(two_link, motion, two_link_truth(two_link), 0.3, 8))
-    assert "covariance of the unconstrained estimate" in found.estimate.method
-    np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
-
-
-def test_one_chunk_or_many_are_the_same(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 9, samples=600)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.3, 9)
-    whole = Factor.from_samples(two_link, motion, torque)
-    parts = Factor.zero(two_link)
-    for start in range(0, 600, 50):
-        cut = slice(start, start + 50)
-        chunk = motion.rows(cut)
-        parts = parts + Factor.from_samples(two_link, chunk, torque[cut])
-    one, other = (consistent_estimate(two_link, f, estimate(two_link, f)) for f in (whole, parts))
-    np.testing.assert_allclose(one.estimate.values, other.estimate.values, rtol=1e-9)
-    np.testing.assert_allclose(one.standard, other.standard, rtol=1e-9, atol=1e-9)
-
-
-def test_a_joint_that_never_moved_keeps_its_nominal_link() -> None:
-    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None), gravity=(0, 0, 0))
-    motion = a_motion(model, 10)
-    for array in motion[1:4]:
-        array[:, 1] = 0.0
-    values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
-    torque = measured(model, motion, values, 0.01, 10)
-    mask = np.zeros(torque.shape, dtype=np.bool_)
-    mask[:, 0] = True
-    found = fitted(model, motion, torque, mask=mask)
-    assert_possible(model, found)
-    assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
-    assert np.all(np.isfinite(found.standard))
-    np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
-
-
-def test_a_prior_without_weight_is_refused() -> None:
-    with pytest.raises(IdentificationError, match="prior weight"):
-        Consistency(prior_weight=0.0)
-
-
-def test_nominal_parameters_of_another_robot_are_refused(two_link: RobotModel) -> None:
-    motion = a_motion(two_link, 11, samples=100)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.05, 11)
-    with pytest.raises(ShapeError):
-        fitted(two_link, motion, torque, Consistency(nominal=np.ones(3)))
-
-
-def test_a_description_without_inertia_says_that_bodies_were_assumed() -> None:
-    bare = TWO_LINK
-    while "<inertial>" in bare:
-        start, end = bare.index("<inertial>"), bare.index("</inertial>") + len("</inertial>")
-        bare = bare[:start] + bare[end:]
-    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None))
-    empty = RobotModel.from_urdf(bare, friction=FrictionLaw(third=None))
-    motion = a_motion(model, 12)
-    torque = measured(model, motion, two_link_truth(model), 0.02, 12)
-    found = fitted(empty, motion, torque)
-    assert all(words.startswith("assumed") for words in found.reference)
-    assert_possible(empty, found)
-    assert found.cost < 1e-3
-
-
-# NS 16: the truth is known, and the paper's estimates are in print.
-
-
-def ns16() -> tuple[RobotModel, Array, Array]:
-    """Return the model, its true parameters, and a nominal that is 5 to 20 % wrong, no rotors."""
-    model = RobotModel.from_urdf(urdf_text())
-    named, truth = standard_parameters(), load_truth()
-    standard = np.array([named[name] for name in model.standard_names])
-    values = np.concatenate(
-        [model.base.grouping @ standard, truth.coulomb, truth.viscous, truth.third]
-    )
-    rng = np.random.default_rng(0)
-    nominal = standard.reshape(6, 11).copy()
-    nominal *= 1.0 + rng.uniform(0.05, 0.2, (6, 1)) * rng.choice([-1.0, 1.0], (6, 1))
-    nominal[:, 10] = 0.0
-    return model, values, nominal.reshape(-1)
-
-
-@pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
-def test_ns16_is_possible_and_predicts_unseen_motion_as_well(noise: float) -> None:
-    model, truth, nominal = ns16()
-    motion, other = a_motion(model, 1), a_motion(model, 2)
-    torque = measured(model, motion, truth, noise, 3)
-    found = fitted(model, motion, torque, Consistency(nominal=nominal))
-    assert_possible(model, found)
-    unseen = measured(model, other, truth, noise, 4)
-
-    def error(values: Array) -> float:
-        wrong = model.torque(values, *other[1:]) - unseen
-        return float(np.linalg.norm(wrong) / np.linalg.norm(unseen))
-
-    assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
-
-
 def nearest_consistent(column: str) -> tuple[float, float]:
     """Distance of a column of Table 2 from the possible machines, and a lower bound of it."""
     model = RobotModel.from_urdf(
@@ -350,14 +142,7 @@ def nearest_consistent(column: str) -> tuple[float, float]:
     gram[0, :40, 40] = gram[0, 40, :40] = values
     gram[0, 40, 40] = values @ values
     factor = Factor(gram, np.array([40, 0, 0, 0, 0, 0]), model.parameter_names)
-    weights = np.ones(6)
-    found = consistent_estimate(
-        model,
-        factor,
-        estimate(model, factor, weights),
-        weights=weights,
-        options=Consistency(prior_weight=1e-6),
-    )
+    found = consistent_estimate(model, factor, weights=np.ones(6), prior_weight=1e-6)
     assert_possible(model, found)
     # From here on Table 2's own grouping.
     names = model.standard_names
@@ -371,46 +156,233 @@ def nearest_consistent(column: str) -> tuple[float, float]:
     return distance, float(np.sqrt(max(distance**2 - gap, 0.0)))
 
 
-def test_the_makers_parameters_are_possible() -> None:
-    distance, _ = nearest_consistent("pi_c")
-    assert distance < 1e-3
+class TestConsistentEstimate:
+    def test_from_poor_data_comes_a_possible_machine(self) -> None:
+        found = planted(truth(), 0.5, 1, samples=150)
+        assert_possible(MODEL, found)
+        assert found.status == "optimal"
+        assert np.all(found.margin > 0.0)
+
+    def test_base_parameters_are_those_of_the_standard_ones(self) -> None:
+        found, rank = planted(truth(), 0.3, 1, samples=300), MODEL.base.rank
+        expected = MODEL.base.grouping @ found.standard
+        np.testing.assert_allclose(found.estimate.values[:rank], expected, atol=1e-12)
+        np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
+
+    def test_where_least_squares_is_possible_it_is_hardly_moved(self) -> None:
+        found = planted(truth(), 0.02, 2)
+        assert np.abs(found.shift).max() < 0.1
+        assert cost(found) < 1e-5
+
+    def test_exact_data_of_the_nominal_give_every_parameter_back(self) -> None:
+        """Also those that no torque depends on: they are the nominal's."""
+        values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
+        np.testing.assert_allclose(planted(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
+
+    def test_friction_that_would_drive_is_none(self) -> None:
+        found = planted(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
+        for name in ("f0_1", "f1_2"):
+            assert found.unconstrained.value(name) < 0.0
+            assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
+        assert_possible(MODEL, found)
+
+    def test_the_third_friction_term_may_have_either_sign(self) -> None:
+        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
+        friction = np.array([4, 4, 2, 2, -0.1, 0.1, -1, 1])
+        values = np.concatenate([model.base.grouping @ model.nominal, friction])
+        found = planted(values, 0.001, 5, model=model)
+        np.testing.assert_allclose(found.friction, friction, rtol=0.05)
+
+    def test_no_other_possible_machine_fits_better(self) -> None:
+        values = with_friction(-1.0, 2.0, 1.5, 0.8)
+        values[MODEL.parameter_names.index("I2yy")] = -0.1  # no machine: the constraints bind
+        motion = a_motion(MODEL, 6)
+        torque = measured(MODEL, motion, values, 0.4, 6)
+        found = fitted(MODEL, motion, torque, prior_weight=1e-4)
+        # The same objective from the samples, and its gradient.
+        factor = Factor.from_samples(MODEL, motion, torque)
+        weights = joint_weights(factor)
+        root, target = rows_of(factor.weighted(weights))
+        excess = float(np.sum((root @ found.estimate.values - target) ** 2))
+        assert excess > 100.0
+        rank, s = MODEL.base.rank, len(MODEL.standard_names)
+        mapping = np.zeros((MODEL.n_parameters, s + 4))
+        mapping[:rank, :s] = MODEL.base.grouping
+        mapping[rank:, s:] = np.eye(4)
+        rows = MODEL.regressor(*motion[1:]).dense(MODEL.n_parameters) @ mapping
+        x = np.concatenate([found.standard, found.friction])
+        gradient = 2.0 * np.einsum("tj,j,tjk->k", rows @ x - torque, weights, rows)
+        assert largest_gain(gradient, x, MODEL.chain.inertial) < 1e-2 * excess
+
+    @pytest.mark.parametrize("noise", [0.1, 0.01, 0.0])
+    def test_of_impossible_data_is_the_closest_machine(self, noise: float) -> None:
+        """As after a wrong sign of one torque, however exact the data are."""
+        values = with_friction(-1.0, 2.0, 1.5, 0.8)
+        values[MODEL.parameter_names.index("I2yy")] = -0.3
+        found = planted(values, noise, 6)
+        assert_possible(MODEL, found)
+        assert "no machine fits" in found.status
+        assert cost(found) > 0.02
+
+    def test_errors_and_covariance_are_those_it_says(self) -> None:
+        motion = a_motion(MODEL, 7, samples=300)
+        torque = measured(MODEL, motion, truth(), 0.3, 7)
+        found = fitted(MODEL, motion, torque)
+        error = MODEL.torque(found.estimate.values, *motion[1:]) - torque
+        rms = np.sqrt((error**2).mean(axis=0))
+        np.testing.assert_allclose(found.estimate.noise_std, rms, rtol=1e-6)
+        relative = np.linalg.norm(error) / np.linalg.norm(torque)
+        assert found.relative_error == pytest.approx(relative, rel=1e-6)
+        assert "covariance of the unconstrained estimate" in found.estimate.method
+        np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
+
+    def test_a_joint_that_never_moved_keeps_its_nominal_link(self) -> None:
+        law = FrictionLaw(third=None)
+        model = RobotModel.from_urdf(URDF, friction=law, gravity=(0, 0, 0))
+        motion = a_motion(model, 10)
+        for array in motion[1:4]:
+            array[:, 1] = 0.0
+        values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
+        torque = measured(model, motion, values, 0.01, 10)
+        mask = np.zeros(torque.shape, dtype=np.bool_)
+        mask[:, 0] = True
+        found = consistent_estimate(model, Factor.from_samples(model, motion, torque, mask))
+        assert_possible(model, found)
+        assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
+        assert np.all(np.isfinite(found.standard))
+        np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
+
+    def test_without_nominal_inertia_bodies_are_assumed(self) -> None:
+        bare = URDF
+        while "<inertial>" in bare:
+            start, end = bare.index("<inertial>"), bare.index("</inertial>") + len("</inertial>")
+            bare = bare[:start] + bare[end:]
+        empty = RobotModel.from_urdf(bare, friction=FrictionLaw(third=None))
+        motion = a_motion(MODEL, 12)
+        found = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
+        assert all(words.startswith("assumed") for words in found.reference)
+        assert_possible(empty, found)
+        assert cost(found) < 1e-3
+
+    @pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
+    def test_ns16_predicts_unseen_motion_as_well(self, noise: float) -> None:
+        """With a nominal that is 5 to 20 % wrong and knows no rotors."""
+        model, planted_rotors = RobotModel.from_urdf(urdf_text()), load_truth()
+        named = standard_parameters()
+        standard = np.array([named[name] for name in model.standard_names]).reshape(6, 11)
+        rng = np.random.default_rng(0)
+        standard[:, :10] *= 1.0 + rng.uniform(0.05, 0.2, (6, 1)) * rng.choice([-1.0, 1.0], (6, 1))
+        friction = (planted_rotors.coulomb, planted_rotors.viscous, planted_rotors.third)
+        values = np.concatenate([model.base.grouping @ standard.reshape(-1), *friction])
+        other = a_motion(model, 2)
+        found = planted(values, noise, 1, model=model)
+        assert_possible(model, found)
+        unseen = measured(model, other, values, noise, 4)
+
+        def error(values: Array) -> float:
+            wrong = model.torque(values, *other[1:]) - unseen
+            return float(np.linalg.norm(wrong) / np.linalg.norm(unseen))
+
+        assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
+
+    def test_the_makers_parameters_are_possible(self) -> None:
+        assert nearest_consistent("pi_c")[0] < 1e-3
+
+    def test_the_papers_method_b_is_not_possible(self) -> None:
+        distance, at_least = nearest_consistent("pi_b")
+        assert 1.4 < at_least <= distance < 1.43
+
+    @pytest.mark.parametrize(
+        "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
+    )
+    def test_other_robots(self, path: str) -> None:
+        """Their nominal parameters are partly no bodies."""
+        model = RobotModel.from_urdf(robot_text(path))
+        friction = np.repeat([2.0, 1.0, 0.0], model.n_joints)
+        standard = model.nominal.reshape(model.n_joints, -1).copy()
+        standard[:, 10] = 0.5
+        values = np.concatenate([model.base.grouping @ standard.reshape(-1), friction])
+        found = planted(values, 0.1, 1, model=model)
+        assert_possible(model, found)
+        assert cost(found) < 1e-3
+
+    def test_an_estimate_of_other_parameters_is_refused(self) -> None:
+        other = RobotModel.from_urdf(URDF)
+        motion = a_motion(MODEL, 1, samples=200)
+        torque = measured(MODEL, motion, truth(), 0.1, 1)
+        wrong = estimate(other, Factor.from_samples(other, motion, torque))
+        with pytest.raises(IdentificationError, match="other parameters"):
+            fitted(MODEL, motion, torque, unconstrained=wrong)
 
 
-def test_the_papers_method_b_is_not_possible() -> None:
-    distance, at_least = nearest_consistent("pi_b")
-    assert 1.4 < at_least <= distance < 1.43
+class TestDrives:
+    """Coupled drives, and friction of more than three terms."""
 
+    TURNS = np.array([[1.0, 0.0], [0.5, 1.0]])
 
-# Robots of other makers, whose nominal parameters are partly no bodies.
+    def coupled(self, inertia: float) -> tuple[RobotModel, Array]:
+        law = FrictionLaw(third=None)
+        model = RobotModel.from_urdf(URDF, friction=law, coupling=Coupling(self.TURNS))
+        standard = model.nominal
+        standard[model.layout.rotors] = 0.4, 0.1
+        standard[model.layout.couplings] = inertia
+        return model, standard
 
+    @pytest.mark.parametrize("inertia", [0.12, 0.6, -0.6])
+    def test_the_rotors_matrix_is_possible(self, inertia: float) -> None:
+        """And where the planted one is, it costs nothing."""
+        model, standard = self.coupled(inertia)
+        friction = np.full(len(model.friction.terms), 0.8)
+        values = np.concatenate([model.base.grouping @ standard, friction])
+        found = planted(values, 0.01, 1, model=model)
+        assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
+        assert np.all(found.margin > 0.0)
+        assert (cost(found) < 1e-4) == (inertia == 0.12)
 
-@pytest.mark.parametrize(
-    "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
-)
-def test_other_robots(path: str) -> None:
-    try:
-        package = distribution("example-robot-data")
-    except PackageNotFoundError:
-        pytest.skip("the example-robot-data package is not installed")
-    root = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
-    model = RobotModel.from_urdf((root / path).read_text(encoding="utf-8"))
-    friction = np.tile(np.array([2.0, 1.0, 0.0]), (model.n_joints, 1)).T.reshape(-1)
-    standard = model.nominal.reshape(model.n_joints, -1).copy()
-    standard[:, 10] = 0.5
-    truth = np.concatenate([model.base.grouping @ standard.reshape(-1), friction])
-    motion = a_motion(model, 1)
-    found = fitted(model, motion, measured(model, motion, truth, 0.1, 1))
-    assert_possible(model, found)
-    assert found.cost < 1e-3
+    def test_the_coupled_ns16_is_written_as_a_urdf(self) -> None:
+        wrist = np.eye(6)
+        wrist[4, 3], wrist[5, 4], wrist[5, 3] = -0.2, -0.3, 0.16
+        law = FrictionLaw(third=None)
+        model = RobotModel.from_urdf(urdf_text(), friction=law, coupling=Coupling(wrist))
+        known = standard_parameters()
+        standard = np.array([known.get(name, 0.0) for name in model.standard_names])
+        standard[model.layout.couplings] = -0.03, 0.01, -0.02
+        friction = np.random.default_rng(0).uniform(1.0, 9.0, len(model.friction.terms))
+        values = np.concatenate([model.base.grouping @ standard, friction])
+        found = planted(values, 0.02, 1, model=model)
+        assert found.status == "optimal"
+        assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
+        assert cost(found) < 1e-3
+        assert np.all(found.friction > 0.0)
+        write_urdf(urdf_text(), model, found.standard, found.friction)
+        assert not_in_urdf(model) == (
+            "rotor inertias", "coupling inertias", "friction of coupled motors",
+        )  # fmt: skip
 
+    def test_impossible_coupling_inertias_are_not_written(self) -> None:
+        model, standard = self.coupled(0.3)
+        with pytest.raises(NotConsistentError, match="coupling"):
+            write_urdf(URDF, model, standard)
 
-def test_an_estimate_of_other_parameters_is_refused(two_link: RobotModel) -> None:
-    other = RobotModel.from_urdf(TWO_LINK)
-    motion = a_motion(two_link, 1, samples=200)
-    torque = measured(two_link, motion, two_link_truth(two_link), 0.1, 1)
-    wrong: Estimate = estimate(other, Factor.from_samples(other, motion, torque))
-    with pytest.raises(IdentificationError, match="other parameters"):
-        consistent_estimate(two_link, Factor.from_samples(two_link, motion, torque), wrong)
+    def test_friction_by_direction_and_at_low_speed_takes_energy(self) -> None:
+        """Planted against nature: more viscous difference than viscosity, less friction at rest."""
+        law = FrictionLaw(third=None, asymmetric=True, stribeck=0.3)
+        model = RobotModel.from_urdf(URDF, friction=law)
+        terms = {"f0": 1.0, "f1": 0.3, "fd": 0.6, "fs": -2.0, "fo": 0.2}
+        base = model.base.grouping @ model.nominal
+
+        def friction() -> Array:
+            return np.array([terms[term.symbol] for term in model.friction.terms])
+
+        found = planted(np.append(base, friction()), 0.01, 1, model=model)
+        for own in model.friction.table(found.friction):
+            assert own["f0"] >= 0.0
+            assert own["f0"] + own["fs"] >= -1e-12
+            assert abs(own["fd"]) <= own["f1"] + 1e-12
+        # And what nature makes comes back.
+        terms |= {"f1": 0.9, "fs": 0.7}
+        found = planted(np.append(base, friction()), 0.0, 1, model=model)
+        np.testing.assert_allclose(found.friction, friction(), rtol=0.02)
 
 
 def a_problem(seed: int) -> Smooth:
@@ -434,49 +406,87 @@ def start(scale: float = 1.0) -> Array:
     return scale * np.concatenate([unit, unit, np.ones(3)])
 
 
-@given(st.integers(0, 2**16))
-@settings(max_examples=20)
-def test_gradient_and_hessian_are_the_derivatives(seed: int) -> None:
-    problem = a_problem(seed)
-    u = start() + 0.05 * np.random.default_rng(seed).normal(size=23)
-    gradient, hessian = problem.derivatives(u)
-    scale = np.abs(hessian).max()
-    np.testing.assert_allclose(
-        gradient, approx_fprime(u, problem.value, 1e-7), atol=1e-4 * np.abs(gradient).max()
-    )
-    numeric = approx_fprime(u, lambda x: problem.derivatives(x)[0], 1e-7)
-    np.testing.assert_allclose(hessian, numeric, atol=1e-4 * scale)
+class TestNewton:
+    @given(st.integers(0, 2**16))
+    @settings(max_examples=20)
+    def test_gradient_and_hessian_are_the_derivatives(self, seed: int) -> None:
+        problem = a_problem(seed)
+        u = start() + 0.05 * np.random.default_rng(seed).normal(size=23)
+        gradient, hessian = problem.derivatives(u)
+        scale = np.abs(hessian).max()
+        np.testing.assert_allclose(
+            gradient, approx_fprime(u, problem.value, 1e-7), atol=1e-4 * np.abs(gradient).max()
+        )
+        numeric = approx_fprime(u, lambda x: problem.derivatives(x)[0], 1e-7)
+        np.testing.assert_allclose(hessian, numeric, atol=1e-4 * scale)
+
+    @given(st.integers(0, 2**16))
+    @settings(max_examples=20)
+    def test_every_start_and_the_path_end_at_the_same_minimum(self, seed: int) -> None:
+        problem = a_problem(seed)
+        found = [
+            polish(problem, start()),
+            polish(problem, start(3.0)),
+            follow_path(problem, start(), lambda _: problem.weight, 1e3),
+        ]
+        assert all(one.converged for one in found)
+        for one in found[1:]:
+            np.testing.assert_allclose(one.u, found[0].u, atol=1e-6)
+        u = found[0].u
+        assert np.all(u[[20, 21]] >= 0.0)
+
+    @given(st.integers(0, 2**16))
+    @settings(max_examples=20)
+    def test_at_the_minimum_no_allowed_direction_leads_down(self, seed: int) -> None:
+        problem = a_problem(seed)
+        found = polish(problem, start())
+        assert found.converged
+        rng = np.random.default_rng(seed)
+        value = problem.value(found.u)
+        for _ in range(20):
+            other = found.u + 10.0 ** rng.uniform(-5, 0) * rng.normal(size=23)
+            other[[20, 21]] = np.maximum(other[[20, 21]], 0.0)
+            assert problem.value(other) >= value - 1e-9 * abs(value)
+
+    def test_a_start_outside_has_not_converged(self) -> None:
+        assert not polish(a_problem(0), start(-1.0)).converged
 
 
-@given(st.integers(0, 2**16))
-@settings(max_examples=20)
-def test_every_start_and_the_path_end_at_the_same_minimum(seed: int) -> None:
-    problem = a_problem(seed)
-    found = [
-        polish(problem, start()),
-        polish(problem, start(3.0)),
-        follow_path(problem, start(), lambda _: problem.weight),
-    ]
-    assert all(one.converged for one in found)
-    for one in found[1:]:
-        np.testing.assert_allclose(one.u, found[0].u, atol=1e-6)
-    u = found[0].u
-    assert np.all(u[[20, 21]] >= 0.0)
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    motion = lively_motion()
+    return recording(gaussian(np.random.default_rng(3), motion), motion)
 
 
-@given(st.integers(0, 2**16))
-@settings(max_examples=20)
-def test_at_the_minimum_no_allowed_direction_leads_down(seed: int) -> None:
-    problem = a_problem(seed)
-    found = polish(problem, start())
-    assert found.converged
-    rng = np.random.default_rng(seed)
-    value = problem.value(found.u)
-    for _ in range(20):
-        other = found.u + 10.0 ** rng.uniform(-5, 0) * rng.normal(size=23)
-        other[[20, 21]] = np.maximum(other[[20, 21]], 0.0)
-        assert problem.value(other) >= value - 1e-9 * abs(value)
+@pytest.fixture(scope="module")
+def equations(samples: Samples) -> NormalEquations:
+    total = total_phase(MODEL, [samples]).total
+    return total.weighted(joint_weights(total))
 
 
-def test_a_start_outside_has_not_converged() -> None:
-    assert not polish(a_problem(0), start(-1.0)).converged
+class TestShrunkEstimate:
+    def test_strength_zero_is_least_squares(self, samples: Samples) -> None:
+        shrunk = fit_shrunk(MODEL, [samples], Shrinkage(0.0))
+        free = fit_least_squares(MODEL, [samples])
+        np.testing.assert_allclose(shrunk.values, free.values, rtol=1e-9)
+        np.testing.assert_allclose(shrunk.covariance, free.covariance, rtol=1e-6)
+
+    def test_infinite_strength_is_the_consistent_solution(self, samples: Samples) -> None:
+        total = total_phase(MODEL, [samples]).total
+        centre = consistent_estimate(MODEL, total, prior_weight=0.1).estimate.values
+        shrunk = fit_shrunk(MODEL, [samples], Shrinkage(math.inf))
+        np.testing.assert_array_equal(shrunk.values, centre)
+
+    def test_it_solves_the_penalised_equations(self, equations: NormalEquations) -> None:
+        """(A + s D) (x - c) = b - A c with D = diag(A), for any centre c."""
+        far = truth() + 1.0
+        values = shrunk_values(equations, far, 0.3)
+        penalised = equations.A + 0.3 * np.diag(np.diag(equations.A))
+        residual = equations.b - equations.A @ far - penalised @ (values - far)
+        assert np.abs(residual).max() < 1e-8 * np.abs(equations.b).max()
+
+    def test_without_data_it_stays_at_the_centre(self, equations: NormalEquations) -> None:
+        unseen = equations.A.copy()
+        unseen[:, 0] = unseen[0, :] = 0.0
+        blind = equations._replace(A=unseen, b=np.append(0.0, equations.b[1:]))
+        assert shrunk_values(blind, np.full(MODEL.n_parameters, 7.0), 0.1)[0] == 7.0
