@@ -76,7 +76,6 @@ LONG: Final = (
     "hil/test_viewers.py",
     "identification/test_calibration.py",
     "identification/test_causes.py",
-    "identification/test_closed_loop.py",
     "identification/test_gains.py",
     "identification/test_instrumental.py",
     "identification/test_low_passes.py",

@@ -38,7 +38,6 @@ from identification.factor.factor import (
     nothing_usable,
     residual_variance,
     solve,
-    total,
 )
 from identification.factor.phases import PhaseFactor, add_grams, equal_runs, joined, merged
 from identification.model.motion import Motion
@@ -493,8 +492,10 @@ class _Problem:
         """
         heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts):
-            parts = [reader.at(self.model, float(shift)) for reader in self.readers]
-            factor = total([Factor.of(self.model, part) for part in parts])
+            parts = (
+                Factor.of(self.model, one.at(self.model, float(shift))) for one in self.readers
+            )
+            factor = sum(parts, Factor.zero(self.model))
             moving = factor.samples > 0
             if moving.any():
                 found = estimate(self.model, factor)

@@ -32,9 +32,9 @@ from identification.estimators.covariance import block_length, spread, with_bloc
 from identification.factor.factor import (
     WORST_CONDITION,
     Estimate,
-    Factor,
     estimate,
     estimate_of,
+    inverse_variance,
     joint_weights,
     residual_variance,
 )
@@ -70,30 +70,21 @@ class Instruments(NamedTuple):
         motion: m instants of n joints.
         usable: where it is known (m, n).
         lag: by which the measured motion follows the command (n,) [s]; NaN for a joint that
-            does not move, or where nothing was shifted.
-        source: where it comes from, in words.
+            does not move.
     """
 
     motion: Motion
     usable: NDArray[np.bool_]
     lag: Array
-    source: str
 
 
-def planned_motion(
-    samples: Samples,
-    commanded: Array,
-    *,
-    bandwidth: float = RIGID_BANDWIDTH,
-    lag: Array | None = None,
-) -> Instruments:
+def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = None) -> Instruments:
     """Commanded motion, shifted by the lag of each axis.
 
     Args:
         samples: the measured motion.
         commanded: commanded positions in the rows of the samples (m, n) [rad or m], NaN where
             nothing was commanded.
-        bandwidth: of the derivatives [Hz]; the same as that of the measured motion's.
         lag: of each axis where it is known from the same motion (n,) [s]; else it is sought.
 
     Raises:
@@ -101,32 +92,30 @@ def planned_motion(
     """
     measured, time = samples.motion.position, samples.motion.time
     known = np.asarray(np.isfinite(commanded).all(axis=1))
+    tolerance = np.full(commanded.shape[1], _COMMAND_TOLERANCE)
     splines = []
     for segment in samples.segments:
         rows = np.flatnonzero(known[segment]) + segment.start
-        if len(rows) < 2 * ORDER:
-            continue
-        tolerance = np.full(commanded.shape[1], _COMMAND_TOLERANCE)
-        spline = fit_smoothing_spline(time[rows], commanded[rows], tolerance, widest=bandwidth)
-        splines.append((rows, spline))
+        if len(rows) >= 2 * ORDER:
+            own = fit_smoothing_spline(
+                time[rows], commanded[rows], tolerance, widest=RIGID_BANDWIDTH
+            )
+            splines.append((rows, own))
     if not splines:
         raise IdentificationError("nothing was commanded: there are no instruments to be had")
     if lag is None:
-        longest_rows, longest = max(splines, key=lambda pair: len(pair[0]))
-        lag = tracking_lag(time[longest_rows], measured[longest_rows], longest)
+        longest, spline = max(splines, key=lambda pair: len(pair[0]))
+        lag = tracking_lag(time[longest], measured[longest], spline)
     if np.isnan(lag).all():
         raise IdentificationError("no joint is commanded to move: there are no instruments")
-    shape = (3, *measured.shape)
-    derivatives, usable = np.zeros(shape), np.zeros(measured.shape, dtype=np.bool_)
+    derivatives, usable = np.zeros((3, *measured.shape)), np.zeros(measured.shape, dtype=np.bool_)
     for rows, spline in splines:
-        for joint, own in enumerate(np.nan_to_num(lag)):
-            at = time[rows] - own
+        for joint, shift in enumerate(np.nan_to_num(lag)):
+            at = time[rows] - shift
             for order in range(3):
                 derivatives[order, rows, joint] = spline(at, order)[:, joint]
             usable[rows, joint] = (at >= time[rows[0]]) & (at <= time[rows[-1]])
-    return Instruments(
-        Motion(time, *derivatives), usable, lag, "the commanded motion, later by each axis's lag"
-    )
+    return Instruments(Motion(time, *derivatives), usable, lag)
 
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
@@ -171,23 +160,20 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
     thin = slice(None, None, max(1, len(time) // _ROWS))
     time, measured = time[thin], measured[thin]
     inside = time >= time[0] + LONGEST_LAG
-    if np.count_nonzero(inside) < 2 * ORDER:
-        inside = np.ones(len(time), dtype=np.bool_)
-    at, wanted = time[inside], measured[inside]
+    if np.count_nonzero(inside) >= 2 * ORDER:
+        time, measured = time[inside], measured[inside]
 
     def misfit(lag: float) -> Array:
-        return np.asarray(np.var(wanted - command(at - lag), axis=0))
+        return np.asarray(np.var(measured - command(time - lag), axis=0))
 
     grid = np.arange(-_LAG_STEP, LONGEST_LAG + _LAG_STEP, _LAG_STEP)
     table = np.array([misfit(float(lag)) for lag in grid])
-    moves = np.ptp(command(at), axis=0) > 1e-6
     lags = np.full(measured.shape[1], np.nan)
-    for joint in np.flatnonzero(moves):
+    for joint in np.flatnonzero(np.ptp(command(time), axis=0) > 1e-6):
         best = int(np.argmin(table[:, joint]))
-        around = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
         lags[joint] = scipy.optimize.minimize_scalar(
             lambda lag, j=joint: misfit(lag)[j],
-            bounds=around,
+            bounds=(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]),
             method="bounded",
             options={"xatol": 1e-6},
         ).x
@@ -208,14 +194,12 @@ class InstrumentalEstimate:
         estimate: by instrumental variables, with cluster-robust covariance.
         least_squares: of the same rows and weights, likewise.
         weights: per joint (n,).
-        strength: Shea's partial R² per parameter (p,), zero where the instruments say nothing.
         weak: names of parameters whose instrument is too weak for the estimate to be trusted.
     """
 
     estimate: Estimate
     least_squares: Estimate
     weights: Array
-    strength: Array
     weak: tuple[str, ...]
 
 
@@ -267,6 +251,9 @@ def estimate_instrumental(
 ) -> InstrumentalEstimate:
     """Estimate with instrumental variables.
 
+    The covariance is the sandwich over blocks, how the estimate moves when one is left out: that of
+    least squares (:mod:`identification.estimators.covariance`) with Z'W for W'W.
+
     Args:
         model: the robot.
         factor: see :func:`identification.factor.phases.instrument_factor`; of one repetition,
@@ -275,29 +262,45 @@ def estimate_instrumental(
             whose weights are those of least squares.
 
     Raises:
-        IdentificationError: the factor holds no rows, or belongs to another model.
+        IdentificationError: the factor holds no rows.
     """
-    if factor.parameter_names[model.n_parameters :] != model.parameter_names:
-        raise IdentificationError("the samples belong to a model of other parameters")
+    p, names = model.n_parameters, model.parameter_names
     if not factor.samples.any():
         raise IdentificationError("there is not one row in which samples and instruments move")
     measured = measured_part(factor)
     rows = measured.total
     if weights is None:
-        weights = _weights(factor, rows)
+        first = joint_weights(rows)
+        values = solve_cross(factor.weighted(first).sum(axis=0)).values
+        root = rows.solve(first).root
+        weights = inverse_variance(residual_variance(rows, values, root, first))
     blocks = factor.weighted(weights)[factor.samples.any(axis=1)]
     total = blocks.sum(axis=0)
     solution = solve_cross(total)
     strength = np.where(solution.determined, partial_r2(total), 0.0)
     first_stage = strength / np.maximum(1.0 - strength, 1e-12) * len(blocks)
+    cross, moments = blocks[:, :p, p : 2 * p], blocks[:, :p, -1]
+    length = block_length(moments - cross @ solution.values)
+    cross = merged(cross, length)
+    scores = merged(moments, length) - cross @ solution.values
+    moved = spread(cross, scores, solution.right, solution.left)
+    found = estimate_of(
+        model.units,
+        rows,
+        rows.solve(weights)._replace(
+            values=solution.values, condition=solution.condition, determined=solution.determined
+        ),
+        weights,
+        f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
+        f" {length * FINE_BLOCK:g} s",
+        moved.T @ moved,
+        float(student_limit(0.025, max(1, len(scores) - 1))),
+    )
     return InstrumentalEstimate(
-        estimate=_with_covariance(model, rows, blocks, solution, weights),
+        estimate=found,
         least_squares=with_block_covariance(estimate(model, rows, weights), measured, weights),
         weights=weights,
-        strength=strength,
-        weak=tuple(
-            name for name, f in zip(model.parameter_names, first_stage, strict=True) if f < WEAK
-        ),
+        weak=tuple(name for name, f in zip(names, first_stage, strict=True) if f < WEAK),
     )
 
 
@@ -321,38 +324,3 @@ def partial_r2(total: Array) -> Array:
 def _inverse(matrix: Array) -> Array:
     """Inverse of a symmetric matrix without the directions that carry no information."""
     return np.asarray(np.linalg.pinv(matrix, rcond=1.0 / WORST_CONDITION**2, hermitian=True))
-
-
-def _weights(factor: PhaseFactor, rows: Factor) -> Array:
-    """Inverse residual variance per joint (n,) of an instrumental fit, zero without rows."""
-    first = joint_weights(rows)
-    solution = solve_cross(factor.weighted(first).sum(axis=0))
-    variance = residual_variance(rows, solution.values, rows.solve(first).root, first)
-    return np.where(np.isnan(variance), 0.0, 1.0 / variance)
-
-
-def _with_covariance(
-    model: RobotModel, rows: Factor, blocks: Array, solution: CrossSolution, weights: Array
-) -> Estimate:
-    """Estimate with the sandwich over blocks: how it moves when one block is left out.
-
-    The same as for least squares (:mod:`identification.estimators.covariance`), with Z'W for W'W.
-    """
-    p = rows.n_parameters
-    cross, moments = blocks[:, :p, p : 2 * p], blocks[:, :p, -1]
-    length = block_length(moments - cross @ solution.values)
-    cross = merged(cross, length)
-    scores = merged(moments, length) - cross @ solution.values
-    moved = spread(cross, scores, solution.right, solution.left)
-    return estimate_of(
-        model,
-        rows,
-        rows.solve(weights)._replace(
-            values=solution.values, condition=solution.condition, determined=solution.determined
-        ),
-        moved.T @ moved,
-        weights,
-        f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
-        f" {length * FINE_BLOCK:g} s",
-        float(student_limit(0.025, max(1, len(scores) - 1))),
-    )

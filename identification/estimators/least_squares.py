@@ -16,14 +16,15 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.covariance import clustered_covariance, with_block_covariance
+from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
 from identification.factor.factor import (
     Estimate,
     Factor,
     QRFactor,
+    Solution,
     estimate,
+    estimate_of,
     joint_weights,
-    nothing_usable,
     reduced,
 )
 from identification.factor.phases import PhaseFactor, total_phase
@@ -56,20 +57,26 @@ def fit_least_squares(
     """
     phase = total_phase(model, recordings) if phase is None else phase
     factor = reduced(model, recordings, phase.total)
-    if not factor.samples.any():
-        raise IdentificationError(nothing_usable(model))
     weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(factor)
-    if not isinstance(factor, QRFactor):
-        classical = estimate(model, factor, weights)
-        return with_block_covariance(classical, phase, weights, f"{weighting} least squares")
-    solution = factor.solve(weights)
-    clustered = clustered_covariance(model, recordings, solution, weights)
-    return replace(
-        estimate(model, factor, weights),
-        covariance=clustered.covariance,
-        interval_factor=clustered.interval_factor,
-        method=f"{weighting} least squares by QR, {clustered.words}",
+    solution, found = clustered_fit(model, factor, recordings, phase, weights)
+    method = f"{weighting} least squares{factor.words}, {found.words}"
+    return estimate_of(
+        model.units, factor, solution, weights, method, found.covariance, found.interval_factor
     )
+
+
+def clustered_fit(
+    model: RobotModel,
+    factor: Factor,
+    recordings: Sequence[Samples],
+    phase: PhaseFactor,
+    weights: Array,
+) -> tuple[Solution, Clustered]:
+    """Solution with weights (n,), and its cluster-robust covariance; QR reads the samples again."""
+    solution = factor.solve(weights)
+    if isinstance(factor, QRFactor):
+        return solution, clustered_covariance(model, recordings, solution, weights)
+    return solution, block_covariance(phase, weights, solution.values)
 
 
 # Share of equal repetitions that scatter by less than what counts as more than chance.
@@ -90,10 +97,6 @@ class RepeatedEstimate:
         phase: sum of all factors, by time of the motion.
         factor: the same without regard to time.
         classical_std: of weighted least squares on all samples if residuals were white (p,).
-        independent_std: of the pooled estimate if repetitions were independent: root mean square
-            of the repetitions' own standard deviations over sqrt(R) (p,).
-        scatter_std: standard deviation over the repetitions over sqrt(R) (p,): what noise alone
-            does, NaN for one repetition.
     """
 
     pooled: Estimate
@@ -101,8 +104,6 @@ class RepeatedEstimate:
     phase: PhaseFactor
     factor: Factor
     classical_std: Array
-    independent_std: Array
-    scatter_std: Array
 
     @classmethod
     def of(
@@ -113,23 +114,8 @@ class RepeatedEstimate:
         phase: PhaseFactor,
     ) -> RepeatedEstimate:
         """Put an estimate from all beside those from each."""
-        values = np.array([one.values for one in repetitions])
-        root = np.sqrt(len(repetitions))
-        variances = [np.diag(one.covariance) for one in repetitions]
         factor = phase.total
-        return cls(
-            pooled=pooled,
-            repetitions=tuple(repetitions),
-            phase=phase,
-            factor=factor,
-            classical_std=estimate(model, factor).std,
-            independent_std=np.sqrt(np.mean(variances, axis=0)) / root,
-            scatter_std=(
-                values.std(axis=0, ddof=1) / root
-                if len(values) > 1
-                else np.full(values.shape[1], np.nan)
-            ),
-        )
+        return cls(pooled, tuple(repetitions), phase, factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
         """The estimate with intervals no narrower than its repetitions scatter.
@@ -137,19 +123,38 @@ class RepeatedEstimate:
         Blocks of time are shared by the repetitions, and errors of opposite signs in some of them
         (a payload in every other one) cancel there.
         """
-        values = np.array([one.values for one in self.repetitions])
-        covariance = no_narrower(self.pooled.covariance, values)
+        covariance = no_narrower(self.pooled.covariance, self.values)
         return replace(self, pooled=replace(self.pooled, covariance=covariance))
+
+    @property
+    def values(self) -> Array:
+        """Of the repetitions (R, p)."""
+        return np.array([one.values for one in self.repetitions])
 
     @property
     def mean(self) -> Array:
         """Mean over the repetitions (p,), as in the paper's Table 2."""
-        return np.asarray(np.mean([one.values for one in self.repetitions], axis=0))
+        return np.asarray(self.values.mean(axis=0))
 
     @property
     def std(self) -> Array:
         """Standard deviation over the repetitions (p,), NaN for one."""
-        return np.asarray(self.scatter_std * np.sqrt(len(self.repetitions)))
+        many = len(self.repetitions) > 1
+        return self.values.std(axis=0, ddof=1) if many else np.full(len(self.pooled.values), np.nan)
+
+    @property
+    def scatter_std(self) -> Array:
+        """Standard deviation of that mean (p,): what noise alone does, NaN for one repetition."""
+        return np.asarray(self.std / np.sqrt(len(self.repetitions)))
+
+    @property
+    def independent_std(self) -> Array:
+        """Of the pooled estimate if repetitions were independent (p,).
+
+        Root mean square of the repetitions' own standard deviations over sqrt(R).
+        """
+        variances = [np.diag(one.covariance) for one in self.repetitions]
+        return np.sqrt(np.mean(variances, axis=0)) / np.sqrt(len(variances))
 
 
 def no_narrower(covariance: Array, values: Array) -> Array:
@@ -194,11 +199,10 @@ def estimate_repetitions(
     def weighted(some: Sequence[Samples], factor: PhaseFactor) -> Estimate:
         return fit_least_squares(model, some, phase=factor)
 
-    fit = weighted if fit is None else fit
-    each = fit if each is None else each
+    fit = fit or weighted
     phase, repetitions = PhaseFactor.zero(model), []
     for samples in recordings:
         own = PhaseFactor.from_samples(model, samples)
-        repetitions.append(each([samples], own))
+        repetitions.append((each or fit)([samples], own))
         phase = phase + own
     return RepeatedEstimate.of(model, fit(recordings, phase), repetitions, phase)

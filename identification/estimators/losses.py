@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
-
 Array = NDArray[np.float64]
 
 
@@ -46,11 +44,6 @@ class Huber(Loss):
 
     tuning: float = 1.345
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.tuning) and self.tuning > 0.0):
-            text = f"a loss with the constant {self.tuning}: it must be positive"
-            raise IdentificationError(text)
-
     @property
     def name(self) -> str:
         """Name and constant, in words."""
@@ -66,7 +59,7 @@ class Huber(Loss):
 
 
 @dataclass(frozen=True)
-class Tukey(Huber):
+class Tukey(Loss):
     """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974).
 
     Has more than one minimum and must be started close to the right one, from Huber's.
@@ -84,12 +77,12 @@ class Tukey(Huber):
 
     def weight(self, x: Array) -> Array:
         """Return (1 - (x/c)²)² within c, zero beyond."""
-        return np.asarray(np.maximum(1.0 - self._squared(x), 0.0) ** 2)
+        return np.asarray((1.0 - self._squared(x)) ** 2)
 
     def slope(self, x: Array) -> Array:
         """Return (1 - (x/c)²)(1 - 5 (x/c)²) within c, zero beyond."""
         squared = self._squared(x)
-        return np.maximum(1.0 - squared, 0.0) * (1.0 - 5.0 * squared)
+        return (1.0 - squared) * (1.0 - 5.0 * squared)
 
     def _squared(self, x: Array) -> Array:
         # Clipped, so that an infinite residual has weight zero and not NaN.

@@ -17,16 +17,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
-from identification.estimators.covariance import block_covariance, clustered_covariance
+from identification.errors import IdentificationError
+from identification.estimators.least_squares import clustered_fit
 from identification.factor.factor import (
     Estimate,
     Factor,
-    QRFactor,
     estimate_of,
     joint_weights,
     mark_undetermined,
-    nothing_usable,
     reduced,
     solve_rows,
 )
@@ -60,22 +58,12 @@ class GaussianPrior:
     words: str
 
     @classmethod
-    def independent(cls, mean: Array, std: Array, words: str = "given") -> GaussianPrior:
-        """Prior with one standard deviation per parameter (p,), infinite for none.
-
-        With mean zero this is ridge regression in units of `std`.
-
-        Raises:
-            IdentificationError: a standard deviation is not positive.
-            ShapeError: mean and std differ in shape.
-        """
-        return cls.of_combinations(np.eye(len(mean)), mean, std, words)
-
-    @classmethod
     def of_combinations(
         cls, combinations: Array, mean: Array, std: Array, words: str = "given"
     ) -> GaussianPrior:
         """Prior on ``combinations @ s`` of independent quantities s.
+
+        With the identity and mean zero this is ridge regression in units of `std`.
 
         Args:
             combinations: (p, s), of full rank.
@@ -86,21 +74,18 @@ class GaussianPrior:
 
         Raises:
             IdentificationError: a standard deviation is not positive.
-            ShapeError: the arrays do not fit together.
         """
-        mean, std = np.asarray(mean, dtype=np.float64), np.asarray(std, dtype=np.float64)
-        for name, array in (("mean", mean), ("std", std)):
-            if array.shape != (combinations.shape[1],):
-                raise ShapeError(name, array.shape, f"({combinations.shape[1]},)")
-        if not np.all(np.isfinite(mean)) or not np.all(std > 0.0):
-            raise IdentificationError("a prior needs finite means and positive deviations")
+        if not np.all(std > 0.0):
+            raise IdentificationError("a prior needs positive deviations")
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
-        size = np.linalg.norm(spread, axis=1)
-        size = np.where(size > 0.0, size, 1.0)
+        size = _length(spread, axis=1)
         seen = _orthogonal_to(combinations[:, flat] / size[:, None])
         seen_spread = seen.T @ (spread / size[:, None])
-        root = _inverse_root(seen_spread @ seen_spread.T) @ seen.T / size
+        covariance = seen_spread @ seen_spread.T
+        scale = np.sqrt(np.diag(covariance))
+        lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
+        root = np.linalg.solve(lower, seen.T / scale[:, None]) / size
         return cls(combinations @ mean, np.asarray(root), words)
 
     @property
@@ -179,10 +164,7 @@ def with_prior(
 
     Raises:
         IdentificationError: some rows, but too few to know the noise from, and no weights.
-        ShapeError: the prior is on another number of parameters.
     """
-    if prior.mean.shape != (model.n_parameters,):
-        raise ShapeError("prior mean", prior.mean.shape, f"({model.n_parameters},)")
     if weights is None:
         weights = _weights(factor)
     rows, target = factor.rows(weights)
@@ -197,15 +179,10 @@ def with_prior(
         values=prior.mean + posterior.values,
         condition=solve_rows(rows, target).condition if len(rows) else np.inf,
     )
-    estimate = estimate_of(
-        model,
-        factor,
-        solution,
-        posterior.inverse,
-        weights / design_effect,
-        f"weighted least squares with a Gaussian prior ({prior.words}),"
-        " posterior covariance (white residuals)",
-    )
+    method = f"weighted least squares with a Gaussian prior ({prior.words}), posterior covariance"
+    if design_effect > 1.0:
+        method += f", {design_effect:.3g} rows counted as one for their colour"
+    estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
     return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
 
 
@@ -234,26 +211,12 @@ def fit_with_prior(
     """
     phase = total_phase(model, recordings) if phase is None else phase
     factor = reduced(model, recordings, phase.total)
-    if not factor.samples.any():
-        raise IdentificationError(nothing_usable(model))
     weights = _weights(factor)
-    solution = factor.solve(weights)
-    clustered = (
-        clustered_covariance(model, recordings, solution, weights)
-        if isinstance(factor, QRFactor)
-        else block_covariance(phase, weights, solution.values)
-    )
+    _, clustered = clustered_fit(model, factor, recordings, phase, weights)
     effect = max(1.0, clustered.design_effect)
     result = with_prior(model, factor, prior, weights, design_effect=effect)
-    return replace(
-        result,
-        estimate=replace(
-            result.estimate,
-            interval_factor=clustered.interval_factor,
-            method=f"weighted least squares with a Gaussian prior ({prior.words}), posterior"
-            f" covariance, {effect:.3g} rows counted as one for their colour",
-        ),
-    )
+    estimate = replace(result.estimate, interval_factor=clustered.interval_factor)
+    return replace(result, estimate=estimate)
 
 
 def _weights(factor: Factor) -> Array:
@@ -266,29 +229,17 @@ def _weights(factor: Factor) -> Array:
     return joint_weights(factor) if rows else np.zeros(factor.n_joints)
 
 
-def _inverse_root(covariance: Array) -> Array:
-    """Lower triangular L^-1 with L L' = covariance.
-
-    Raises:
-        IdentificationError: the covariance is not positive definite.
-    """
-    scale = np.sqrt(np.abs(np.diag(covariance)))
-    if not (np.all(np.isfinite(covariance)) and np.all(scale > 0.0)):
-        raise IdentificationError("a prior covariance needs finite, positive variances")
-    try:
-        lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
-    except np.linalg.LinAlgError:
-        raise IdentificationError("the prior covariance is not positive definite") from None
-    return np.asarray(np.linalg.solve(lower, np.diag(1.0 / scale)))
+def _length(columns: Array, axis: int) -> Array:
+    """Lengths to divide by: one where there is nothing."""
+    length = np.linalg.norm(columns, axis=axis)
+    return np.where(length > 0.0, length, 1.0)
 
 
 def _orthogonal_to(columns: Array) -> Array:
     """Orthonormal basis (p, p - r) of what is orthogonal to columns (p, k) of rank r."""
     if columns.shape[1] == 0:
         return np.eye(len(columns))
-    length = np.linalg.norm(columns, axis=0)
-    acting = columns[:, length > 0.0] / length[length > 0.0]
-    left, singular, _ = np.linalg.svd(acting, full_matrices=True)
+    left, singular, _ = np.linalg.svd(columns / _length(columns, axis=0), full_matrices=True)
     rank = int(np.count_nonzero(singular > 1e-12 * singular.max(initial=0.0)))
     return np.asarray(left[:, rank:])
 
@@ -350,10 +301,8 @@ def _nominal_std(model: RobotModel, share: float) -> Array:
     inertia[inertia == 0.0], mass[mass == 0.0] = inertia.max(), mass.max()
     moment = values[:, _MOMENT].max(axis=1)
     moment = np.where(moment > 0.0, moment, np.sqrt(mass * inertia))
-    links = np.empty(values.shape)
-    links[:, _INERTIA] = share * inertia[:, None]
-    links[:, _MOMENT] = share * moment[:, None]
-    links[:, _MASS] = share * mass
     std = np.full(model.layout.size, np.inf)
-    std[model.layout.links] = links
+    std[model.layout.links] = share * np.repeat(
+        np.column_stack([inertia, moment, mass]), [6, 3, 1], axis=1
+    )
     return std

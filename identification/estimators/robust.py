@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
 from identification.estimators.covariance import clustered_covariance
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.factor.factor import (
@@ -26,10 +25,11 @@ from identification.factor.factor import (
     Factor,
     Solution,
     augmented_rows,
-    nothing_usable,
+    estimate_of,
+    inverse_variance,
     reduced,
-    undetermined_names,
 )
+from identification.factor.phases import total_phase
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -77,25 +77,25 @@ class RobustEstimate:
         return np.asarray(self.outlying > MOST_OUTLYING)
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Where the iteration stands.
+class _State(NamedTuple):
+    """Where the iteration is.
 
     Attributes:
         factor: of the rows as weighted last.
         solution: from it.
-        scale: standard deviation of each joint's good residuals (n,), NaN without rows.
+        scale: standard deviation of each joint's good residuals (n,), NaN without rows; infinite
+            at the start.
         residuals: per recording (m, n), of the values before the solution's.
         passes: over the samples so far.
-        held: whether the scale has settled and is not looked for again.
+        held: whether the scale is not looked for again.
         converged: whether the last pass changed nothing.
     """
 
     factor: Factor
     solution: Solution
     scale: Array
-    residuals: list[Array]
-    passes: int
+    residuals: tuple[Array, ...] = ()
+    passes: int = 1
     held: bool = False
     converged: bool = False
 
@@ -107,7 +107,6 @@ def robust_estimate(
     *,
     gram: Factor | None = None,
     most_iterations: int = MOST_ITERATIONS,
-    tolerance: float = TOLERANCE,
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once, one at a time.
 
@@ -121,61 +120,71 @@ def robust_estimate(
         loss: what a residual costs.
         gram: factor of the recordings, if it is known: saves a pass over the samples.
         most_iterations: for each loss. What has not converged by then is returned and says so.
-        tolerance: change in standard deviations that ends the iteration.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.
     """
-    factor = reduced(model, recordings, gram)
-    if not factor.samples.any():
-        raise IdentificationError(nothing_usable(model))
-    solution = factor.solve(np.ones(model.n_joints))
-    residuals = [np.full(samples.torque.shape, np.nan) for samples in recordings]
-    state = _State(factor, solution, np.full(model.n_joints, np.inf), residuals, 1)
-    if isinstance(loss, Tukey):
-        rough = max(tolerance, _ROUGH)
-        state = _iterate(model, recordings, state, Huber(), most_iterations, rough)
-    state = _iterate(model, recordings, state, loss, most_iterations, tolerance)
-    return _result(model, recordings, state, loss)
+    gram = total_phase(model, recordings).total if gram is None else gram
+    factor, n = reduced(model, recordings, gram), model.n_joints
+    state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
+    stages = [(Huber(), _ROUGH)] if isinstance(loss, Tukey) else []
+    for one, tolerance in [*stages, (loss, TOLERANCE)]:
+        state = state._replace(converged=False)
+        for _ in range(most_iterations):
+            state = _pass(model, recordings, state, one, tolerance)
+            if state.converged:
+                break
+    weights = inverse_variance(state.scale**2)
+    clustered = clustered_covariance(model, recordings, state.solution, weights, loss)
+    scaled = np.concatenate(state.residuals) / state.scale
+    rows = np.where(np.isfinite(state.scale), np.count_nonzero(np.isfinite(scaled), axis=0), np.nan)
+    ended = "" if state.converged else ", NOT converged"
+    estimate = estimate_of(
+        model.units,
+        state.factor,
+        state.solution._replace(determined=clustered.determined),
+        weights,
+        f"iteratively reweighted least squares{factor.words}, {loss.name}, {state.passes}"
+        f" passes{ended}, {clustered.words}",
+        clustered.covariance,
+        clustered.interval_factor,
+    )
+    return RobustEstimate(
+        estimate=replace(estimate, noise_std=state.scale),
+        outlying=np.count_nonzero(np.abs(scaled) > OUTLYING, axis=0) / rows,
+        iterations=state.passes,
+        converged=state.converged,
+    )
 
 
-def _iterate(
-    model: RobotModel,
-    recordings: Sequence[Samples],
-    state: _State,
-    loss: Loss,
-    most: int,
-    tolerance: float,
+def _pass(
+    model: RobotModel, recordings: Sequence[Samples], state: _State, loss: Loss, tolerance: float
 ) -> _State:
-    # The first pass finds the residuals of the start; only then there is a scale.
-    if not np.isfinite(state.scale).any():
-        state = _pass(model, recordings, state, Loss())
-    for _ in range(most):
-        new = _pass(model, recordings, state, loss)
-        # In standard deviations, root mean square over the parameters.
-        change = new.solution.values - state.solution.values
-        squares = new.factor.products(change[:, None])[:, 0, 0]
-        step = float(np.sqrt(max(float(_weights(new.scale) @ squares), 0.0) / len(change)))
-        known = np.isfinite(new.scale)
-        moved = np.abs(new.scale[known] / state.scale[known] - 1.0).max(initial=0.0)
-        settled = bool(moved <= _SETTLED and step <= _ROUGH)
-        state = replace(new, held=state.held or settled, converged=state.held and step <= tolerance)
-        if state.converged:
-            break
-    return state
+    """Weight all rows by their residuals, solve, and find the scale of those, unless held.
 
-
-def _pass(model: RobotModel, recordings: Sequence[Samples], state: _State, loss: Loss) -> _State:
-    """Weight all rows by their residuals, solve, and find the scale of those, unless held."""
-    residuals = [np.full(samples.torque.shape, np.nan) for samples in recordings]
+    The first pass finds the residuals of the start; only then there is a scale.
+    """
+    residuals = tuple(np.full(samples.torque.shape, np.nan) for samples in recordings)
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
     factor = state.factor.from_blocks(model, rows, state.factor.samples)
-    weights = _weights(state.scale)
+    weights = inverse_variance(state.scale**2)
     solution = factor.solve(weights if weights.any() else np.ones(len(weights)))
-    scale = state.scale
-    if not state.held:
-        scale = _scales(recordings, residuals, state.solution)
-    return _State(factor, solution, scale, residuals, state.passes + 1, state.held)
+    scale = state.scale if state.held else _scales(recordings, residuals, state.solution)
+    # In standard deviations, root mean square over the parameters.
+    change = solution.values - state.solution.values
+    squares = float(inverse_variance(scale**2) @ factor.products(change[:, None])[:, 0, 0])
+    step = np.sqrt(max(squares, 0.0) / len(change))
+    known = np.isfinite(scale)
+    moved = np.abs(scale[known] / state.scale[known] - 1.0).max(initial=0.0)
+    return _State(
+        factor,
+        solution,
+        scale,
+        residuals,
+        state.passes + 1,
+        held=bool(state.held or (moved <= _SETTLED and step <= _ROUGH)),
+        converged=bool(state.held and step <= tolerance),
+    )
 
 
 def _weighted_rows(
@@ -184,7 +193,7 @@ def _weighted_rows(
     values: Array,
     scale: Array,
     loss: Loss,
-    residuals: list[Array],
+    residuals: Sequence[Array],
 ) -> Iterator[list[Array]]:
     """Yield rows times the roots of their weights; writes what they leave over to `residuals`."""
     for samples, left in zip(recordings, residuals, strict=True):
@@ -197,58 +206,19 @@ def _weighted_rows(
             yield blocks
 
 
-def _scales(recordings: Sequence[Samples], residuals: list[Array], solution: Solution) -> Array:
+def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution: Solution) -> Array:
     """Standard deviation per joint (n,) from the median of |residual|, NaN without rows.
 
     Corrected, all joints alike, for the degrees of freedom that the parameters take.
     """
-    n = residuals[0].shape[1]
-    scale = np.full(n, np.nan)
-    rows = sum(int(np.count_nonzero(samples.usable)) for samples in recordings)
-    freedom = max(rows - solution.root.shape[1], 1)
-    for joint in range(n):
-        left = np.concatenate([
-            one[samples.usable[:, joint], joint]
-            for samples, one in zip(recordings, residuals, strict=True)
-        ])  # fmt: skip
-        if len(left) == 0:
-            continue
-        power = [np.sum(s.torque[s.usable[:, joint], joint] ** 2) for s in recordings]
-        floor = _SMALLEST_SCALE * np.sqrt(np.sum(power) / len(left))
-        spread = np.median(np.abs(left)) / _MAD * np.sqrt(rows / freedom)
-        scale[joint] = max(float(spread), float(floor), np.finfo(np.float64).tiny ** 0.5)
+    usable = np.concatenate([samples.usable for samples in recordings])
+    torque = np.concatenate([samples.torque for samples in recordings])
+    left, rows = np.concatenate(residuals), np.count_nonzero(usable)
+    wider = np.sqrt(rows / max(rows - solution.root.shape[1], 1))
+    scale = np.full(left.shape[1], np.nan)
+    for joint, own in enumerate(usable.T):
+        if own.any():
+            floor = _SMALLEST_SCALE * np.sqrt(np.mean(torque[own, joint] ** 2))
+            spread = np.median(np.abs(left[own, joint])) / _MAD * wider
+            scale[joint] = max(spread, floor, np.finfo(np.float64).tiny ** 0.5)
     return scale
-
-
-def _weights(scale: Array) -> Array:
-    """Inverse squares of scales (n,), zero where there is none yet."""
-    known = np.isfinite(scale)
-    return np.where(known, 1.0 / np.where(known, scale, 1.0) ** 2, 0.0)
-
-
-def _result(
-    model: RobotModel, recordings: Sequence[Samples], state: _State, loss: Loss
-) -> RobustEstimate:
-    clustered = clustered_covariance(model, recordings, state.solution, _weights(state.scale), loss)
-    scaled = np.concatenate(state.residuals) / state.scale
-    finite = np.isfinite(scaled)
-    rows = np.where(np.isfinite(state.scale), np.count_nonzero(finite, axis=0), np.nan)
-    ended = "" if state.converged else ", NOT converged"
-    return RobustEstimate(
-        estimate=Estimate(
-            names=model.parameter_names,
-            units=model.units,
-            values=state.solution.values,
-            covariance=clustered.covariance,
-            noise_std=state.scale,
-            samples=state.factor.samples,
-            method=f"iteratively reweighted least squares{state.factor.words}, {loss.name},"
-            f" {state.passes} passes{ended}, {clustered.words}",
-            condition=state.solution.condition,
-            undetermined=undetermined_names(model.parameter_names, clustered.determined),
-            interval_factor=clustered.interval_factor,
-        ),
-        outlying=np.count_nonzero(finite & (np.abs(scaled) > OUTLYING), axis=0) / rows,
-        iterations=state.passes,
-        converged=state.converged,
-    )

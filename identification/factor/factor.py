@@ -51,8 +51,12 @@ class NormalEquations(NamedTuple):
 
     A: Array
     b: Array
-    yy: float
-    n: int
+    yy: float = 0.0
+    n: int = 0
+
+    def part(self, chosen: NDArray[np.intp]) -> NormalEquations:
+        """Those of some parameters (k,), the others zero."""
+        return self._replace(A=self.A[np.ix_(chosen, chosen)], b=self.b[chosen])
 
 
 class Solution(NamedTuple):
@@ -109,11 +113,8 @@ class Factor:
         Raises:
             ShapeError: an array does not have the shape it should have.
         """
-        return cls.from_blocks(
-            model,
-            (rows.blocks for rows in augmented_rows(model, samples)),
-            np.count_nonzero(samples.usable, axis=0),
-        )
+        blocks = (rows.blocks for rows in augmented_rows(model, samples))
+        return cls.from_blocks(model, blocks, np.count_nonzero(samples.usable, axis=0))
 
     @classmethod
     def from_samples(
@@ -123,31 +124,16 @@ class Factor:
         torque: Array,
         mask: NDArray[np.bool_] | None = None,
     ) -> Self:
-        """Reduce m samples.
+        """Reduce m samples of a motion and the torque that W pi should equal [N·m, N] (m, n).
 
-        Args:
-            model: the robot.
-            motion: m samples of its joints.
-            torque: what W pi should equal [N·m, N], shape (m, n).
-            mask: which rows count, shape (m, n); all without it. See :meth:`RobotModel.moving`.
+        A mask (m, n) says which rows count: all without it. See :meth:`RobotModel.moving`.
 
         Raises:
             ShapeError: an array does not have the shape it should have.
         """
-        q, qd, qdd, torque = joint_arrays(
-            model.n_joints,
-            position=motion.position,
-            velocity=motion.velocity,
-            acceleration=motion.acceleration,
-            torque=torque,
-        )
-        if mask is not None and mask.shape != q.shape:
-            raise ShapeError("mask", mask.shape, str(q.shape))
-        usable = np.ones(q.shape, dtype=np.bool_) if mask is None else mask
-        chunks = model.plan.chunks(q, qd, qdd, motion.direction, response=torque)
-        return cls.from_blocks(
-            model, (rows.blocks for rows in masked_rows(chunks, usable)), usable.sum(axis=0)
-        )
+        usable = np.ones(np.shape(torque), dtype=np.bool_) if mask is None else mask
+        nothing = np.full(model.n_joints, np.inf)
+        return cls.of(model, Samples(motion, torque, usable, (), 0.0, nothing))
 
     @classmethod
     def from_blocks(
@@ -313,29 +299,35 @@ def _triangle(rows: Array) -> Array:
     return square
 
 
-def solve(equations: NormalEquations) -> Solution:
+def _unit_columns(length: Array) -> Array:
+    """What columns of a length (p,) are divided by: one where there is nothing."""
+    return np.where(length > 0.0, length, 1.0)
+
+
+def _by_size(length: Array, size: Array, vectors: Array, worst: float) -> Solution:
+    """Solution without values, from singular values (p,) and vectors of columns of unit length."""
+    significant = (size > size.max(initial=0.0) / worst) & (size > 0.0)
+    lost = np.abs(vectors[:, ~significant]).max(axis=1, initial=0.0)
+    smallest = size.min(initial=np.inf) if np.all(length > 0.0) else 0.0
+    return Solution(
+        values=np.zeros(len(length)),
+        root=vectors[:, significant] / size[significant] / _unit_columns(length)[:, None],
+        condition=float(size.max() / smallest) if smallest > 0.0 else np.inf,
+        determined=np.asarray((length > 0.0) & (lost < _PARTICIPATION)),
+    )
+
+
+def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
     """Solve ``A x = b`` with columns scaled to unit length, naming what A does not determine.
 
-    Directions of the scaled parameter space in which the condition exceeds `WORST_CONDITION`
-    are left out; the parameters that take part in one of them are undetermined.
+    Directions of the scaled parameter space in which the condition exceeds `worst` are left out;
+    the parameters that take part in one of them are undetermined.
     """
     length = np.sqrt(np.diag(equations.A))
-    present = length > 0.0
-    scale = np.where(present, length, 1.0)
+    scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    largest = eigenvalues[-1]
-    significant = eigenvalues > largest / WORST_CONDITION**2
-    lost = vectors[:, ~significant]
-    determined = present & (np.abs(lost).max(axis=1, initial=0.0) < _PARTICIPATION)
-    basis = vectors[:, significant]
-    root = basis / np.sqrt(eigenvalues[significant]) / scale[:, None]
-    smallest = eigenvalues[0] if present.all() else 0.0
-    return Solution(
-        values=root @ (root.T @ equations.b),
-        root=root,
-        condition=float(np.sqrt(largest / smallest)) if smallest > 0.0 else np.inf,
-        determined=np.asarray(determined),
-    )
+    found = _by_size(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
+    return found._replace(values=found.root @ (found.root.T @ equations.b))
 
 
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
@@ -347,27 +339,15 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
     Args:
         rows: (k, p).
         target: (k,).
-        worst: directions in which the condition exceeds this are left out; the parameters that
-            take part in one of them are undetermined.
+        worst: as for :func:`solve`.
     """
     length = np.linalg.norm(rows, axis=0)
-    present = length > 0.0
-    scale = np.where(present, length, 1.0)
-    left, singular, right = np.linalg.svd(rows / scale, full_matrices=True)
-    p = rows.shape[1]
-    padded = np.zeros(p)
-    padded[: len(singular)] = singular
-    significant = (padded > padded.max(initial=0.0) / worst) & (padded > 0.0)
-    lost = right[~significant]
-    determined = present & (np.abs(lost).max(axis=0, initial=0.0) < _PARTICIPATION)
-    root = right[significant].T / padded[significant] / scale[:, None]
-    smallest = padded.min(initial=np.inf) if present.all() else 0.0
-    return Solution(
-        values=root @ (left[:, : len(singular)].T @ target)[significant[: len(singular)]],
-        root=root,
-        condition=float(padded[0] / smallest) if smallest > 0.0 else np.inf,
-        determined=np.asarray(determined),
-    )
+    left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
+    size = np.zeros(rows.shape[1])
+    size[: len(singular)] = singular
+    found = _by_size(length, size, right.T, worst)
+    # The significant ones are the first.
+    return found._replace(values=found.root @ (left[:, : found.root.shape[1]].T @ target))
 
 
 def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
@@ -377,7 +357,7 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     are left out: they carry no information.
     """
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
-    scale = np.where(length > 0.0, length, 1.0)
+    scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
     significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
     singular = np.sqrt(eigenvalues[significant])
@@ -405,8 +385,13 @@ def joint_weights(factor: Factor) -> Array:
     """Inverse variance of each joint's residual in an ordinary fit (n,), zero without rows."""
     ordinary = np.ones(factor.n_joints)
     first = factor.solve(ordinary)
-    variance = residual_variance(factor, first.values, first.root, ordinary)
-    return np.where(np.isnan(variance), 0.0, 1.0 / variance)
+    return inverse_variance(residual_variance(factor, first.values, first.root, ordinary))
+
+
+def inverse_variance(variance: Array) -> Array:
+    """Weights (n,) of joints, zero where the variance is NaN or infinite."""
+    known = np.isfinite(variance)
+    return np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,42 +447,47 @@ def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) ->
     Raises:
         IdentificationError: the factor holds no rows.
     """
-    if not factor.samples.any():
-        raise IdentificationError(nothing_usable(model))
+    require_rows(model, factor)
     if weights is None:
         weights = joint_weights(factor)
-    solution = factor.solve(weights)
     method = f"weighted least squares{factor.words}, classical covariance (white residuals)"
-    return estimate_of(model, factor, solution, solution.inverse, weights, method)
+    return estimate_of(model.units, factor, factor.solve(weights), weights, method)
 
 
 def estimate_of(
-    model: RobotModel,
+    units: Sequence[str],
     factor: Factor,
     solution: Solution,
-    covariance: Array,
     weights: Array,
     method: str,
+    covariance: Array | None = None,
     interval_factor: float = 1.96,
 ) -> Estimate:
     """Estimate from a solution with weights (n,) per joint.
 
-    The `covariance` (p, p) is that on what is determined, and is marked in place elsewhere.
+    The `covariance` (p, p) is that on what is determined, by default the inverse of A.
     """
+    covariance = solution.inverse if covariance is None else covariance.copy()
     mark_undetermined(covariance, solution.determined)
     variance = residual_variance(factor, solution.values, solution.root, weights)
     return Estimate(
-        names=model.parameter_names,
-        units=model.units,
+        names=factor.parameter_names,
+        units=tuple(units),
         values=solution.values,
         covariance=covariance,
         noise_std=np.sqrt(variance),
         samples=factor.samples,
         method=method,
         condition=solution.condition,
-        undetermined=undetermined_names(model.parameter_names, solution.determined),
+        undetermined=undetermined_names(factor.parameter_names, solution.determined),
         interval_factor=interval_factor,
     )
+
+
+def require_rows(model: RobotModel, factor: Factor) -> None:
+    """Raise IdentificationError where no row can be fitted."""
+    if not factor.samples.any():
+        raise IdentificationError(nothing_usable(model))
 
 
 def nothing_usable(model: RobotModel) -> str:
@@ -521,37 +511,24 @@ def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> t
     return tuple(name for name, known in zip(names, determined, strict=True) if not known)
 
 
-def total(factors: Sequence[Factor]) -> Factor:
-    """Sum of factors: all repetitions as one."""
-    return sum(factors[1:], factors[0])
+def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:
+    """Return the Gram matrices of recordings, or triangles where the condition demands it.
 
-
-def reduced(model: RobotModel, recordings: Iterable[Samples], gram: Factor | None = None) -> Factor:
-    """Reduce recordings to Gram matrices, or to triangles where the condition demands it.
-
-    The Gram matrices come first, being five times as fast; the samples are read a second time
-    only if the scaled condition of the ordinary problem exceeds `QR_CONDITION`.
+    Gram matrices are five times as fast; the samples are read once more only if the scaled
+    condition of the ordinary problem exceeds `QR_CONDITION`.
 
     Args:
         model: the robot.
-        recordings: can be gone through twice: a sequence, not a generator.
-        gram: their factor, if it is known; without recordings all there is.
+        recordings: none where the factor is all there is.
+        gram: their factor.
 
     Raises:
-        IdentificationError: neither recordings nor factor, or they can be gone through only once.
+        IdentificationError: not one usable row.
     """
-    if iter(recordings) is recordings:
-        raise IdentificationError("recordings may have to be read twice: a sequence is needed")
-    if gram is None:
-        factors = [Factor.of(model, samples) for samples in recordings]
-        if not factors:
-            raise IdentificationError("there are no recordings to estimate from")
-        gram = total(factors)
-    alone = isinstance(recordings, Sequence) and not recordings
-    if alone or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
+    require_rows(model, gram)
+    if not recordings or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
         return gram
-    triangles = (QRFactor.of(model, samples) for samples in recordings)
-    return sum(triangles, QRFactor.zero(model))
+    return sum((QRFactor.of(model, samples) for samples in recordings), QRFactor.zero(model))
 
 
 class Rows(NamedTuple):
@@ -591,29 +568,20 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
         chunks = model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)
     else:
         chunks = _filtered(model, samples)
-    return masked_rows(chunks, samples.usable)
-
-
-def masked_rows(
-    chunks: Iterable[tuple[slice, list[Array]]], usable: NDArray[np.bool_]
-) -> Iterator[Rows]:
-    """Yield rows in chunks, with zeros, in place, for what is not usable (m, n)."""
     for part, blocks in chunks:
-        for block, lost in zip(blocks, ~usable[part].T, strict=True):
+        for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
             if lost.any():
                 # Assigned, not multiplied: a row left out may hold NaN.
                 block[:, np.flatnonzero(lost)] = 0.0
         yield Rows(part, blocks)
 
 
-def _filtered(model: RobotModel, samples: Samples) -> Iterator[Rows]:
+def _filtered(model: RobotModel, samples: Samples) -> Iterator[tuple[slice, list[Array]]]:
     blocks, _ = samples.regressor(model)
+    tables = [
+        np.concatenate([block.T, torque[None]])
+        for block, torque in zip(blocks, samples.torque.T, strict=True)
+    ]
     for start in range(0, len(samples.torque), CHUNK):
         part = slice(start, min(start + CHUNK, len(samples.torque)))
-        yield Rows(
-            part,
-            [
-                np.concatenate([block[part].T, samples.torque[None, part, joint]])
-                for joint, block in enumerate(blocks)
-            ],
-        )
+        yield part, [table[:, part] for table in tables]

@@ -26,6 +26,7 @@ from identification.errors import IdentificationError
 from identification.factor.factor import Factor, augmented_rows
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
+from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -57,24 +58,41 @@ class PhaseFactor:
     @classmethod
     def zero(cls, model: RobotModel) -> PhaseFactor:
         """Return the factor of no samples: what a sum starts from."""
-        columns = model.plan.columns
-        gram = tuple(np.zeros((0, len(c) + 1, len(c) + 1)) for c in columns)
-        return cls(
-            gram, columns, np.zeros((0, model.n_joints), dtype=np.intp), model.parameter_names
-        )
+        nothing = np.zeros(0, dtype=np.int64), np.zeros((0, model.n_joints), dtype=np.bool_)
+        return cls.of_rows(*nothing, model.plan.columns, model.parameter_names, ())
 
     @classmethod
     def from_samples(cls, model: RobotModel, samples: Samples) -> PhaseFactor:
         """Reduce a recording, block by block. Rows before the origin belong to the first."""
-        index = fine_blocks(samples)
-        count = int(index[-1]) + 1 if len(index) else 0
+        index, rows = fine_blocks(samples), augmented_rows(model, samples)
         columns = model.plan.columns
-        gram = tuple(np.zeros((count, len(c) + 1, len(c) + 1)) for c in columns)
-        for part, rows in augmented_rows(model, samples):
+        return cls.of_rows(index, samples.usable, columns, model.parameter_names, rows)
+
+    @classmethod
+    def of_rows(
+        cls,
+        index: NDArray[np.int64],
+        usable: NDArray[np.bool_],
+        columns: tuple[NDArray[np.intp], ...],
+        names: tuple[str, ...],
+        chunks: Iterable[tuple[slice, Sequence[Array]]],
+    ) -> PhaseFactor:
+        """Reduce rows.
+
+        Args:
+            index: block of each (m,), rising.
+            usable: whether it counts (m, n); what does not count is zero in the chunks.
+            columns: per joint the parameters of its columns (c_j,).
+            names: of the parameters (p,).
+            chunks: which rows, and per joint their columns and, last, the torque (c_j + 1, k).
+        """
+        count = int(index[-1]) + 1 if len(index) else 0
+        gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
+        for part, rows in chunks:
             runs = equal_runs(index[part])
             for total, block in zip(gram, rows, strict=True):
                 add_grams(total, block, runs)
-        return cls(gram, columns, samples_by_cell(index, samples.usable), model.parameter_names)
+        return cls(gram, columns, samples_by_cell(index, usable), names)
 
     @property
     def n_joints(self) -> int:
@@ -99,9 +117,7 @@ class PhaseFactor:
         if self.parameter_names != other.parameter_names or self.n_joints != other.n_joints:
             raise IdentificationError("factors with different joints or parameters cannot be added")
         gram = tuple(_sum(a, b) for a, b in zip(self.gram, other.gram, strict=True))
-        return PhaseFactor(
-            gram, self.columns, _sum(self.samples, other.samples), self.parameter_names
-        )
+        return replace(self, gram=gram, samples=_sum(self.samples, other.samples))
 
     def places(self, joint: int) -> NDArray[np.intp]:
         """Where the columns of a joint's Gram stand among all p + 1, the torque being last."""
@@ -127,7 +143,7 @@ class PhaseFactor:
     def blocks(self, which: slice | NDArray[np.bool_]) -> PhaseFactor:
         """Some of the blocks, by place or by a mask (B,)."""
         gram = tuple(own[which] for own in self.gram)
-        return PhaseFactor(gram, self.columns, self.samples[which], self.parameter_names)
+        return replace(self, gram=gram, samples=self.samples[which])
 
     def occupied(self) -> PhaseFactor:
         """Without the blocks that hold no row."""
@@ -137,7 +153,7 @@ class PhaseFactor:
     def merged(self, length: int) -> PhaseFactor:
         """Runs of `length` blocks as one; the last one may be shorter."""
         gram = tuple(merged(own, length) for own in self.gram)
-        return PhaseFactor(gram, self.columns, merged(self.samples, length), self.parameter_names)
+        return replace(self, gram=gram, samples=merged(self.samples, length))
 
     @property
     def total(self) -> Factor:
@@ -182,19 +198,16 @@ def instrument_factor(
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
         rows &= usable
-    index = fine_blocks(samples)
-    count = int(index[-1]) + 1 if len(index) else 0
     columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
-    gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
     measured = augmented_rows(model, replace(samples, usable=rows))
     # Of the same rows, and through the same torque channel.
     planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
-    for (part, blocks), (_, clean) in zip(measured, planned, strict=True):
-        runs = equal_runs(index[part])
-        for total, noisy, quiet in zip(gram, blocks, clean, strict=True):
-            add_grams(total, np.concatenate([quiet[:-1], noisy]), runs)
+    both = (
+        (part, [np.concatenate([z[:-1], w]) for z, w in zip(quiet, noisy, strict=True)])
+        for (part, noisy), (_, quiet) in zip(measured, planned, strict=True)
+    )
     names = (*(f"Z {name}" for name in model.parameter_names), *model.parameter_names)
-    return PhaseFactor(gram, columns, samples_by_cell(index, rows), names)
+    return PhaseFactor.of_rows(fine_blocks(samples), rows, columns, names, both)
 
 
 def measured_part(factor: PhaseFactor) -> PhaseFactor:
@@ -230,30 +243,25 @@ def gain_factor(
         load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
     time = samples.motion.time - samples.motion.time[0]
     index = np.floor(time / max(FINE_BLOCK, time[-1] / _MOST_BLOCKS) + 1e-9).astype(np.int64)
-    runs = equal_runs(index)
-    gram = tuple(np.zeros((int(index[-1]) + 1, p + 2, p + 2)) for _ in range(n))
-    usable = np.zeros((m, n), dtype=np.bool_)
+    usable, tables = np.zeros((m, n), dtype=np.bool_), np.zeros((n, p + 2, m))
     for motor, share in enumerate(np.linalg.inv(turns).T):
         acting = np.flatnonzero(share).tolist()
         usable[:, motor] = samples.usable[:, acting].all(axis=1)
-        table = np.zeros((m, p + 2))
         for joint in acting:
-            table[:, columns[joint]] += share[joint] * blocks[joint]
-            table[:, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
-        table[:, p + 1] = motor_current[:, motor]
-        table[~usable[:, motor]] = 0.0
-        add_grams(gram[motor], table.T, runs)
+            tables[motor, columns[joint]] += share[joint] * blocks[joint].T
+            tables[motor, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
+        tables[motor, p + 1] = motor_current[:, motor]
+        tables[motor][:, ~usable[:, motor]] = 0.0
     names = (*model.parameter_names, "torque of the payload")
     every = (np.arange(p + 1),) * n
-    return PhaseFactor(gram, every, samples_by_cell(index, usable), names)
+    return PhaseFactor.of_rows(index, usable, every, names, [(slice(None), [*tables])])
 
 
 def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:
     """Blocks of several recordings one after the other."""
-    first = parts[0]
     gram = tuple(np.concatenate(own) for own in zip(*(part.gram for part in parts), strict=True))
     samples = np.concatenate([part.samples for part in parts])
-    return PhaseFactor(gram, first.columns, samples, first.parameter_names)
+    return replace(parts[0], gram=gram, samples=samples)
 
 
 def total_phase(model: RobotModel, recordings: Iterable[Samples]) -> PhaseFactor:
@@ -341,3 +349,85 @@ def _sum(first: Blocks, second: Blocks) -> Blocks:
     total = longer.copy()
     total[: len(shorter)] += shorter
     return total
+
+
+# Rows of one recording: what is asked of any gravity is coarse, and neighbours say the same.
+_MOST_ROWS: Final = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class StandardGram:
+    """Sums over samples of products of [W0 | Wx | Wy | Wz | y] in standard parameters, by joint.
+
+    The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz. One pass over the
+    samples therefore says what any other gravity would have made of them. Standard parameters are
+    used, since which combinations of them are base parameters depends on gravity.
+
+    Attributes:
+        gram: (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, friction, then
+            springs and balancers.
+        rows: that were summed (n,).
+    """
+
+    gram: Array
+    rows: NDArray[np.intp]
+
+    def under(self, gravity: Array) -> Factor:
+        """Factor of the s columns under a gravity (3,) [m/s²]."""
+        share, n, s = np.append(1.0, gravity), len(self.gram), len(self.gram[0]) // 4
+        parts = self.gram[:, :-1, :-1].reshape(n, 4, s, 4, s)
+        found = np.empty((n, s + 1, s + 1))
+        found[:, :s, :s] = np.einsum("a,jasbt,b->jst", share, parts, share, optimize=True)
+        found[:, :s, s] = share @ self.gram[:, :-1, -1].reshape(n, 4, s)
+        found[:, s, :s] = found[:, :s, s]
+        found[:, s, s] = self.gram[:, -1, -1]
+        return Factor(found, self.rows, ())
+
+    @classmethod
+    def of(cls, model: RobotModel, recordings: Sequence[Samples]) -> StandardGram:
+        """Sum over about a thousand usable rows of each recording."""
+        n, s = model.n_joints, model.layout.size
+        s += len(model.friction.names) + len(model.elements.names)
+        plans = [
+            RegressorPlan(
+                model.chain,
+                gravity,
+                [list(range(10))] * n,
+                [model.rotor_inertia] * n,
+                model.friction,
+                model.layout.pairs,
+                model.elements,
+            )
+            for gravity in (np.zeros(3), *np.eye(3))
+        ]
+        gram, rows = np.zeros((n, 4 * s + 1, 4 * s + 1)), np.zeros(n, dtype=np.intp)
+        for samples in recordings:
+            every = max(1, len(samples.torque) // _MOST_ROWS)
+            filtered = samples.torque_bandwidth is not None
+            part = slice(None, None, 1 if filtered else every)  # a filter reads all rows
+            found = [plan.evaluate(*(one[part] for one in samples.motion[1:4])) for plan in plans]
+            for joint in range(n):
+                usable = samples.usable[::every, joint]
+                table = np.zeros((len(usable), 4 * s + 1))
+                for k, (blocks, columns) in enumerate(found):
+                    block = blocks[joint]
+                    if filtered:
+                        block = samples.as_measured(joint, block)[::every]
+                    table[:, k * s + columns[joint]] = block
+                for k in (1, 2, 3):
+                    table[:, k * s : (k + 1) * s] -= table[:, :s]
+                table[:, -1] = samples.torque[::every, joint]
+                table = table[usable]
+                gram[joint] += table.T @ table
+                rows[joint] += len(table)
+        return cls(gram, rows)
+
+
+def gravity_loads(model: RobotModel, position: Array) -> NDArray[np.bool_]:
+    """Whether gravity can load each joint (n,) in some of the positions (m, n)."""
+    still = np.zeros_like(position)
+    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
+    blocks = plan.evaluate(position, still, still).blocks
+    # Of a unit first moment the torque is g; rounding in the URDF's angles leaves far less.
+    floor = 1e-3 * float(np.linalg.norm(model.gravity))
+    return np.array([bool(np.abs(block).max(initial=0.0) > floor) for block in blocks])

@@ -25,7 +25,7 @@ quadratic form. The samples are not read again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -38,12 +38,10 @@ from identification.estimators.covariance import block_length, with_block_covari
 from identification.factor.factor import (
     Estimate,
     Factor,
-    NormalEquations,
     Solution,
+    estimate_of,
     joint_weights,
-    residual_variance,
     solve,
-    undetermined_names,
 )
 from identification.factor.phases import PhaseFactor, joined, merged
 from identification.model.robot import RobotModel
@@ -202,12 +200,11 @@ def _blind(
     if len(used) - cut < _FEWEST_BLOCKS:
         return None
     first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
-    chosen = eliminate(model, first, last, weights=weights).estimate.names
-    columns = np.array([model.parameter_names.index(name) for name in chosen], dtype=np.intp)
-    values = np.zeros(model.n_parameters)
-    values[columns] = solve(training.restricted(columns).total.weighted(weights)).values
-    full = solve(training.total.weighted(weights)).values
-    return BlindChoice(len(columns), unseen.relative_error(values), unseen.relative_error(full))
+    chosen = np.flatnonzero(eliminate(model, first, last, weights=weights).values)
+    equations, values = training.total.weighted(weights), np.zeros(model.n_parameters)
+    values[chosen] = solve(equations.part(chosen)).values
+    full = solve(equations).values
+    return BlindChoice(len(chosen), unseen.relative_error(values), unseen.relative_error(full))
 
 
 def eliminate(
@@ -234,20 +231,22 @@ def eliminate(
     for factor, what in ((training, "fitted"), (held_out, "held-out")):
         if not factor.samples.any():
             raise IdentificationError(f"there is not one usable {what} sample")
-    total = training.total
+    total, names = training.total, training.parameter_names
     if weights is None:
         weights = joint_weights(total)
     path = _Path(total, held_out, weights, rule)
     path.guarded()
-    cut, refused = len(path.steps) - 1, tuple(total.parameter_names[k] for k in path.refused)
-    chosen = path.current
+    cut, refused, chosen = len(path.steps) - 1, tuple(names[k] for k in path.refused), path.current
     path.to_the_end()
+    part, units = training.restricted(chosen.left), [model.units[k] for k in chosen.left]
+    classical = estimate_of(units, part.total, chosen.solution, weights, "")
+    name = "essential parameters by weighted least squares"
     return Elimination(
         steps=tuple(path.steps),
         cut=cut,
         refused=refused,
         reason=_reason(path.steps, cut, refused, rule),
-        estimate=_estimate(model, training, weights, chosen.left),
+        estimate=with_block_covariance(classical, part, weights, name),
         values=chosen.values,
     )
 
@@ -263,10 +262,10 @@ class _Subset(NamedTuple):
     held_out: float  # relative error over all joints
     held_out_joint: Array  # (n,), zero for one without rows
 
-    @property
-    def spread(self) -> float:
-        """Largest over smallest relative standard deviation."""
-        return float(self.relative.max() / max(self.relative.min(), _TINY))
+    def spread(self, free: NDArray[np.bool_] | bool = True) -> float:
+        """Largest relative standard deviation of those that are free over the smallest of all."""
+        largest = np.where(free, self.relative, 0.0).max()
+        return float(largest / max(self.relative.min(), _TINY))
 
 
 class _Path:
@@ -280,15 +279,13 @@ class _Path:
     """
 
     def __init__(self, total: Factor, held_out: PhaseFactor, weights: Array, rule: CutRule) -> None:
-        self._total = total
+        self._total, self._unseen, self._rule = total, held_out.total, rule
         self._equations = total.weighted(weights)
-        self._unseen = held_out.total
         self._blocks = held_out.weighted(weights)[held_out.samples.any(axis=1)]
-        self._rule = rule
         self.refused: list[int] = []
         self.steps: list[EliminationStep] = []
         self.best = self.current = self._subset(np.arange(total.n_parameters))
-        self._take(self.current, None)
+        self._go_on(self.current, None)
 
     def guarded(self) -> None:
         """Remove until those that may go are known comparably well, or nothing may go."""
@@ -296,20 +293,27 @@ class _Path:
         # What another parameter stood in for may have become superfluous without it.
         while before != self.refused:
             before, self.refused = self.refused, []
-            while self._free_spread() >= self._rule.spread and len(self.current.left) > 1:
+            while self.current.spread(self._free) >= self._rule.spread:
+                if len(self.current.left) == 1:
+                    break
                 index, relative_std = self._worst()
                 smaller = self._without(index)
                 if np.isfinite(relative_std) and self._is_worse(smaller):
                     self.refused.append(index)
                 else:
-                    self._take(smaller, index)
+                    self._go_on(smaller, index)
 
     def to_the_end(self) -> None:
         """Remove by relative standard deviation alone until one parameter is left."""
         self.refused = []
-        while self.steps[-1].left > 1:
+        while len(self.current.left) > 1:
             index, _ = self._worst()
-            self._take(self._without(index), index)
+            self._go_on(self._without(index), index)
+
+    @property
+    def _free(self) -> NDArray[np.bool_]:
+        """Which of those left may go."""
+        return ~np.isin(self.current.left, self.refused)
 
     def _worst(self) -> tuple[int, float]:
         """Index and relative standard deviation of what to take out next.
@@ -319,21 +323,17 @@ class _Path:
         """
         solution, left = self.current.solution, self.current.left
         if not solution.determined.all():
-            own = self._equations.A[np.ix_(left, left)]
+            own = self._equations.part(left).A
             lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, own)
             return int(left[np.flatnonzero(lost > 0.99 * lost.max())[-1]]), np.inf
-        free = ~np.isin(left, self.refused)
-        worst = int(np.argmax(np.where(free, self.current.relative, -1.0)))
+        worst = int(np.argmax(np.where(self._free, self.current.relative, -1.0)))
         return int(left[worst]), float(self.current.relative[worst])
 
     def _without(self, index: int) -> _Subset:
         return self._subset(self.current.left[self.current.left != index])
 
     def _subset(self, left: Indices) -> _Subset:
-        whole, values = self._equations, np.zeros(len(self._equations.b))
-        solution = solve(
-            NormalEquations(whole.A[np.ix_(left, left)], whole.b[left], whole.yy, whole.n)
-        )
+        solution, values = solve(self._equations.part(left)), np.zeros(len(self._equations.b))
         values[left] = solution.values
         variance = np.maximum(np.diag(solution.inverse), 0.0)
         relative = np.sqrt(variance) / np.maximum(np.abs(solution.values), _TINY)
@@ -358,18 +358,12 @@ class _Path:
         certain = _is_certain(smaller.blocks - self.best.blocks)
         return max(overall, float(axis.max())) > (self._rule.noticeable if certain else 1.0)
 
-    def _free_spread(self) -> float:
-        """Relative standard deviation of the worst that may go over that of the best known."""
-        current = self.current
-        free = current.relative[~np.isin(current.left, self.refused)]
-        return float(free.max(initial=0.0) / max(current.relative.min(), _TINY))
-
-    def _take(self, subset: _Subset, index: int | None) -> None:
+    def _go_on(self, subset: _Subset, index: int | None) -> None:
         self.steps.append(
             EliminationStep(
                 removed=None if index is None else self._total.parameter_names[index],
                 left=len(subset.left),
-                spread=subset.spread,
+                spread=subset.spread(),
                 largest_relative_std=float(subset.relative.max()),
                 in_sample=self._total.relative_error(subset.values),
                 held_out=subset.held_out,
@@ -419,23 +413,3 @@ def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], ru
         f"{text}. Error on the motion they were chosen on: {full.held_out:.2%} with all"
         f" parameters, {chosen.held_out:.2%} with these"
     )
-
-
-def _estimate(model: RobotModel, training: PhaseFactor, weights: Array, left: Indices) -> Estimate:
-    """Estimate of some of the parameters, as a model of its own."""
-    part = training.restricted(left)
-    total = part.total
-    solution = solve(total.weighted(weights))
-    result = Estimate(
-        names=part.parameter_names,
-        units=tuple(model.units[k] for k in left),
-        values=solution.values,
-        covariance=solution.inverse,
-        noise_std=np.sqrt(residual_variance(total, solution.values, solution.root, weights)),
-        samples=total.samples,
-        method="",
-        condition=solution.condition,
-        undetermined=undetermined_names(part.parameter_names, solution.determined),
-    )
-    robust = with_block_covariance(result, part, weights)
-    return replace(robust, method=f"essential parameters by {robust.method}")

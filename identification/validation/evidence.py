@@ -19,8 +19,8 @@ from identification.excitation.criteria import (
     coupling_index_max,
     information,
 )
-from identification.factor.factor import Estimate, Factor, total
-from identification.factor.standard_gram import StandardGram, gravity_loads, solve, squared_errors
+from identification.factor.factor import Estimate, Factor, solve
+from identification.factor.phases import StandardGram, gravity_loads
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.noise import noiseless_above
@@ -47,6 +47,8 @@ SLOW: Final = 10.0
 SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
+# Combinations of standard parameters that hardly act are worse conditioned than this.
+_WORST_CONDITION: Final = 10.0**4.5
 # A joint's error is beyond that of the fit if its power is this many times larger.
 _GROWN: Final = 4.0
 _POSTURES: Final = 40
@@ -82,6 +84,11 @@ class GravityDirection:
         return float(np.arccos(np.clip(self.declared @ self.best / size, -1.0, 1.0)))
 
 
+def _solved(factor: Factor, weights: Array) -> Array:
+    """Standard parameters, of least norm where the data leave a choice."""
+    return solve(factor.weighted(weights), _WORST_CONDITION).values
+
+
 def find_gravity(
     model: RobotModel, training: StandardGram, held_out: StandardGram
 ) -> GravityDirection:
@@ -92,12 +99,12 @@ def find_gravity(
 
     def fitted(gravity: Array) -> tuple[Array, Array]:
         """Parameters, each joint weighted by its own residual, and the squared errors (n,)."""
-        gram, rows = training.under(gravity), training.rows
-        floor = 1e-12 * gram[:, -1, -1] + 1e-300
-        errors, values = gram[:, -1, -1], np.empty(0)
+        factor = training.under(gravity)
+        errors, values = factor.gram[:, -1, -1], np.empty(0)
+        floor = 1e-12 * errors + 1e-300
         for _ in range(_PASSES):
-            values = solve(gram, np.where(rows > 0, rows / np.maximum(errors, floor), 0))
-            errors = squared_errors(gram, values)
+            values = _solved(factor, training.rows / np.maximum(errors, floor))
+            errors = factor.squared_errors(values)
         return values, np.maximum(errors, floor)
 
     def misfit(gravity: Array) -> float:
@@ -105,9 +112,9 @@ def find_gravity(
         return float(training.rows @ np.log(fitted(gravity)[1]))
 
     def unseen(gravity: Array) -> Array:
-        gram = held_out.under(gravity)
-        errors = squared_errors(gram, fitted(gravity)[0])
-        return np.maximum(np.maximum(errors, 1e-12 * gram[:, -1, -1]), 1e-300)
+        factor = held_out.under(gravity)
+        errors = factor.squared_errors(fitted(gravity)[0])
+        return np.maximum(np.maximum(errors, 1e-12 * factor.gram[:, -1, -1]), 1e-300)
 
     size = float(np.linalg.norm(model.gravity)) or _STANDARD
     starts = [model.gravity, *(size * sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]
@@ -205,20 +212,20 @@ def find_load(
     recordings, for its interval.
     """
     seen, unseen = fitted.under(model.gravity), predicted.under(model.gravity)
-    values = solve(seen, fitted.rows / np.maximum(seen[:, -1, -1], 1e-300))
+    values = _solved(seen, fitted.rows / np.maximum(seen.gram[:, -1, -1], 1e-300))
     # The error of the fit in as many rows as were predicted.
-    floor = 1e-12 * unseen[:, -1, -1] + 1e-300
-    usual = squared_errors(seen, values) * predicted.rows / np.maximum(fitted.rows, 1.0)
+    floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
+    usual = seen.squared_errors(values) * predicted.rows / np.maximum(fitted.rows, 1.0)
     weights = predicted.rows / np.maximum(usual, floor)
-    before = squared_errors(unseen, values)
+    before = unseen.squared_errors(values)
     last = model.layout.links[-1]
     # Of [last link | what the fit leaves over].
-    change = np.zeros((unseen.shape[1], len(last) + 1))
+    change = np.zeros((unseen.n_parameters + 1, len(last) + 1))
     change[last, range(len(last))] = 1.0
     change[:, -1] = np.append(-values, 1.0)
-    gram = change.T @ unseen @ change
-    body = solve(gram, weights)
-    after = squared_errors(gram, body)
+    left = replace(unseen, matrices=unseen.products(change))
+    body = _solved(left, weights)
+    after = left.squared_errors(body)
     beyond = weights @ np.maximum(before - usual, 0.0)
     found = CarriedLoad(
         mass=float(body[LINK_SYMBOLS.index("m")]),
@@ -375,7 +382,7 @@ def gather(
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])
     postures = position[:: max(1, len(position) // _POSTURES)]
-    unseen = total([Factor.of(model, run) for run in held_out])
+    unseen = sum((Factor.of(model, run) for run in held_out), Factor.zero(model))
     error = over_all(prediction_error(model, values, held_out))
     few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
     grams = StandardGram.of(model, few), StandardGram.of(model, unseen_few)

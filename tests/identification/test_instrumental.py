@@ -1,17 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators import instrumental
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
@@ -29,28 +26,18 @@ from identification.signals.samples import Samples
 from identification.signals.smoothing import fit_smoothing_spline
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from sim_fixtures.ns16 import urdf_text
-from tests.identification.closed_loop import JointServo, simulated_motion, standard_parameters
-from tests.identification.two_link import as_samples, sine_motion
+from tests.identification import two_link
+from tests.identification.two_link import URDF, as_samples, sine_motion, truth
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
-NOISE = np.array([3.0, 0.2])  # N·m
+TRUTH = truth()
 STEP = 5e-3
 TIME = np.arange(0.0, 10.0, STEP)
 LARGE, SMALL = 5e-4, 3e-6  # rad, encoder noise
 
 
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, standstill=0.1))
-
-
-@pytest.fixture(scope="module")
-def truth(model: RobotModel) -> Array:
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, standstill=0.1))
 
 
 def sines(seed: int, size: float = 1.0) -> Motion:
@@ -62,17 +49,7 @@ def sines(seed: int, size: float = 1.0) -> Motion:
 PLAN = sines(12)
 
 
-def coloured(rng: np.random.Generator, correlation: float) -> Array:
-    """First-order torque noise of standard deviation NOISE, correlated over a time [s]."""
-    r = np.exp(-STEP / correlation) if correlation else 0.0
-    start = rng.standard_normal((1, 2)) * r
-    white = np.sqrt(1.0 - r**2) * rng.standard_normal((len(TIME), 2))
-    return NOISE * lfilter([1.0], [1.0, -r], white, axis=0, zi=start)[0]
-
-
 def executed(
-    model: RobotModel,
-    truth: Array,
     seed: int,
     *,
     position_noise: float = 0.0,
@@ -84,38 +61,43 @@ def executed(
     true = Motion(
         TIME, *(a + b for a, b in zip(PLAN[1:4], sines(13 + seed, 0.02)[1:4], strict=True))
     )
-    torque = model.torque(truth, *true[1:]) + noise * coloured(rng, correlation)
-    seen = true
+    torque = MODEL.torque(TRUTH, *true[1:]) + noise * two_link.coloured(
+        rng, len(TIME), STEP, correlation
+    )
     if position_noise:
-        measured = true.position + position_noise * rng.standard_normal(true.position.shape)
-        spline = fit_smoothing_spline(TIME, measured, np.full(2, 1e-14), widest=40.0)
-        seen = Motion(TIME, spline(TIME), spline(TIME, 1), spline(TIME, 2))
-    return samples_of(model, seen, torque)
+        noise_of_positions = position_noise * rng.standard_normal(true.position.shape)
+        true = smoothed(true.position + noise_of_positions)
+    return samples_of(true, torque)
 
 
-def samples_of(model: RobotModel, motion: Motion, torque: Array) -> Samples:
-    usable = model.moving(motion.velocity)
+def smoothed(position: Array) -> Motion:
+    """Positions (m, n) through a spline of 40 Hz, however noisy they are."""
+    tolerance = np.full(position.shape[1], 1e-14)
+    spline = fit_smoothing_spline(TIME, position, tolerance, widest=40.0)
+    return Motion(TIME, *(spline(TIME, order) for order in range(3)))
+
+
+def samples_of(motion: Motion, torque: Array, arm: RobotModel = MODEL) -> Samples:
+    usable = arm.moving(motion.velocity)
     usable[:50] = usable[-50:] = False
-    return as_samples(model, motion, torque, usable=usable, origin=float(motion.time[0]))
+    return as_samples(arm, motion, torque, usable=usable, origin=float(motion.time[0]))
 
 
-def fit(
-    model: RobotModel, samples: Samples, plan: Motion = PLAN
-) -> tuple[PhaseFactor, InstrumentalEstimate]:
-    factor = instrument_factor(model, samples, plan)
-    return factor, estimate_instrumental(model, factor)
+def fit(samples: Samples, plan: Motion = PLAN) -> tuple[PhaseFactor, InstrumentalEstimate]:
+    factor = instrument_factor(MODEL, samples, plan)
+    return factor, estimate_instrumental(MODEL, factor)
 
 
-def examine(model: RobotModel, samples: Samples) -> EndogeneityTest:
-    factor, result = fit(model, samples)
-    return endogeneity_test(model, factor, result)
+def examine(samples: Samples) -> EndogeneityTest:
+    factor, result = fit(samples)
+    return endogeneity_test(MODEL, factor, result)
 
 
-def dense(model: RobotModel, samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
+def dense(samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
     """Z and W (m, n, p) and y (m, n) of the rows that count, zero elsewhere."""
-    rows = samples.usable & model.moving(plan.velocity)
-    p = model.n_parameters
-    z, w = (model.regressor(*one[1:]).dense(p) for one in (plan, samples.motion))
+    rows = samples.usable & MODEL.moving(plan.velocity)
+    p = MODEL.n_parameters
+    z, w = (MODEL.regressor(*one[1:]).dense(p) for one in (plan, samples.motion))
     return (
         np.where(rows[..., None], z, 0.0),
         np.where(rows[..., None], w, 0.0),
@@ -126,79 +108,71 @@ def dense(model: RobotModel, samples: Samples, plan: Motion = PLAN) -> tuple[Arr
 # The estimate
 
 
-def test_without_noise_the_truth_comes_back(model: RobotModel, truth: Array) -> None:
-    _, result = fit(model, executed(model, truth, 0, noise=0.0))
-    np.testing.assert_allclose(result.estimate.values, truth, rtol=1e-6, atol=1e-7)
+def test_without_noise_the_truth_comes_back() -> None:
+    _, result = fit(executed(0, noise=0.0))
+    np.testing.assert_allclose(result.estimate.values, TRUTH, rtol=1e-6, atol=1e-7)
     assert result.estimate.undetermined == ()
     assert result.weak == ()
 
 
-def test_it_solves_the_stacked_weighted_instrumental_equations(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 1, position_noise=LARGE)
-    z, w, y = dense(model, samples)
+def test_it_solves_the_stacked_weighted_instrumental_equations() -> None:
+    samples = executed(1, position_noise=LARGE)
+    z, w, y = dense(samples)
     weights = np.array([0.3, 20.0])
     z = z * weights[:, None]
     expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
-    factor = instrument_factor(model, samples, PLAN)
-    result = estimate_instrumental(model, factor, weights)
+    factor = instrument_factor(MODEL, samples, PLAN)
+    result = estimate_instrumental(MODEL, factor, weights)
     np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
 
 
-def test_where_position_noise_is_large_it_beats_least_squares(
-    model: RobotModel, truth: Array
-) -> None:
-    runs = [fit(model, executed(model, truth, s, position_noise=LARGE))[1] for s in range(30)]
-    instrumental = np.array([run.estimate.values for run in runs]) - truth
-    least = np.array([run.least_squares.values for run in runs]) - truth
-    inertias = [model.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
+def test_where_position_noise_is_large_it_beats_least_squares() -> None:
+    runs = [fit(executed(s, position_noise=LARGE))[1] for s in range(30)]
+    instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
+    least = np.array([run.least_squares.values for run in runs]) - TRUTH
+    inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
     # Least squares shrinks what stands in front of the acceleration, instruments do not, ...
-    assert np.all(np.abs(least.mean(axis=0))[inertias] > 0.2 * truth[inertias])
-    assert np.all(np.abs(instrumental.mean(axis=0))[inertias] < 0.02 * truth[inertias])
+    assert np.all(np.abs(least.mean(axis=0))[inertias] > 0.2 * TRUTH[inertias])
+    assert np.all(np.abs(instrumental.mean(axis=0))[inertias] < 0.02 * TRUTH[inertias])
     # ... and the error as a whole is smaller by far.
     errors = [np.sqrt((e**2).mean(axis=0)) for e in (instrumental, least)]
     assert np.median(errors[0] / errors[1]) < 0.3
 
 
-def test_where_position_noise_is_small_both_agree(model: RobotModel, truth: Array) -> None:
+def test_where_position_noise_is_small_both_agree() -> None:
     for seed in range(5):
-        _, result = fit(model, executed(model, truth, seed, position_noise=SMALL))
+        _, result = fit(executed(seed, position_noise=SMALL))
         apart = np.abs(result.estimate.values - result.least_squares.values)
         assert np.all(apart < result.estimate.std)
         np.testing.assert_allclose(result.estimate.std, result.least_squares.std, rtol=0.35)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(
-    model: RobotModel, truth: Array, correlation: float
-) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
     covered = []
     for seed in range(60):
-        samples = executed(model, truth, seed, position_noise=1e-4, correlation=correlation)
-        one = fit(model, samples)[1].estimate
-        covered.append(np.abs(one.values - truth) < one.interval_factor * one.std)
+        samples = executed(seed, position_noise=1e-4, correlation=correlation)
+        one = fit(samples)[1].estimate
+        covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_repetitions_and_pieces_add_up(model: RobotModel, truth: Array) -> None:
-    runs = [executed(model, truth, seed, position_noise=LARGE) for seed in (1, 2)]
-    one, two = (instrument_factor(model, run, PLAN) for run in runs)
-    both = estimate_instrumental(model, one + two, np.ones(2)).estimate
-    parts = [dense(model, run) for run in runs]
+def test_repetitions_and_pieces_add_up() -> None:
+    runs = [executed(seed, position_noise=LARGE) for seed in (1, 2)]
+    one, two = (instrument_factor(MODEL, run, PLAN) for run in runs)
+    both = estimate_instrumental(MODEL, one + two, np.ones(2)).estimate
+    parts = [dense(run) for run in runs]
     z, w, y = (np.concatenate([part[k] for part in parts]) for k in range(3))
     expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
     np.testing.assert_allclose(both.values, expected, rtol=1e-7, atol=1e-9)
     np.testing.assert_array_equal(both.samples, one.samples.sum(0) + two.samples.sum(0))
 
 
-def test_the_part_without_instruments_is_what_least_squares_reads(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 1)
-    factor = instrument_factor(model, samples, PLAN)
-    same_rows = replace(samples, usable=samples.usable & model.moving(PLAN.velocity))
-    expected = Factor.of(model, same_rows)
+def test_the_part_without_instruments_is_what_least_squares_reads() -> None:
+    samples = executed(1)
+    factor = instrument_factor(MODEL, samples, PLAN)
+    same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
+    expected = Factor.of(MODEL, same_rows)
     np.testing.assert_allclose(
         measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
     )
@@ -208,15 +182,15 @@ def test_the_part_without_instruments_is_what_least_squares_reads(
 # Strength of the instruments
 
 
-def test_strength_is_sheas_partial_r2(model: RobotModel, truth: Array) -> None:
-    samples = executed(model, truth, 1, position_noise=LARGE)
-    z, w, y = dense(model, samples)
-    rows = [part.reshape(-1, model.n_parameters) for part in (z, w)]
+def test_strength_is_sheas_partial_r2() -> None:
+    samples = executed(1, position_noise=LARGE)
+    z, w, y = dense(samples)
+    rows = [part.reshape(-1, MODEL.n_parameters) for part in (z, w)]
     table = np.column_stack([*rows, y.ravel()])
     strength = partial_r2(table.T @ table)
     fitted = rows[0] @ np.linalg.lstsq(rows[0], rows[1], rcond=None)[0]
-    for k in range(model.n_parameters):
-        others = np.arange(model.n_parameters) != k
+    for k in range(MODEL.n_parameters):
+        others = np.arange(MODEL.n_parameters) != k
         apart = [
             part[:, k]
             - part[:, others] @ np.linalg.lstsq(part[:, others], part[:, k], rcond=None)[0]
@@ -225,46 +199,35 @@ def test_strength_is_sheas_partial_r2(model: RobotModel, truth: Array) -> None:
         assert strength[k] == pytest.approx((apart[1] @ apart[1]) / (apart[0] @ apart[0]), rel=1e-5)
 
 
-def test_instruments_that_have_nothing_to_do_with_the_motion_are_called_weak(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 1)
-    factor, result = fit(model, samples, sines(99))
+def test_instruments_that_have_nothing_to_do_with_the_motion_are_called_weak() -> None:
+    samples = executed(1)
+    factor, result = fit(samples, sines(99))
     assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
-    assert "too weak for" in endogeneity_test(model, factor, result).words
+    assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
 
-def test_a_joint_whose_instrument_stands_still_is_not_determined(
-    model: RobotModel, truth: Array
-) -> None:
+def test_a_joint_whose_instrument_stands_still_is_not_determined() -> None:
     still = PLAN._replace(
         velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
     )
-    _, result = fit(model, executed(model, truth, 1), still)
+    _, result = fit(executed(1), still)
     assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)
-    assert np.isinf(result.estimate.std[model.parameter_names.index("f0_2")])
+    assert np.isinf(result.estimate.std[MODEL.parameter_names.index("f0_2")])
     assert {"f0_2", "f1_2"} <= set(result.weak)
 
 
 # Was least squares biased?
 
 
-def test_without_noise_in_the_regressor_a_5_percent_test_rejects_3_to_8_percent(
-    model: RobotModel, truth: Array
-) -> None:
-    runs = [
-        examine(model, executed(model, truth, seed, correlation=(0.02, 0.1)[seed % 2]))
-        for seed in range(300)
-    ]
+def test_without_noise_in_the_regressor_a_5_percent_test_rejects_3_to_8_percent() -> None:
+    runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
     assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
     assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
 
 
-def test_with_much_noise_it_says_that_least_squares_was_biased_and_where(
-    model: RobotModel, truth: Array
-) -> None:
+def test_with_much_noise_it_says_that_least_squares_was_biased_and_where() -> None:
     for seed in range(5):
-        test = examine(model, executed(model, truth, seed, position_noise=LARGE))
+        test = examine(executed(seed, position_noise=LARGE))
         assert test.biased
         assert {"I1yy", "I2yy"} <= set(test.shifted)
         assert "Least squares is biased by noise in the regressor" in test.words
@@ -274,58 +237,50 @@ def test_with_much_noise_it_says_that_least_squares_was_biased_and_where(
         np.testing.assert_allclose(test.coefficient, -1.0, atol=0.05)
 
 
-def test_a_disturbance_that_moves_the_arm_is_not_taken_for_noise(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 0)
-    explained = model.torque(truth, *PLAN[1:])
+def test_a_disturbance_that_moves_the_arm_is_not_taken_for_noise() -> None:
+    samples = executed(0)
+    explained = MODEL.torque(TRUTH, *PLAN[1:])
     disturbed = samples.torque + 0.8 * (samples.torque - explained)
-    test = examine(model, replace(samples, torque=disturbed))
+    test = examine(replace(samples, torque=disturbed))
     assert test.biased
     assert np.all(test.coefficient > 0.0)
     assert "does not act as noise of measurement does" in test.words
 
 
-def test_without_noise_it_says_that_nothing_speaks_for_a_bias(
-    model: RobotModel, truth: Array
+@pytest.mark.parametrize(
+    ("noise", "biased", "matters", "words"),
+    [
+        (0.0, False, False, "Nothing says that noise in the regressor has biased"),
+        (2e-5, True, False, "too small to matter"),
+        (LARGE, True, True, "Use the instrumental variables"),
+    ],
+)
+def test_it_says_whether_there_is_a_bias_that_matters(
+    noise: float, biased: bool, matters: bool, words: str
 ) -> None:
-    test = examine(model, executed(model, truth, 0))
-    assert not test.biased
-    assert test.words.startswith("Nothing says that noise in the regressor has biased")
+    test = examine(executed(0, position_noise=noise))
+    assert (test.biased, test.matters) == (biased, matters)
+    assert (test.predicted.max() < 0.005) == (not matters)
+    assert words in test.words
 
 
-def test_a_bias_too_small_to_matter_is_called_that(model: RobotModel, truth: Array) -> None:
-    test = examine(model, executed(model, truth, 0, position_noise=2e-5))
-    assert test.biased
-    assert test.predicted.max() < 0.005
-    assert not test.matters
-    assert "too small to matter" in test.words
-
-
-def test_a_bias_of_many_standard_deviations_matters_only_if_it_moves_torques(
-    model: RobotModel, truth: Array
-) -> None:
-    factor, result = fit(model, executed(model, truth, 0, position_noise=2e-5), PLAN)
+def test_a_bias_of_many_standard_deviations_matters_only_if_it_moves_torques() -> None:
+    factor, result = fit(executed(0, position_noise=2e-5), PLAN)
     # As from so many samples that parameters are known far better than torques need them.
     least = replace(result.least_squares, covariance=1e-4 * result.least_squares.covariance)
-    test = endogeneity_test(model, factor, replace(result, least_squares=least))
+    test = endogeneity_test(MODEL, factor, replace(result, least_squares=least))
     assert test.biased
     assert np.any(np.abs(test.shift) > 3.0 * least.std)
     assert test.predicted.max() < 0.005
     assert not test.matters
     assert "too small to matter" in test.words
     assert "Use the instrumental variables" not in test.words
-    noisy = examine(model, executed(model, truth, 0, position_noise=LARGE))
-    assert noisy.matters
-    assert "Use the instrumental variables" in noisy.words
 
 
-def test_instruments_that_are_the_measured_motion_leave_nothing_to_test(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 0, position_noise=SMALL)
-    factor, result = fit(model, samples, samples.motion)
-    test = endogeneity_test(model, factor, result)
+def test_instruments_that_are_the_measured_motion_leave_nothing_to_test() -> None:
+    samples = executed(0, position_noise=SMALL)
+    factor, result = fit(samples, samples.motion)
+    test = endogeneity_test(MODEL, factor, result)
     assert np.isnan(test.p_value)
     assert not test.biased
     assert "nothing to test" in test.words
@@ -334,17 +289,13 @@ def test_instruments_that_are_the_measured_motion_leave_nothing_to_test(
     )
 
 
-def test_the_statistic_is_that_of_the_auxiliary_regression_refitted_without_each_block(
-    model: RobotModel, truth: Array
-) -> None:
-    samples = executed(model, truth, 3, position_noise=1e-4)
-    factor, result = fit(model, samples)
-    test = endogeneity_test(model, factor, result)
+def test_the_statistic_is_that_of_the_auxiliary_regression_refitted_without_each_block() -> None:
+    samples = executed(3, position_noise=1e-4)
+    factor, result = fit(samples)
+    test = endogeneity_test(MODEL, factor, result)
     scale = np.sqrt(result.weights)
-    z, w, y = (
-        part * (scale[:, None] if part.ndim == 3 else scale) for part in dense(model, samples)
-    )
-    p = model.n_parameters
+    z, w, y = (part * (scale[:, None] if part.ndim == 3 else scale) for part in dense(samples))
+    p = MODEL.n_parameters
     explained = np.linalg.lstsq(
         z.reshape(-1, p), w.reshape(-1, p) @ result.estimate.values, rcond=None
     )[0]
@@ -391,8 +342,7 @@ def test_on_the_ns16_noisy_encoders_bias_least_squares_and_not_the_instruments()
     torque = arm.torque(true, *motion[1:])
     torque += 0.03 * torque.std(axis=0) * rng.standard_normal(torque.shape)
     measured = motion.position + 2e-4 * rng.standard_normal(torque.shape)
-    spline = fit_smoothing_spline(TIME, measured, np.full(6, 1e-14), widest=40.0)
-    samples = samples_of(arm, Motion(TIME, *(spline(TIME, k) for k in range(3))), torque)
+    samples = samples_of(smoothed(measured), torque, arm)
     plan = planned_motion(samples, motion.position)
     assert np.all(np.abs(plan.lag) < 1e-4)
     factor = instrument_factor(arm, samples, plan.motion, plan.usable)
@@ -420,7 +370,6 @@ def test_on_the_ns16_noisy_encoders_bias_least_squares_and_not_the_instruments()
 def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
     shoulder: float, elbow: float
 ) -> None:
-    model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
     late = [
         np.column_stack(
@@ -430,7 +379,7 @@ def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
     ]
     noise = 1e-4 * np.random.default_rng(0).standard_normal(late[0].shape)
     drooped = Motion(TIME, late[0] + noise + [0.01, -0.02], *late[1:])
-    instruments = planned_motion(samples_of(model, drooped, 0.0 * noise), PLAN.position)
+    instruments = planned_motion(samples_of(drooped, 0.0 * noise), PLAN.position)
     np.testing.assert_allclose(instruments.lag, [shoulder, elbow], atol=1e-4)
     inside = (TIME > 0.5) & (TIME < 9.5)
     np.testing.assert_allclose(
@@ -440,10 +389,8 @@ def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
     assert instruments.usable[inside].all()
 
 
-def test_a_lag_that_is_known_is_not_sought_again(
-    model: RobotModel, truth: Array, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    samples = executed(model, truth, 0)
+def test_a_lag_that_is_known_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = executed(0)
     found = planned_motion(samples, PLAN.position)
     monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
     again = planned_motion(samples, PLAN.position, lag=found.lag)
@@ -465,8 +412,8 @@ def test_repetitions_share_a_plan_whatever_their_clocks_and_other_motions_do_not
     assert not same_plan(plan, (TIME, np.full_like(PLAN.position, np.nan)))
 
 
-def test_rows_without_a_command_and_recordings_without_any(model: RobotModel, truth: Array) -> None:
-    samples = executed(model, truth, 0)
+def test_rows_without_a_command_and_recordings_without_any() -> None:
+    samples = executed(0)
     command = PLAN.position.copy()
     command[300:340, 1] = np.nan
     instruments = planned_motion(samples, command)
@@ -476,71 +423,3 @@ def test_rows_without_a_command_and_recordings_without_any(model: RobotModel, tr
         planned_motion(samples, np.full_like(command, np.nan))
     with pytest.raises(IdentificationError, match="no joint is commanded to move"):
         planned_motion(samples, np.ones_like(command))
-
-
-SERVO = JointServo(np.array([4000.0, 1500.0]), np.array([300.0, 60.0]))
-
-
-def test_the_simulated_arm_obeys_its_servo_and_its_dynamics(
-    model: RobotModel, truth: Array
-) -> None:
-    simulated = simulated_motion(model, truth, SERVO, PLAN).motion
-    servo_torque = SERVO.position * (PLAN.position - simulated.position)
-    servo_torque += SERVO.velocity * (PLAN.velocity - simulated.velocity)
-    needed = model.torque(truth, *simulated[1:])
-    moving = model.moving(simulated.velocity)
-    error = np.where(moving, needed - servo_torque, 0.0)
-    assert np.all(np.linalg.norm(error, axis=0) < 0.03 * np.linalg.norm(needed * moving, axis=0))
-    ahead = simulated_motion(model, truth, replace(SERVO, feedforward=True), PLAN).motion
-    errors = [np.std(one.position - PLAN.position, axis=0) for one in (ahead, simulated)]
-    assert np.all(errors[0] < 0.2 * errors[1])
-
-
-def test_instruments_from_the_closed_loop_beat_least_squares(
-    model: RobotModel, truth: Array
-) -> None:
-    real = simulated_motion(model, truth, SERVO, PLAN).motion
-    applied = SERVO.position * (PLAN.position - real.position)
-    applied += SERVO.velocity * (PLAN.velocity - real.velocity)
-    rng = np.random.default_rng(5)
-    measured = real.position + LARGE * rng.standard_normal(real.position.shape)
-    spline = fit_smoothing_spline(TIME, measured, np.full(2, 1e-14), widest=40.0)
-    seen = Motion(TIME, spline(TIME), spline(TIME, 1), spline(TIME, 2))
-    samples = samples_of(model, seen, applied + coloured(rng, 0.02))
-    rough = truth * np.random.default_rng(1).uniform(0.8, 1.2, len(truth))
-    instrument = simulated_motion(model, rough, SERVO, PLAN).motion
-    _, result = fit(model, samples, instrument)
-    errors = [np.abs(one.values - truth)[:7] for one in (result.estimate, result.least_squares)]
-    assert np.median(errors[0] / errors[1]) < 0.3
-
-
-def test_bodies_equivalent_to_base_parameters_make_the_same_torques() -> None:
-    model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(False, False, None))
-    rng = np.random.default_rng(2)
-    nominal = model.base.grouping @ model.nominal
-    values = nominal * rng.uniform(0.7, 1.3, len(nominal))
-    links, rotors = standard_parameters(model, values)
-    assert np.all(links[:, 9] > 0.0)
-    both = np.column_stack([links, np.diag(rotors)]).ravel()
-    np.testing.assert_allclose(model.base.grouping @ both, values, rtol=1e-8, atol=1e-9)
-    # The mass matrix, as pinocchio makes it of the URDF's own bodies.
-    arm = pin.buildModelFromXML(urdf_text())
-    q, qd, qdd = rng.uniform(-1.0, 1.0, (3, 6))
-    links, rotors = standard_parameters(model, nominal)
-    expected = pin.rnea(arm, arm.createData(), q, qd, qdd)
-    both = np.column_stack([links, np.diag(rotors)]).ravel()
-    torque = model.torque(model.base.grouping @ both, q[None], qd[None], qdd[None])[0]
-    np.testing.assert_allclose(torque, expected, rtol=1e-8, atol=1e-8)
-
-
-def test_parameters_without_a_positive_mass_matrix_cannot_be_simulated(
-    model: RobotModel, truth: Array
-) -> None:
-    wrong = truth.copy()
-    wrong[0] = -5.0
-    with pytest.raises(IdentificationError, match="no positive mass matrix"):
-        simulated_motion(model, wrong, SERVO, PLAN)
-    with pytest.raises(ValueError, match="must be positive"):
-        JointServo(np.zeros(2), np.ones(2))
-    with pytest.raises(ShapeError, match="servo gains"):
-        simulated_motion(model, truth, JointServo(np.ones(3), np.ones(3)), PLAN)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import importlib.metadata
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -73,13 +72,6 @@ def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> Non
 
 def test_an_infinite_residual_of_tukeys_counts_nothing() -> None:
     assert Tukey().weight(np.array([np.inf])) == 0.0
-
-
-@pytest.mark.parametrize("tuning", [0.0, -1.0, np.nan, np.inf])
-def test_a_constant_that_makes_no_loss_is_refused(tuning: float) -> None:
-    for kind in (Huber, Tukey):
-        with pytest.raises(IdentificationError, match="positive"):
-            kind(tuning)
 
 
 # The robust fit -----------------------------------------------------------------------------
@@ -176,28 +168,6 @@ def test_it_is_the_minimum_of_the_loss_with_the_scales_it_found(loss: Loss) -> N
     np.testing.assert_allclose(scale, np.array(middle) / 0.67449, rtol=0.02)
 
 
-@given(pieces=st.integers(2, 40), seed=st.integers(0, 999))
-@settings(max_examples=5)
-def test_one_recording_or_many_pieces_give_the_same_to_nine_digits(pieces: int, seed: int) -> None:
-    motion, rng = a_motion(3.0), np.random.default_rng(seed)
-    whole = recording(spoiled(rng, gaussian(rng, motion), 0.05, 30.0), motion)
-    edges = np.unique(np.linspace(0, len(motion.time), pieces + 1).astype(int))
-    parts = [
-        replace(
-            whole,
-            motion=motion.rows(slice(a, b)),
-            torque=whole.torque[a:b],
-            usable=whole.usable[a:b],
-        )
-        for a, b in pairwise(edges)
-    ]
-    for loss in LOSSES:
-        one = robust_estimate(MODEL, [whole], loss).estimate
-        many = robust_estimate(MODEL, parts, loss).estimate
-        np.testing.assert_allclose(many.values, one.values, rtol=1e-9)
-        np.testing.assert_allclose(many.std, one.std, rtol=1e-6)
-
-
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
 def test_95_percent_intervals_cover_90_to_99_percent_with_gross_errors_and_coloured_noise(
@@ -253,14 +223,12 @@ def test_where_a_model_leaves_much_out_the_outlying_rows_say_so() -> None:
     assert result.doubtful.tolist() == [False, True]
 
 
-def test_no_rows_and_recordings_that_can_be_read_once_only_are_errors() -> None:
+def test_no_rows_are_an_error() -> None:
     motion = a_motion(1.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
     empty = replace(samples, usable=np.zeros_like(samples.usable))
     with pytest.raises(IdentificationError, match="not one usable sample"):
         robust_estimate(MODEL, [empty])
-    with pytest.raises(IdentificationError, match="twice"):
-        robust_estimate(MODEL, (s for s in [samples]))  # type: ignore[arg-type]
 
 
 def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(
