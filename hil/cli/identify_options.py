@@ -9,7 +9,6 @@ import typer
 
 from hil.errors import InputError
 from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, Options, friction_from
-from identification.signals.samples import Smoother
 
 LONGEST_DELAY: Final = 0.5
 """s; what lags by more belongs to another recording."""
@@ -56,13 +55,6 @@ DelayOption = Annotated[
         "compensated.",
     ),
 ]
-SmootherOption = Annotated[
-    Smoother,
-    typer.Option(
-        help="spline: a smoothing spline as close as the measured noise allows; butterworth: a "
-        "low-pass without phase."
-    ),
-]
 TorqueBandwidthOption = Annotated[
     str,
     typer.Option(
@@ -80,7 +72,6 @@ def options_from(
     friction: str = "auto",
     standstill: Literal["auto", "rests", "slow", "none"] = "auto",
     delay: str | None = None,
-    smoother: Smoother = "spline",
     torque_bandwidth: str = "auto",
     **others: Any,
 ) -> Options:
@@ -98,7 +89,6 @@ def options_from(
         friction="auto" if friction == "auto" else friction_from(friction),
         standstill=standstill,
         delay=delay_from(delay),
-        smoother=smoother,
         torque_bandwidth=None
         if torque_bandwidth == "none"
         else bandwidth_from(torque_bandwidth, "--torque-bandwidth"),

@@ -24,7 +24,6 @@ from hil.cli.identify_options import (
     BandwidthOption,
     DelayOption,
     FrictionOption,
-    SmootherOption,
     StandstillOption,
     TorqueBandwidthOption,
     VelocityOption,
@@ -209,7 +208,6 @@ def reidentify(
     friction: FrictionOption = "auto",
     standstill: StandstillOption = "auto",
     delay: DelayOption = None,
-    smoother: SmootherOption = "spline",
     torque_bandwidth: TorqueBandwidthOption = "auto",
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -240,7 +238,6 @@ def reidentify(
         options_from(
             delay=delay,
             torque_bandwidth=torque_bandwidth,
-            smoother=smoother,
             estimator=estimator,
             bandwidth=bandwidth,
             velocity=velocity,

@@ -151,7 +151,6 @@ def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -
         "delay": bool(suggested),
         "bandwidth": options.bandwidth == "auto",
         "velocity": options.velocity == "auto"
-        and options.smoother == "spline"
         and all(one.velocity is not None for one in recorded),
         "presliding": options.friction == "auto",
         "rows": options.standstill == "auto",

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, get_args
 from hil.errors import InputError
 from identification.model.friction import ABSENT, TERMS
 from identification.signals.masks import LeftOut
-from identification.signals.samples import RIGID_BANDWIDTH, Smoother, VelocitySource
+from identification.signals.samples import RIGID_BANDWIDTH, VelocitySource
 
 Method = Literal["default", "paper"]
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
@@ -42,7 +42,6 @@ class Options:
         torque_bandwidth: low-pass [Hz] the torque has come through before it was recorded; None
             for none. "auto" looks for one in imported torques; a controller's own currents are
             known to have come through none.
-        smoother: of the positions: "spline" or "butterworth".
         estimator: by name, see `ESTIMATORS`.
         bandwidth: widest of the smoothed positions [Hz].
         velocity: the slope of the smoothed positions, or the measured velocity.
@@ -62,7 +61,6 @@ class Options:
     split: float = 0.7
     delay: float | Literal["auto", "stated"] | None = None
     torque_bandwidth: float | Literal["auto"] | None = "auto"
-    smoother: Smoother = "spline"
     estimator: Estimator = "auto"
     bandwidth: float | Literal["auto"] = "auto"
     velocity: VelocitySource | Literal["auto"] = "auto"
@@ -73,7 +71,6 @@ class Options:
     def __post_init__(self) -> None:
         for name, kind in (
             ("method", Method),
-            ("smoother", Smoother),
             ("estimator", Estimator),
         ):
             value, known = getattr(self, name), get_args(kind)

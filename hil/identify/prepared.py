@@ -177,7 +177,7 @@ def with_torques(sources: Sources) -> Sources:
     why = "the URDF has no masses to compare currents with"
     if len(currents) == len(recordings) and np.any(model.nominal):
         turns = motor_from_joint(recordings[0])
-        motions = [smooth(one, sources.noise_variance) for one in recordings]
+        motions = [smooth(one, sources.noise_variance)[0] for one in recordings]
         scale = scale_from_nominal(model, motions, currents, turns)
         why = "their currents do not look like the weight and inertia of the URDF on any axis"
         why = "" if scale.determined.any() else why

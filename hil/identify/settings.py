@@ -79,7 +79,6 @@ def stated_settings(cell: Cell, options: Options) -> Settings:
     delay = delay if isinstance(delay, float) else stated_delay(cell)
     return Settings(
         Preprocessing(
-            smoother=options.smoother,
             rigid_bandwidth=RIGID_BANDWIDTH if options.bandwidth == "auto" else options.bandwidth,
             velocity="position" if options.velocity == "auto" else options.velocity,
             left_out=None if options.standstill == "auto" else options.standstill,

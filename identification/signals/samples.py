@@ -23,8 +23,7 @@ from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
     SMOOTHER,
     LowPassShape,
-    butterworth_motion,
-    choose_cutoff,
+    SmoothingSpline,
     fit_smoothing_spline,
     low_passed,
 )
@@ -37,7 +36,6 @@ Array = NDArray[np.float64]
 RIGID_BANDWIDTH: Final = 40.0  # Hz
 _SHORTEST_SEGMENT: Final = 12  # samples: twice what a quintic spline needs
 
-Smoother = Literal["spline", "butterworth"]
 VelocitySource = Literal["position", "measured"]
 
 
@@ -46,9 +44,6 @@ class Preprocessing:
     """How a recording is turned into samples.
 
     Attributes:
-        smoother: of the positions: the smoothing spline whose mean squared residual is the noise
-            variance, or a zero-phase Butterworth filter
-            (:mod:`identification.signals.smoothing`).
         rigid_bandwidth: widest bandwidth of the smoothed positions [Hz], however little noise
             they have. A rigid model has nothing to say above the first resonance of the arm,
             where motors accelerate without their links; and a wide one lets ripple that has
@@ -74,7 +69,6 @@ class Preprocessing:
             reversal, where `left_out` is "slow".
     """
 
-    smoother: Smoother = "spline"
     rigid_bandwidth: float = RIGID_BANDWIDTH
     velocity: VelocitySource = "position"
     left_out: LeftOut | None = None
@@ -196,25 +190,45 @@ class Samples:
 def smooth(
     recording: Recording,
     noise_variance: Array | None = None,
-    *,
-    delay: float = 0.0,
-    widest: float = RIGID_BANDWIDTH,
-) -> Motion:
-    """Smoothed motion in the rows of the recording, at each instant less the delay.
+    options: Preprocessing = Preprocessing(),
+) -> tuple[Motion, Array]:
+    """Smoothed motion at each instant less the delay, and the bandwidth of the longest stretch.
 
-    Rows of a segment too short to smooth keep their position, at rest; see :func:`prepare` for
+    Rows of a stretch too short to smooth keep their position, at rest; see :func:`prepare` for
     which rows count.
 
     Args:
         recording: checked.
         noise_variance: of the measured positions (n,) [rad² or m²], from standstill and at least
             resolution²/12. None: estimated from the differences of the positions.
-        delay: time by which what the motion is to be compared with lags it [s].
-        widest: see `Preprocessing.rigid_bandwidth` [Hz].
+        options: its bandwidth, velocity and delay.
+
+    Returns:
+        Motion in the rows of the recording, and the bandwidth per joint (n,) [Hz].
     """
-    return _spline_motion(
-        recording, noise_variance, Preprocessing(torque_delay=delay, rigid_bandwidth=widest)
-    )[0]
+    position = recording.position.copy()
+    velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
+    bandwidth, longest = np.full(recording.n_joints, np.inf), 0
+    speed = recording.velocity if options.velocity == "measured" else None
+
+    def spline_of(time: Array, measured: Array, variance: Array | None) -> SmoothingSpline:
+        tolerance = _attainable(time, measured, variance)
+        return fit_smoothing_spline(time, measured, tolerance, widest=options.rigid_bandwidth)
+
+    for segment in recording.segments():
+        time = recording.time[segment]
+        if len(time) < SHORTEST_STRETCH:
+            continue
+        spline, at = spline_of(time, position[segment], noise_variance), time - options.torque_delay
+        position[segment] = spline(at)
+        if speed is None:
+            velocity[segment], acceleration[segment] = spline(at, 1), spline(at, 2)
+        else:
+            slope = spline_of(time, speed[segment], None)
+            velocity[segment], acceleration[segment] = slope(at), slope(at, 1)
+        if len(time) > longest:
+            longest, bandwidth = len(time), spline.bandwidth
+    return Motion(recording.time, position, velocity, acceleration), bandwidth
 
 
 def prepare(
@@ -247,7 +261,7 @@ def prepare(
     recording.checked(model.joint_names)
     if recording.torque is None:
         raise RecordingError("torque", "the recording has no joint torque to fit")
-    motion, bandwidth = _motion(recording, noise_variance, options)
+    motion, bandwidth = smooth(recording, noise_variance, options)
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None
     if options.torque_bandwidth is not None:
@@ -285,48 +299,6 @@ def prepare(
     return replace(samples, torque=samples.torque - samples.known_torque(model))
 
 
-def _motion(
-    recording: Recording, noise_variance: Array | None, options: Preprocessing
-) -> tuple[Motion, Array]:
-    """Smoothed motion, and the bandwidth of the smoothing (n,) [Hz]."""
-    if options.smoother == "spline":
-        return _spline_motion(recording, noise_variance, options)
-    cutoff = choose_cutoff(recording, noise_variance, widest=options.rigid_bandwidth)
-    return butterworth_motion(recording, cutoff, delay=options.torque_delay), cutoff
-
-
-def _spline_motion(
-    recording: Recording, noise_variance: Array | None, options: Preprocessing
-) -> tuple[Motion, Array]:
-    """Motion, and the bandwidth (n,) of the longest segment."""
-    position = recording.position.copy()
-    velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
-    bandwidth = np.full(recording.n_joints, np.inf)
-    longest, widest = 0, options.rigid_bandwidth
-    speed = recording.velocity if options.velocity == "measured" else None
-    for segment in recording.segments():
-        time, measured = recording.time[segment], recording.position[segment]
-        if len(time) < SHORTEST_STRETCH:
-            continue
-        variance = difference_variance(time, measured) if noise_variance is None else noise_variance
-        spline = fit_smoothing_spline(
-            time, measured, _attainable(variance, measured), widest=widest
-        )
-        at = time - options.torque_delay
-        position[segment] = spline(at)
-        if speed is None:
-            velocity[segment], acceleration[segment] = spline(at, 1), spline(at, 2)
-        else:
-            own = difference_variance(time, speed[segment])
-            slope = fit_smoothing_spline(
-                time, speed[segment], _attainable(own, speed[segment]), widest=widest
-            )
-            velocity[segment], acceleration[segment] = slope(at), slope(at, 1)
-        if len(time) > longest:
-            longest, bandwidth = len(time), spline.bandwidth
-    return Motion(recording.time, position, velocity, acceleration), bandwidth
-
-
 def _noise_bandwidth(
     recording: Recording, variance: Array | None, segments: tuple[slice, ...]
 ) -> Array:
@@ -338,13 +310,16 @@ def _noise_bandwidth(
     assert recording.torque is not None
     longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
     time, measured = recording.time[longest], recording.torque[longest]
+    return fit_smoothing_spline(time, measured, _attainable(time, measured, variance)).bandwidth
+
+
+def _attainable(time: Array, measured: Array, variance: Array | None) -> Array:
+    """Noise variance (c,), by default from differences; at least that of rounding.
+
+    Closer a spline cannot follow (m, c).
+    """
     if variance is None:
         variance = difference_variance(time, measured)
-    return fit_smoothing_spline(time, measured, _attainable(variance, measured)).bandwidth
-
-
-def _attainable(variance: Array, measured: Array) -> Array:
-    """Noise variance (c,), at least that of rounding: closer a spline cannot follow (m, c)."""
     rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
     return np.asarray(np.maximum(variance, np.maximum(rounding, 1e-40)))
 

@@ -335,10 +335,9 @@ def test_a_standstill_gives_the_noise_and_other_recordings_are_predicted(tmp_pat
     assert [one.name for one in unread.held_out] == ["b.mcap"]
 
 
-@pytest.mark.parametrize("smoother", ["spline", "butterworth"])
-def test_either_smoother_finds_the_parameters(tmp_path: Path, smoother: str) -> None:
+def test_a_log_without_time_finds_the_parameters(tmp_path: Path) -> None:
     simulated = simulate(UR5, np.arange(0.0, 20.0, 4e-3))
     np.savez(tmp_path / "log.npz", q=simulated.position, tau=simulated.torque)
     columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
-    options = Options(torque_bandwidth=None, smoother=smoother)  # type: ignore[arg-type]
+    options = Options(torque_bandwidth=None)
     assert_found(identify(tmp_path, simulated, "log.npz", columns, options=options), simulated)

@@ -192,7 +192,7 @@ class TestCache:
         store = Store(tmp_path)
         store.put(KEY, settings)
         assert store.get(KEY, Settings) == settings
-        store.put(KEY, {"smoother": "spline", "torque_delay": 0.0})
+        store.put(KEY, {"velocity": "position", "torque_delay": 0.0})
         assert store.get(KEY, Settings) is None
 
 
@@ -242,7 +242,7 @@ def test_factors_are_known_by_everything_they_depend_on() -> None:
     )
     assert settings_digest(stated) == settings_digest(for_the_estimate)
     others = [
-        stated.preprocessed(smoother="butterworth"),
+        stated.preprocessed(velocity="measured"),
         stated.preprocessed(torque_delay=0.004),
         stated.preprocessed(torque_bandwidth=30.0),
         replace(stated, noise_variance=(1e-9 * (1 + 2e-16),) * 6),

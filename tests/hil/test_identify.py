@@ -594,7 +594,6 @@ class TestCommand:
         [
             ({"estimator": "lms"}, "estimator: 'lms' is no estimator; use auto, wls"),
             ({"method": "papers"}, "method: 'papers' is no method; use default, paper"),
-            ({"smoother": "kalman"}, "smoother: 'kalman' is no smoother; use spline, butterworth"),
             ({"split": 1.5}, "split: 1.5 is no share; give one between 0 and 1"),
         ],
     )

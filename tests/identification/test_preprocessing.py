@@ -153,7 +153,7 @@ def test_smooth_gives_the_motion_in_the_rows_of_the_recording(
     model: RobotModel, truth: Array
 ) -> None:
     recording = a_recording(model, truth)
-    smoothed = smooth(recording, QUANTISATION)
+    smoothed, _ = smooth(recording, QUANTISATION)
     assert smoothed.position.shape == recording.position.shape
     np.testing.assert_array_equal(smoothed.time, recording.time)
     assert np.abs(smoothed.position - recording.position).max() < 3 * RESOLUTION
