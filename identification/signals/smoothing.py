@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from math import comb
 from typing import Final
 
 import numpy as np
@@ -30,8 +29,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-ORDER: Final = 6  # quintic: six basis functions are non-zero on each knot interval
-SAMPLES_PER_KNOT: Final = 4
+DEGREE: Final = 5
+ORDER: Final = DEGREE + 1  # basis functions that are non-zero on each knot interval
 # The penalty is limited, in knot units and per sample, to where it still smooths something the
 # knots can show (lower end) and where the normal equations still have digits left (upper end).
 _LIGHTEST: Final = 1e-9
@@ -61,18 +60,14 @@ class SmoothingSpline:
 
         Times outside the knots extrapolate the first or last piece.
         """
-        intervals = len(self.coefficients) - ORDER + 1
-        rows = _rows(self.start, self.spacing, intervals, time, derivative)
-        return np.asarray(rows @ self.coefficients)
+        knots = _knots(len(self.coefficients) - DEGREE)
+        spline = scipy.interpolate.BSpline(knots, self.coefficients, DEGREE)
+        at = (np.asarray(time, dtype=np.float64) - self.start) / self.spacing
+        return np.asarray(spline(at, derivative) / self.spacing**derivative)
 
 
 def fit_smoothing_spline(
-    time: Array,
-    values: Array,
-    tolerance: Array,
-    *,
-    widest: float = np.inf,
-    samples_per_knot: int = SAMPLES_PER_KNOT,
+    time: Array, values: Array, tolerance: Array, *, widest: float = np.inf
 ) -> SmoothingSpline:
     """Smooth each channel until its mean squared residual equals its tolerance.
 
@@ -81,31 +76,24 @@ def fit_smoothing_spline(
     all but name).
 
     Args:
-        time: strictly increasing (m,) [s], uniform or not.
+        time: strictly increasing (m,) [s], uniform or not; at least `ORDER`.
         values: (m, c).
         tolerance: wanted mean squared residual (c,), positive.
         widest: bandwidth [Hz] that is never exceeded, whatever the tolerance.
-        samples_per_knot: knot spacing in median sampling intervals, to begin with.
-
-    Raises:
-        ValueError: fewer than 6 samples, or a tolerance that is not positive.
     """
-    if len(time) < ORDER:
-        raise ValueError(f"a quintic smoothing spline needs {ORDER} samples, got {len(time)}")
-    tolerance = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), values.shape[1:])
-    if not np.all(tolerance > 0.0):
-        raise ValueError(f"the tolerance must be positive in every channel, got {tolerance}")
-    while True:
-        problem = _Problem.build(time, values, samples_per_knot * _median_step(time))
+    for samples_per_knot in (4, 2, 1):
+        problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
         fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
-        close = bool(np.all(np.mean(problem.closest_residual**2, axis=0) <= tolerance))
-        if fine or close or samples_per_knot == 1:
+        if fine or np.all(np.mean(problem.closest_residual**2, axis=0) <= tolerance):
             break
-        samples_per_knot = max(1, samples_per_knot // 2)
-    channels = range(values.shape[1])
-    return problem.solve(
-        np.array([problem.penalty_for(c, float(tolerance[c]), widest) for c in channels])
+    penalties = np.array(
+        [problem.penalty_for(c, float(one), widest) for c, one in enumerate(tolerance)]
     )
+    coefficients = problem.closest.copy()
+    for channel, penalty in enumerate(penalties.tolist()):
+        coefficients[:, channel] += problem.correction(channel, penalty)
+    bandwidth = (problem.density / penalties) ** (1 / 6) / (2.0 * np.pi * problem.spacing)
+    return SmoothingSpline(float(time[0]), problem.spacing, coefficients, bandwidth)
 
 
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
@@ -114,8 +102,8 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     What is applied to a measured torque and to every column of its regressor alike leaves their
     linear relation as it is.
     """
-    spacing = max(_median_step(time), _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth))
-    problem = _Problem.build(time, values, spacing)
+    step = float(np.median(np.diff(time)))
+    problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
     correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
     return np.asarray(problem.rows @ (problem.closest + correction))
 
@@ -128,8 +116,7 @@ class _Problem:
     of the noise, so nothing is lost to cancellation against positions of many radians.
     """
 
-    start: float
-    spacing: float
+    spacing: float  # [s]
     density: float  # samples per knot interval
     rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
     gram: Array  # (6, k) lower band of rows' rows
@@ -139,25 +126,21 @@ class _Problem:
     roughness: Array  # (k, c) penalty matrix times closest
 
     @classmethod
-    def build(cls, time: Array, values: Array, spacing: float) -> _Problem:
+    def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
+        """Problem with about this spacing of the knots [s]."""
         span = float(time[-1] - time[0])
         intervals = max(1, round(span / spacing))
-        spacing = span / intervals
-        density = len(time) / intervals
-        start = float(time[0])
-        rows = _rows(start, spacing, intervals, time, 0)
+        spacing, density = span / intervals, len(time) / intervals
+        at = np.clip((time - time[0]) / spacing, 0.0, intervals)
+        rows = scipy.interpolate.BSpline.design_matrix(at, _knots(intervals), DEGREE)
         gram, penalty = _gram_band(rows), _penalty_band(intervals)
-        lightest = gram + _LIGHTEST * density * penalty
-        factor = (scipy.linalg.cholesky_banded(lightest, lower=True), True)
+        lightest = _LIGHTEST * density
+        factor = (scipy.linalg.cholesky_banded(gram + lightest * penalty, lower=True), True)
         closest = scipy.linalg.cho_solve_banded(factor, rows.T @ values)
-        closest += scipy.linalg.cho_solve_banded(
-            factor,
-            rows.T @ (values - rows @ closest) - _LIGHTEST * density * _roughness(closest),
-        )
+        refined = rows.T @ (values - rows @ closest) - lightest * _roughness(closest)
+        closest += scipy.linalg.cho_solve_banded(factor, refined)
         residual = values - rows @ closest
-        return cls(
-            start, spacing, density, rows, gram, penalty, closest, residual, _roughness(closest)
-        )
+        return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """How the coefficients of a channel, or all, differ from the least smoothed ones."""
@@ -180,87 +163,27 @@ class _Problem:
         """
 
         def excess(log_penalty: float) -> float:
-            residual = self.closest_residual[:, channel] - self.rows @ self.correction(
-                channel, float(np.exp(log_penalty))
-            )
+            correction = self.correction(channel, float(np.exp(log_penalty)))
+            residual = self.closest_residual[:, channel] - self.rows @ correction
             variance = float(np.mean(residual**2))
             return float(np.log(max(variance / tolerance, np.finfo(np.float64).tiny)))
 
-        lightest = np.log(self.penalty_at(widest))
-        heaviest = np.log(self.penalty_at(0.0))
+        lightest, heaviest = np.log(self.penalty_at(widest)), np.log(self.penalty_at(0.0))
         if excess(lightest) >= 0.0:
             return float(np.exp(lightest))
         if excess(heaviest) <= 0.0:
             return float(np.exp(heaviest))
         return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=1e-4)))
 
-    def solve(self, penalties: Array) -> SmoothingSpline:
-        coefficients = self.closest.copy()
-        for channel, penalty in enumerate(penalties):
-            coefficients[:, channel] += self.correction(channel, float(penalty))
-        return SmoothingSpline(
-            start=self.start,
-            spacing=self.spacing,
-            coefficients=coefficients,
-            bandwidth=(self.density / penalties) ** (1 / 6) / (2.0 * np.pi * self.spacing),
-        )
 
-
-def _median_step(time: Array) -> float:
-    return float(np.median(np.diff(time)))
-
-
-def _pieces() -> Array:
-    """Cardinal quintic B-spline on one knot interval: (6 powers of u, 6 basis functions).
-
-    From B(x) = sum_j (-1)^j C(6, j) (x - j)_+^5 / 5!; basis function k sees x = u + 5 - k.
-    """
-    pieces = np.zeros((ORDER, ORDER))
-    for k in range(ORDER):
-        for j in range(ORDER - k):
-            shift = 5 - k - j
-            for power in range(ORDER):
-                pieces[power, k] += (
-                    (-1) ** j * comb(6, j) * comb(5, power) * shift ** (5 - power) / 120
-                )
-    return pieces
-
-
-_PIECES: Final = _pieces()
-# Quadratic B-spline likewise: (3 powers of u, 3 basis functions).
-_QUADRATIC_PIECES: Final = np.array([[0.5, 0.5, 0.0], [-1.0, 1.0, 0.0], [0.5, -1.0, 0.5]])
-
-
-def _piece_derivative(order: int) -> Array:
-    pieces = _PIECES
-    for _ in range(order):
-        pieces = np.arange(1, len(pieces))[:, None] * pieces[1:]
-    return pieces
-
-
-def _rows(
-    start: float, spacing: float, intervals: int, time: Array, derivative: int
-) -> scipy.sparse.csr_array:
-    """Basis functions, or their derivatives, at each time: sparse (m, intervals + 5)."""
-    x = (np.asarray(time, dtype=np.float64) - start) / spacing
-    interval = np.clip(np.floor(x).astype(np.int64), 0, intervals - 1)
-    pieces = _piece_derivative(derivative)
-    weights = np.vander(x - interval, len(pieces), increasing=True) @ pieces
-    columns = interval[:, None] + np.arange(ORDER)
-    return scipy.sparse.csr_array(
-        (
-            (weights / spacing**derivative).ravel(),
-            columns.ravel(),
-            np.arange(0, ORDER * len(x) + 1, ORDER),
-        ),
-        shape=(len(x), intervals + ORDER - 1),
-    )
+def _knots(intervals: int) -> Array:
+    """Uniform knots of a quintic spline on so many intervals, in knot units from the first."""
+    return np.arange(-DEGREE, intervals + ORDER, dtype=np.float64)
 
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     """Lower band (6, k) of rows' rows."""
-    columns = rows.indices.reshape(-1, ORDER)
-    weights = rows.data.reshape(-1, ORDER)
+    columns, weights = rows.indices.reshape(-1, ORDER), rows.data.reshape(-1, ORDER)
     band = np.zeros((ORDER, rows.shape[1]))
     for k in range(ORDER):
         for offset in range(ORDER - k):
@@ -270,20 +193,25 @@ def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     return band
 
 
-def _gauss_products(pieces: Array) -> Array:
-    """Integrals over one knot interval of the products of two pieces, up to cubics."""
+def _products(degree: int, derivative: int) -> Array:
+    """Integrals over one knot interval of products of B-splines' derivatives, up to cubics."""
     points, weights = np.polynomial.legendre.leggauss(4)
-    values = np.vander((points + 1.0) / 2.0, len(pieces), increasing=True) @ pieces
+    knots = np.arange(-degree, degree + 2, dtype=np.float64)
+    basis = scipy.interpolate.BSpline(knots, np.eye(degree + 1), degree)
+    values = basis((points + 1.0) / 2.0, derivative)
     return np.asarray(values.T @ (values * (weights / 2.0)[:, None]))
+
+
+_THIRD_DERIVATIVES: Final = _products(DEGREE, 3)
+_QUADRATICS: Final = _products(2, 0)
 
 
 def _penalty_band(intervals: int) -> Array:
     """Lower band (6, k) of the integrals of products of third derivatives, in knot units."""
-    local = _gauss_products(_piece_derivative(3))
-    band = np.zeros((ORDER, intervals + ORDER - 1))
+    band = np.zeros((ORDER, intervals + DEGREE))
     for k in range(ORDER):
         for offset in range(ORDER - k):
-            band[offset, k : k + intervals] += local[k, k + offset]
+            band[offset, k : k + intervals] += _THIRD_DERIVATIVES[k, k + offset]
     return band
 
 
@@ -296,11 +224,10 @@ def _roughness(coefficients: Array) -> Array:
     """
     third = np.diff(coefficients, 3, axis=0)
     intervals = len(third) - 2
-    local = _gauss_products(_QUADRATIC_PIECES)
     product = np.zeros_like(third)
     for k in range(3):
         for other in range(3):
-            product[k : k + intervals] += local[k, other] * third[other : other + intervals]
+            product[k : k + intervals] += _QUADRATICS[k, other] * third[other : other + intervals]
     return -np.diff(np.pad(product, ((3, 3), (0, 0))), 3, axis=0)
 
 
