@@ -7,7 +7,6 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.delay import (
     DelayEstimate,
     compensate,
-    delay_sensitivity,
     estimate_delays,
     rate_products,
     with_uncertain_delay,

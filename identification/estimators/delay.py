@@ -35,11 +35,12 @@ from identification.factor.factor import (
     NormalEquations,
     Solution,
     estimate,
+    inverse_variance,
     nothing_usable,
     residual_variance,
     solve,
 )
-from identification.factor.phases import PhaseFactor, add_grams, equal_runs, joined, merged
+from identification.factor.phases import PhaseFactor, merged
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import near_any_reversal
@@ -117,26 +118,13 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
     return products
 
 
-def delay_sensitivity(factor: Factor, products: Array, weights: Array, values: Array) -> Array:
-    """Change of the estimated parameters per second of delay applied to the torque (p,).
-
-    A later delay compares the torque with earlier motion, which is another torque by its rate of
-    change; the parameters move by the fit of that rate.
-
-    Args:
-        factor: of what was fitted.
-        products: its `rate_products` (n, p, p + 1).
-        weights: per joint (n,).
-        values: the estimate (p,).
-    """
-    rate = np.tensordot(weights, products, axes=1) @ np.append(values, 1.0)
-    return solve(factor.weighted(weights)._replace(b=rate)).values
-
-
 def with_uncertain_delay(
     estimate: Estimate, factor: Factor, products: Array, variance: float
 ) -> Estimate:
     """Return the estimate with the uncertainty of the delay in its covariance.
+
+    A later delay compares the torque with earlier motion, which is another torque by its rate of
+    change; the parameters move by the fit of that rate.
 
     Args:
         estimate: made with one delay assumed certain.
@@ -144,9 +132,9 @@ def with_uncertain_delay(
         products: its `rate_products` (n, p, p + 1).
         variance: of the delay [s²].
     """
-    noise = estimate.noise_std
-    weights = np.where(np.isfinite(noise), noise, np.inf) ** -2.0
-    moved = delay_sensitivity(factor, products, weights, estimate.values)
+    weights = inverse_variance(estimate.noise_std**2)
+    rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
+    moved = solve(factor.weighted(weights)._replace(b=rate)).values
     known = np.where(np.isfinite(np.diag(estimate.covariance)), moved, 0.0)
     return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))
 
@@ -174,7 +162,7 @@ _MODEL_ERROR: Final = 0.05
 _REVERSAL_PERIODS: Final = 0.5
 _FOLDS: Final = 5
 # Of the time, at most half as many of the covariance: one delay needs no more.
-_BLOCKS: Final = 79
+_BLOCKS: Final = 80
 _WORTHWHILE: Final = 0.02  # of the squared error, that a delay of its own has to save
 _CHANCE: Final = 0.005  # of a delay that is found where there is none, each way
 
@@ -286,7 +274,6 @@ def estimate_delays(
     *,
     noise_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
-    longest: float = LONGEST_DELAY,
 ) -> DelayEstimate:
     """Estimate by how much the torque of a recording lags its position.
 
@@ -295,48 +282,26 @@ def estimate_delays(
         model: the robot.
         noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
         options: how it is smoothed, what the torque has come through, and the assumed delay.
-        longest: delays are sought up to this one, either way [s].
 
     Raises:
         RecordingError: see :func:`identification.signals.samples.prepare`.
         IdentificationError: no usable row.
     """
+    n, p, assumed = model.n_joints, model.n_parameters, options.torque_delay
     narrow = min(options.rigid_bandwidth, DELAY_BANDWIDTH)
     options = replace(options, smooth_torque=False, rigid_bandwidth=narrow)
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-    return delays_of(model, [samples], assumed=options.torque_delay, longest=longest)
-
-
-def delays_of(
-    model: RobotModel,
-    recordings: Sequence[Samples],
-    *,
-    assumed: float = 0.0,
-    longest: float = LONGEST_DELAY,
-) -> DelayEstimate:
-    """Estimate by how much the torque lags the position in recordings with one delay.
-
-    Args:
-        model: the robot.
-        recordings: smoothed, torque as measured.
-        assumed: delay that they were prepared with [s].
-        longest: delays are sought up to this one, either way [s].
-
-    Raises:
-        IdentificationError: no usable row.
-    """
-    n, p = model.n_joints, model.n_parameters
-    problem = _Problem(model, tuple(_Reader.of(model, samples) for samples in recordings))
-    ends = (-longest - assumed, longest - assumed)
-    grid = np.linspace(*ends, 1 + 2 * max(1, int(np.ceil(longest / _PROFILE_STEP))))
-    heights, values = problem.profile(grid)
+    reader = _Reader.of(model, samples)
+    ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
+    grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
+    heights, values = reader.profile(grid)
     shift = np.full(n, grid[np.argmin(heights)])
-    shift, blocks = _descend(problem, shift, values, _basis(p, n), ends)
-    rival = _rival(grid, heights, float(shift[0]), problem.profile(shift[:1])[0][0])
+    shift, blocks = _descend(reader, shift, values, _basis(p, n), ends)
+    rival = _rival(grid, heights, float(shift[0]), reader.profile(shift[:1])[0][0])
     axes = _deviating(blocks, p, n)
     basis = _basis(p, n, axes)
     if axes:
-        shift, blocks = _descend(problem, shift, values, basis, ends)
+        shift, blocks = _descend(reader, shift, values, basis, ends)
     solution = blocks.solution(basis)
     covariance, factor = blocks.covariance(basis, solution)
     _, by_chance = blocks.covariance(basis, solution, _CHANCE)
@@ -346,7 +311,7 @@ def delays_of(
     common = float(shift[first])
     common_std = float(std[first]) if solution.determined[p] else np.inf
     at_edge = bool(np.any((shift <= ends[0]) | (shift >= ends[1])))
-    before = problem.linearised(np.zeros(n), solution.values[:p], blocks.weights)
+    before = reader.linearised(np.zeros(n), solution.values[:p], blocks.weights)
     return DelayEstimate(
         joint_names=model.joint_names,
         common=common + assumed,
@@ -354,7 +319,7 @@ def delays_of(
         deviations=np.where(own, shift - common, 0.0),
         deviation_std=np.where(own, std, 0.0),
         assumed=assumed,
-        cycle=problem.readers[0].cycle,
+        cycle=reader.cycle,
         interval_factor=factor,
         reason=_why_not(factor * common_std, at_edge, rival + assumed),
         significant=bool(
@@ -374,12 +339,12 @@ def _basis(p: int, n: int, axes: Sequence[int] = ()) -> Array:
 
 
 def _descend(
-    problem: _Problem, shift: Array, values: Array, basis: Array, ends: tuple[float, float]
+    reader: _Reader, shift: Array, values: Array, basis: Array, ends: tuple[float, float]
 ) -> tuple[Array, _Blocks]:
     """Shifts (n,) of least weighted residual by Gauss-Newton, and the linear problem there."""
-    p = problem.model.n_parameters
+    p = reader.model.n_parameters
     for _ in range(_ITERATIONS):
-        blocks = problem.linearised(shift, values)
+        blocks = reader.linearised(shift, values)
         solution = blocks.solution(basis)
         values = solution.values[:p]
         step = np.clip(basis[p:, p:] @ solution.values[p:], -_PROFILE_STEP, _PROFILE_STEP)
@@ -474,51 +439,7 @@ def _reduced(gram: Array, basis: Array) -> Array:
 
 
 def _solved(gram: Array) -> Solution:
-    return solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1]), 0))
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Recordings whose torque can be compared with earlier or later motion."""
-
-    model: RobotModel
-    readers: tuple[_Reader, ...]
-
-    def profile(self, shifts: Array) -> tuple[Array, Array]:
-        """Mean log variance of the residual at common shifts (K,), the parameters of the least.
-
-        Raises:
-            IdentificationError: no usable row.
-        """
-        heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
-        for k, shift in enumerate(shifts):
-            parts = (
-                Factor.of(self.model, one.at(self.model, float(shift))) for one in self.readers
-            )
-            factor = sum(parts, Factor.zero(self.model))
-            moving = factor.samples > 0
-            if moving.any():
-                found = estimate(self.model, factor)
-                height = 2.0 * np.log(found.noise_std[moving])
-                heights[k] = np.average(height, weights=factor.samples[moving])
-                best = found.values if heights[k] <= heights.min() else best
-        if not np.isfinite(heights).any():
-            raise IdentificationError(nothing_usable(self.model))
-        return heights, best
-
-    def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
-        """Normal equations about shifts (n,) and parameters (p,).
-
-        Weighted (n,) by default by the inverse variance of the residual there.
-        """
-        count = _BLOCKS // len(self.readers) + 1
-        phase = joined([one.phase(self.model, shift, values, count) for one in self.readers])
-        if weights is None:
-            q = phase.n_parameters
-            here = np.append(values, np.zeros(q - len(values)))
-            variance = residual_variance(phase.total, here, np.zeros((q, 0)), np.ones(len(shift)))
-            weights = np.where(np.isnan(variance), 0.0, 1.0 / variance)
-        return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))
+    return solve(NormalEquations(gram[:-1, :-1], gram[:-1, -1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -526,6 +447,7 @@ class _Reader:
     """A recording with its torque averaged over short bins, whose motion is read at any shift.
 
     Attributes:
+        model: the robot.
         samples: as prepared.
         binned: their torque in bins, a known payload's included; without motion.
         parts: per stretch its rows of `samples` and of `binned`.
@@ -533,6 +455,7 @@ class _Reader:
         cycle: usual step of the clock [s].
     """
 
+    model: RobotModel
     samples: Samples
     binned: Samples
     parts: tuple[tuple[slice, slice], ...]
@@ -573,9 +496,9 @@ class _Reader:
             mask=None,
             whole=None,
         )
-        return cls(samples, binned, tuple(parts), every(clear), cycle)
+        return cls(model, samples, binned, tuple(parts), every(clear), cycle)
 
-    def at(self, model: RobotModel, shift: float) -> Samples:
+    def at(self, shift: float) -> Samples:
         """Bins whose torque belongs to the motion a shift earlier than it was prepared with."""
         time, usable = self.binned.motion.time, self.binned.usable.copy()
         fields = [field for field in self.samples.motion[1:] if field is not None]
@@ -588,30 +511,50 @@ class _Reader:
             near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
             usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
         result = replace(self.binned, motion=Motion(time, *moved), usable=usable)
-        return replace(result, torque=result.torque - result.known_torque(model))
+        return replace(result, torque=result.torque - result.known_torque(self.model))
 
-    def phase(self, model: RobotModel, shift: Array, values: Array, count: int) -> PhaseFactor:
-        """Gram matrices of `count` blocks, of p parameters and n steps of the delay.
+    def profile(self, shifts: Array) -> tuple[Array, Array]:
+        """Mean log variance of the residual at common shifts (K,), the parameters of the least.
 
-        With each axis at its own shift (n,), the columns of the steps at parameters (p,).
+        Raises:
+            IdentificationError: no usable row.
         """
-        n, p = model.n_joints, model.n_parameters
-        time = self.binned.motion.time
-        index = np.arange(len(time)) * count // max(1, len(time))
-        runs = equal_runs(index)
-        gram = [np.zeros((count, len(own) + 2, len(own) + 2)) for own in model.plan.columns]
-        rows = np.zeros_like(self.clear)
-        for value in np.unique(shift):
-            samples = self.at(model, float(value))
+        heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
+        for k, shift in enumerate(shifts.tolist()):
+            factor = Factor.of(self.model, self.at(shift))
+            moving = factor.samples > 0
+            if moving.any():
+                found = estimate(self.model, factor)
+                height = 2.0 * np.log(found.noise_std[moving])
+                heights[k] = np.average(height, weights=factor.samples[moving])
+                best = found.values if heights[k] <= heights.min() else best
+        if not np.isfinite(heights).any():
+            raise IdentificationError(nothing_usable(self.model))
+        return heights, best
+
+    def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
+        """Normal equations of p parameters and n steps of the delay, by blocks of time.
+
+        With each axis at its own shift (n,), the columns of the steps at parameters (p,). Weighted
+        (n,) by default by the inverse variance of the residual there.
+        """
+        n, p, model = self.model.n_joints, self.model.n_parameters, self.model
+        rows, tables = np.zeros_like(self.clear), [np.empty((0, 0))] * n
+        for value in np.unique(shift).tolist():
+            samples = self.at(value)
             blocks, columns = samples.regressor(model)
             load = samples.known_torque(model)
             for j in np.flatnonzero(shift == value):
                 rate = predicted_rate(samples, load[:, j] + blocks[j] @ values[columns[j]])
                 table = np.column_stack([blocks[j], -rate, samples.torque[:, j]])
                 rows[:, j] = samples.usable[:, j]
-                add_grams(gram[j], np.where(rows[:, j], table.T, 0.0), runs)
-        columns = tuple(np.append(own, p + j) for j, own in enumerate(model.plan.columns))
+                tables[j] = np.where(rows[:, j], table.T, 0.0)
+        index = np.arange(len(rows)) * _BLOCKS // max(1, len(rows))
+        own = tuple(np.append(used, p + j) for j, used in enumerate(model.plan.columns))
         names = model.parameter_names + tuple(f"delay of {name}" for name in model.joint_names)
-        counts = np.zeros((count, n), dtype=np.intp)
-        np.add.at(counts, index, rows)
-        return PhaseFactor(tuple(gram), columns, counts, names)
+        phase = PhaseFactor.of_rows(index, rows, own, names, [(slice(None), tables)])
+        if weights is None:
+            here, nothing = np.append(values, np.zeros(n)), np.zeros((p + n, 0))
+            variance = residual_variance(phase.total, here, nothing, np.ones(n))
+            weights = inverse_variance(variance)
+        return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))
