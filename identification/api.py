@@ -51,7 +51,7 @@ from identification.model.payload import Payload
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.selection.essential import Elimination, eliminate
-from identification.signals.clock import Clock, TimeBase, time_base, true_times
+from identification.signals.clock import TimeBase, time_base, true_times
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth

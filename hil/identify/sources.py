@@ -351,8 +351,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     words: tuple[str, ...] = ()
     stamped = single
     if archive.kind == "imported":  # a controller counts its own cycles
-        clock = true_times(single)
-        single, words = clock.apply(stamped), tuple(clock.describe())
+        single, words = true_times(stamped)
     return Source(
         archive.path,
         archive.path.name,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import scipy
@@ -117,7 +117,7 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
     steps = np.diff(time)
     forward = steps[steps > 0.0]
     if forward.size == 0:
-        raise RecordingError("clock", f"the clock of all {len(time)} samples stands still")
+        raise RecordingError(f"the clock of all {len(time)} samples stands still")
     reported = np.zeros(len(steps), dtype=np.bool_) if gap_before is None else gap_before[1:]
     median = float(np.median(forward))
     gap = reported | (steps > GAP_STEPS * median)
@@ -181,88 +181,16 @@ def _steps_by_phase(time: Array, step: float) -> Array:
     return np.asarray(np.diff(ahead) + 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Clock:
-    """When the samples of a recording were measured, m rows.
+def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
+    """The recording at the times its samples were measured, and what was decided in sentences.
 
-    Attributes:
-        time: of the samples (m,) [s].
-        repeated: (m,) True where a row repeats the sample before it although the arm moves: the
-            logger had no new one, and the row says nothing of its time.
-        decision: which reading `time` is: the stamps as they are, or even steps that follow the
-            stamps' slow drift, with missing samples counted.
-        certain: whether the positions decide; else the stamps stand.
-        step: of the even samples [s].
-        scatter: standard deviation of the stamps about even times, in steps.
-        missing: samples that the even times leave out.
-        share: of the stamps' scatter that the positions follow: one if the stamps are right, zero
-            if the samples were even; NaN where there is nothing to decide.
-        share_deviation: its standard deviation.
-        residuals: high-frequency residual of the positions under the stamps and under even times,
-            root mean square in multiples of the lesser one of each joint.
-    """
-
-    time: Array
-    repeated: Rows
-    decision: Literal["as recorded", "even"]
-    certain: bool
-    step: float
-    scatter: float
-    missing: int
-    share: float
-    share_deviation: float
-    residuals: tuple[float, float]
-
-    def apply(self, recording: Recording) -> Recording:
-        """The recording at these times, without the repeated rows."""
-        rows = ~self.repeated
-        if rows.all() and self.decision == "as recorded":
-            return recording
-        return replace(recording, time=self.time).rows(rows)
-
-    def describe(self) -> list[str]:
-        """What was decided and why, in sentences; none where the stamps are even."""
-        lines = []
-        repeated = int(np.count_nonzero(self.repeated))
-        if repeated:
-            lines.append(
-                f"{repeated} rows repeat the sample before them while the arm moves and were left"
-                " out"
-            )
-        if np.isnan(self.share):
-            return lines
-        figures = (
-            f"share of the scatter that the positions follow: {self.share:.2f} ±"
-            f" {self.share_deviation:.1g}; their high-frequency residual, in multiples of noise:"
-            f" {self.residuals[0]:.3g} with the stamps, {self.residuals[1]:.3g} with even times"
-        )
-        scatter = f"the time stamps scatter by {self.scatter:.1%} of a step"
-        missing = f"{self.missing} missing samples were counted"
-        if self.decision == "even" and self.scatter == 0.0:
-            lines.append(f"the time stamps are even, the samples are not: {missing} ({figures})")
-        elif self.decision == "even":
-            lines.append(
-                f"{scatter} and the samples do not: even times were used"
-                + (f", {missing}" if self.missing else "")
-                + f" ({figures})"
-            )
-        elif self.certain:
-            lines.append(f"{scatter} and so do the samples: the stamps were used ({figures})")
-        else:
-            lines.append(
-                f"{scatter}; the positions do not show whether the samples do: the stamps were"
-                f" used ({figures})"
-            )
-        return lines
-
-
-def true_times(recording: Recording) -> Clock:
-    """Decide from the positions, and velocities where given, what the time stamps are worth.
-
-    Two readings are compared where they differ: the stamps, and even times that follow the
-    stamps' slow drift. Of an even reading, the distance of each sample from the cubic through
+    Decided from the positions, and velocities where given. Two readings are compared where they
+    differ: the stamps, and even times that follow the stamps' slow drift, with missing samples
+    counted. Of an even reading, the distance of each sample from the cubic through
     its neighbours is noise; if the stamps are right it holds the speed times their distance from
-    even times, too. The share of that product in it, over all joints, is near one or near zero.
+    even times, too. The share of that product in it, over all joints, is near one or near zero;
+    where it is neither the stamps are right. Rows that repeat the sample before them although the
+    arm moves are left out: the logger had no new one, and they say nothing of their time.
 
     Args:
         recording: its samples in order; stamps that repeat or fall back are legal.
@@ -270,14 +198,12 @@ def true_times(recording: Recording) -> Clock:
     Raises:
         RecordingError: NaN or infinity, or the clock stands still.
     """
-    recording._check_finite()
+    recording.check_finite()
     time, signals = recording.time, recording.position
-    velocity = getattr(recording, "velocity", None)
-    if velocity is not None:
-        signals = np.hstack([signals, velocity])
+    if recording.velocity is not None:
+        signals = np.hstack([signals, recording.velocity])
     base = time_base(time, recording.gap_before)
-    even, repeated = time.copy(), np.zeros(len(time), np.bool_)
-    idle = repeated.copy()
+    even, repeated, idle = time.copy(), *np.zeros((2, len(time)), np.bool_)
     evidence, scatter, missing, longer = [], [], 0, 0.0
     for part in recording.segments():
         even[part] += longer
@@ -309,23 +235,26 @@ def true_times(recording: Recording) -> Clock:
     # Nearer to one reading than to the other, and not half way between them.
     certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
     is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
-    if not is_even and base.largest_deviation <= UNIFORM:
-        share = np.nan  # even stamps: nothing was to be decided
     out = repeated | idle if is_even else repeated
-    rows = np.flatnonzero(~out)
-    chosen = (even if is_even else time)[rows]
-    return Clock(
-        time=np.interp(np.arange(len(time)), rows, chosen) if out.any() else chosen,
-        repeated=out,
-        decision="even" if is_even else "as recorded",
-        certain=bool(np.isnan(share) or is_even or (certain and share > 0.5)),
-        step=base.step,
-        scatter=0.0 if base.uniform else float(scattered.std()),
-        missing=missing,
-        share=share,
-        share_deviation=deviation,
-        residuals=residuals,
-    )
+    words = []
+    if out.any():
+        words.append(
+            f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
+            " were left out"
+        )
+    if is_even or (base.largest_deviation > UNIFORM and not np.isnan(share)):
+        used = f"even times, {missing} missing samples counted" if is_even else "the stamps"
+        if not certain or (share < 0.5 and not is_even):
+            used += ", for the positions do not decide"
+        words.append(
+            f"the time stamps scatter by {0.0 if base.uniform else scattered.std():.1%} of a step;"
+            f" share of it that the positions follow: {share:.2f} ± {deviation:.1g}; their"
+            f" high-frequency residual, in multiples of noise: {residuals[0]:.3g} with the stamps,"
+            f" {residuals[1]:.3g} with even times; used: {used}"
+        )
+    if not out.any() and not is_even:
+        return recording, tuple(words)
+    return replace(recording, time=even if is_even else time).rows(~out), tuple(words)
 
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:

@@ -34,9 +34,8 @@ def standstill_variance(time: Array, values: Array) -> Array:
     """
     if len(time) < _SHORTEST_WINDOW:
         raise RecordingError(
-            "shape",
             f"a variance at standstill needs {_SHORTEST_WINDOW} samples, the recording has"
-            f" {len(time)}",
+            f" {len(time)}"
         )
     width = max(_SHORTEST_WINDOW, round(STANDSTILL_WINDOW / float(np.median(np.diff(time)))))
     width = min(width, len(time))
@@ -66,8 +65,7 @@ def difference_variance(time: Array, values: Array) -> Array:
     """
     if len(time) < 2 * _HIGHEST_DIFFERENCE:
         raise RecordingError(
-            "shape",
-            f"a noise variance needs {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}",
+            f"a noise variance needs {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
         )
     found = [_difference_variance(time, values, 1)]
     settled = np.zeros((0, values.shape[1]), dtype=np.bool_)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import scipy
@@ -16,8 +16,6 @@ from identification.errors import IdentificationError, ShapeError
 Array = NDArray[np.float64]
 
 
-Check = Literal["shape", "finite", "clock", "stuck", "joints", "torque"]
-
 # A joint is not held still to the last bit of its encoder while it is commanded to move this far.
 STUCK_MOVEMENT: Final = 0.02  # rad or m
 LONGEST_PAUSE: Final = 600.0
@@ -27,21 +25,7 @@ GAP_STEPS: Final = 5.0
 
 
 class RecordingError(IdentificationError, ValueError):
-    """A recording that must not be identified from.
-
-    Attributes:
-        check: which check failed.
-        joint: name of the joint to blame, None where it is not one joint.
-        sample: index of the first offending sample, None where it is the whole recording.
-    """
-
-    def __init__(
-        self, check: Check, message: str, *, joint: str | None = None, sample: int | None = None
-    ) -> None:
-        super().__init__(message)
-        self.check = check
-        self.joint = joint
-        self.sample = sample
+    """A recording that must not be identified from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +88,13 @@ class Recording:
                 joints that are not the model's, or a stuck joint.
         """
         if self.n_samples < 2:
-            raise RecordingError("shape", f"the recording has {self.n_samples} samples")
-        if joint_names is not None:
-            self._check_joints(tuple(joint_names))
-        self._check_finite()
+            raise RecordingError(f"the recording has {self.n_samples} samples")
+        if joint_names is not None and self.joint_names != tuple(joint_names):
+            raise RecordingError(
+                f"the recorded joints are {', '.join(self.joint_names)}; the model's are"
+                f" {', '.join(joint_names)}, in this order"
+            )
+        self.check_finite()
         self._check_clock()
         self._check_stuck()
         return self
@@ -169,51 +156,18 @@ class Recording:
         """Return every channel present, changed alike, by attribute name."""
         return {name: select(array) for name, array in self._channels()}
 
-    def _check_joints(self, expected: tuple[str, ...]) -> None:
-        if self.joint_names == expected:
-            return
-        recorded = ", ".join(self.joint_names)
-        missing = [name for name in expected if name not in self.joint_names]
-        if missing:
-            raise RecordingError(
-                "joints",
-                f"the model has a joint {missing[0]} that was not recorded; recorded: {recorded}",
-                joint=missing[0],
-            )
-        extra = [name for name in self.joint_names if name not in expected]
-        if extra:
-            raise RecordingError(
-                "joints",
-                f"the recorded joint {extra[0]} is not in the model; its joints are "
-                f"{', '.join(expected)}",
-                joint=extra[0],
-            )
-        first = next(a for a, b in zip(self.joint_names, expected, strict=True) if a != b)
-        raise RecordingError(
-            "joints",
-            f"the joints are recorded in the order {recorded}, the model's order is "
-            f"{', '.join(expected)}",
-            joint=first,
-        )
-
-    def _check_finite(self) -> None:
+    def check_finite(self) -> None:
+        """Raise RecordingError where a number is NaN or infinite; commands may be NaN."""
         bad = np.flatnonzero(~np.isfinite(self.time))
         if bad.size:
-            raise RecordingError(
-                "finite", f"time is {self.time[bad[0]]} at sample {bad[0]}", sample=int(bad[0])
-            )
+            raise RecordingError(f"time is {self.time[bad[0]]} at sample {bad[0]}")
         for name, array in self._channels():
             # A packet without a set-point has no commanded position; that is legal.
             wrong = np.isinf(array) if name == "commanded_position" else ~np.isfinite(array)
-            rows, columns = np.nonzero(wrong)
-            if rows.size:
-                sample, joint = int(rows[0]), self.joint_names[columns[0]]
+            for sample, joint in np.argwhere(wrong)[:1].tolist():
                 raise RecordingError(
-                    "finite",
-                    f"{name} of joint {joint} is {array[rows[0], columns[0]]} at sample {sample}"
-                    f" (t = {self.time[sample]:.6g} s)",
-                    joint=joint,
-                    sample=sample,
+                    f"{name} of joint {self.joint_names[joint]} is {array[sample, joint]} at sample"
+                    f" {sample} (t = {self.time[sample]:.6g} s)"
                 )
 
     def _check_clock(self) -> None:
@@ -223,18 +177,14 @@ class Recording:
             sample = int(bad[0]) + 1
             what = "repeats" if steps[bad[0]] == 0.0 else "falls back"
             raise RecordingError(
-                "clock",
                 f"the clock {what} at sample {sample}: {self.time[sample - 1]:.9g} s, then "
-                f"{self.time[sample]:.9g} s ({bad.size} such samples)",
-                sample=sample,
+                f"{self.time[sample]:.9g} s ({bad.size} such samples)"
             )
         sample = int(np.argmax(steps)) + 1
         if steps[sample - 1] > LONGEST_PAUSE:
             raise RecordingError(
-                "clock",
                 f"the clock leaps by {steps[sample - 1]:.6g} s at sample {sample}; pauses of "
-                f"{LONGEST_PAUSE:g} s are borne: cut the recording there",
-                sample=sample,
+                f"{LONGEST_PAUSE:g} s are borne: cut the recording there"
             )
 
     def _check_stuck(self) -> None:
@@ -246,29 +196,23 @@ class Recording:
         that joint was held or its reading is dead cannot be determined, so a joint that was held
         has to be declared.
         """
-        moves = np.ptp(self.position, axis=0) > STUCK_MOVEMENT
+        ranges = np.ptp(self.position, axis=0)
         for j, name in enumerate(self.joint_names):
             if name in self.held_joints:
                 continue
             if self.commanded_position is not None:
                 found = stuck(self.position[:, j], self.commanded_position[:, j])
                 if found is not None:
-                    start, travel = found
                     raise RecordingError(
-                        "stuck",
-                        f"joint {name} is stuck: its position stays {self.position[start, j]:.6g}"
-                        f" from sample {start} on while its command moves by {travel:.3g}",
-                        joint=name,
-                        sample=start,
+                        f"joint {name} is stuck: its position stays"
+                        f" {self.position[found[0], j]:.6g} from sample {found[0]} on while its"
+                        f" command moves by {found[1]:.3g}"
                     )
-            elif np.ptp(self.position[:, j]) == 0.0 and moves.any():
+            elif ranges[j] == 0.0 and np.any(ranges > STUCK_MOVEMENT):
                 raise RecordingError(
-                    "stuck",
                     f"joint {name} is stuck: its position is {self.position[0, j]:.6g} in all"
                     f" {self.n_samples} samples while other joints move; declare it as held if"
-                    " it was meant to stand still",
-                    joint=name,
-                    sample=0,
+                    " it was meant to stand still"
                 )
 
 
@@ -281,8 +225,7 @@ def without_repeats(recording: Recording) -> Recording:
     steps = np.diff(recording.time)
     if np.any(steps < 0.0):
         sample = int(np.argmax(steps < 0.0)) + 1
-        text = f"the clock falls back at sample {sample}; samples are not put in order here"
-        raise RecordingError("clock", text, sample=sample)
+        raise RecordingError(f"the clock falls back at sample {sample}; samples are not reordered")
     starts = np.flatnonzero(np.concatenate([[True], steps > 0.0]))
     if len(starts) == recording.n_samples:
         return recording
@@ -338,15 +281,13 @@ def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
     Returns:
         None where some recording shows another motion, or where there is only one.
     """
-    if len(recordings) < 2:
-        return None
     offsets = [0.0]
     for one in recordings[1:]:
         offset = _offset(recordings[0], one)
         if offset is None:
             return None
         offsets.append(offset)
-    return np.array(offsets)
+    return np.array(offsets) if len(offsets) > 1 else None
 
 
 def _offset(first: Recording, other: Recording) -> float | None:

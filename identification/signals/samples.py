@@ -260,7 +260,7 @@ def prepare(
     """
     recording.checked(model.joint_names)
     if recording.torque is None:
-        raise RecordingError("torque", "the recording has no joint torque to fit")
+        raise RecordingError("the recording has no joint torque to fit")
     motion, bandwidth = smooth(recording, noise_variance, options)
     segments = tuple(recording.segments())
     torque, torque_bandwidth = recording.torque, None

@@ -252,9 +252,8 @@ def test_factors_of_filtered_samples_hold_the_filtered_rows(
 
 
 def test_a_recording_without_torque_is_refused(model: RobotModel, truth: Array) -> None:
-    with pytest.raises(RecordingError, match="no joint torque") as refused:
+    with pytest.raises(RecordingError, match="no joint torque"):
         prepare(replace(a_recording(model, truth), torque=None), model)
-    assert refused.value.check == "torque"
 
 
 def test_a_recording_that_fails_its_checks_is_refused(model: RobotModel, truth: Array) -> None:

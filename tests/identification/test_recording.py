@@ -35,135 +35,94 @@ def a_recording(samples: int = 200, *, commanded: bool = True) -> Recording:
     )
 
 
-def test_a_sound_recording_passes_unchanged() -> None:
+def changed(name: str, rows: slice | int, joint: int, value: object) -> Recording:
+    """A sound recording with other readings of a joint."""
     recording = a_recording()
-    assert recording.checked(NAMES) is recording
+    values = getattr(recording, name).copy()
+    values[rows, joint] = values[0, joint] if value is None else value
+    return replace(recording, **{name: values})
 
 
-@given(
-    channel=st.sampled_from(["position", "torque"]),
-    sample=st.integers(0, 199),
-    joint=st.integers(0, 2),
-    value=st.sampled_from([np.nan, np.inf, -np.inf]),
-)
-def test_a_number_that_is_none_is_refused_with_channel_joint_and_sample(
-    channel: str, sample: int, joint: int, value: float
-) -> None:
-    recording = a_recording()
-    spoilt = getattr(recording, channel).copy()
-    spoilt[sample, joint] = value
-    with pytest.raises(RecordingError, match=f"{channel} of joint {NAMES[joint]}") as refused:
-        replace(recording, **{channel: spoilt}).checked()
-    assert (refused.value.check, refused.value.joint, refused.value.sample) == (
-        "finite",
-        NAMES[joint],
-        sample,
+def leaping(sample: int, step: float) -> Recording:
+    """A recording whose clock goes on after another step than the usual one [s]."""
+    time = a_recording().time.copy()
+    time[sample:] += time[sample - 1] + step - time[sample]
+    return replace(a_recording(), time=time)
+
+
+RESTING = changed("commanded_position", slice(None), 1, 0.3).commanded_position
+
+
+class TestChecks:
+    def test_a_sound_recording_passes_unchanged(self) -> None:
+        recording = a_recording()
+        assert recording.checked(NAMES) is recording
+
+    @given(
+        channel=st.sampled_from(["position", "torque"]),
+        sample=st.integers(0, 199),
+        joint=st.integers(0, 2),
+        value=st.sampled_from([np.nan, np.inf, -np.inf]),
     )
+    def test_a_number_that_is_none_is_refused_where_it_is(
+        self, channel: str, sample: int, joint: int, value: float
+    ) -> None:
+        where = f"{channel} of joint {NAMES[joint]} is {value} at sample {sample} "
+        with pytest.raises(RecordingError, match=where):
+            changed(channel, sample, joint, value).checked()
 
+    @pytest.mark.parametrize(
+        ("recording", "words"),
+        [
+            (leaping(50, np.nan), "time is nan at sample 50"),
+            (leaping(50, 0.0), "repeats at sample 50"),
+            (leaping(50, -5e-3), "falls back at sample 50"),
+            (leaping(50, 601.0), r"leaps by .* at sample 50; .* cut the recording"),
+            (leaping(50, 2e9), r"leaps by .* at sample 50; .* cut the recording"),
+            (changed("position", slice(None), 1, None), "elbow is stuck.* from sample 0 on"),
+            (changed("position", slice(120, None), 2, 0.3), "wrist is stuck.* from sample 120 on"),
+            (a_recording(1), "has 1 samples"),
+        ],
+    )
+    def test_what_no_motion_can_be_is_refused(self, recording: Recording, words: str) -> None:
+        with pytest.raises(RecordingError, match=words):
+            recording.checked()
 
-def test_time_that_is_not_a_number_is_refused() -> None:
-    time = a_recording().time.copy()
-    time[7] = np.nan
-    with pytest.raises(RecordingError, match="sample 7"):
-        replace(a_recording(), time=time).checked()
+    @pytest.mark.parametrize(
+        "recording",
+        [
+            changed("commanded_position", slice(20, 30), 1, np.nan),
+            replace(changed("position", slice(None), 1, 0.3), commanded_position=RESTING),
+            leaping(50, 599.0),
+            replace(a_recording(commanded=False), position=np.full((200, 3), 0.3)),
+        ],
+        ids=["cycles without a set-point", "commanded to rest", "a long pause", "standstill"],
+    )
+    def test_what_is_legal_passes(self, recording: Recording) -> None:
+        assert recording.checked() is recording
 
+    def test_without_a_command_a_dead_reading_must_be_declared(self) -> None:
+        recording = replace(changed("position", slice(None), 0, 0.3), commanded_position=None)
+        with pytest.raises(RecordingError, match=r"shoulder is stuck.*declare it as held"):
+            recording.checked()
+        replace(recording, held_joints=("shoulder",)).checked()
 
-def test_a_cycle_without_a_set_point_is_no_fault() -> None:
-    recording = a_recording()
-    assert recording.commanded_position is not None
-    command = recording.commanded_position.copy()
-    command[20:30] = np.nan
-    replace(recording, commanded_position=command).checked()
+    def test_quantised_readings_of_a_slow_joint_are_not_stuck(self) -> None:
+        slow = 0.01 * a_recording().time[:, None] + np.zeros(3)
+        coarse = np.round(slow / 1e-3) * 1e-3
+        replace(a_recording(), position=coarse, commanded_position=slow).checked()
 
-
-@pytest.mark.parametrize(("step", "word"), [(0.0, "repeats"), (-5e-3, "falls back")])
-def test_a_repeated_or_falling_clock_is_refused_at_its_sample(step: float, word: str) -> None:
-    time = a_recording().time.copy()
-    time[50:] += time[49] + step - time[50]
-    with pytest.raises(RecordingError, match=word) as refused:
-        replace(a_recording(), time=time).checked()
-    assert (refused.value.check, refused.value.sample) == ("clock", 50)
-
-
-def test_a_joint_that_does_not_follow_its_command_is_stuck() -> None:
-    recording = a_recording()
-    position = recording.position.copy()
-    position[:, 1] = position[0, 1]
-    with pytest.raises(RecordingError, match="elbow is stuck") as refused:
-        replace(recording, position=position).checked()
-    assert (refused.value.check, refused.value.joint) == ("stuck", "elbow")
-
-
-def test_a_reading_that_freezes_half_way_is_stuck_from_there_on() -> None:
-    recording = a_recording()
-    position = recording.position.copy()
-    position[120:, 2] = position[120, 2]
-    with pytest.raises(RecordingError, match="wrist is stuck") as refused:
-        replace(recording, position=position).checked()
-    assert refused.value.sample == 120
-
-
-def test_a_joint_commanded_to_stand_still_may_stand_still() -> None:
-    recording = a_recording()
-    position, command = recording.position.copy(), recording.commanded_position
-    assert command is not None
-    command = command.copy()
-    position[:, 1] = command[:, 1] = 0.3
-    replace(recording, position=position, commanded_position=command).checked()
-
-
-def test_without_a_command_a_dead_reading_beside_moving_joints_is_stuck_unless_declared() -> None:
-    recording = a_recording(commanded=False)
-    position = recording.position.copy()
-    position[:, 0] = 0.3
-    with pytest.raises(RecordingError, match=r"shoulder is stuck.*declare it as held"):
-        replace(recording, position=position).checked()
-    replace(recording, position=position, held_joints=("shoulder",)).checked()
-
-
-def test_at_standstill_no_joint_is_stuck() -> None:
-    recording = a_recording(commanded=False)
-    replace(recording, position=np.full_like(recording.position, 0.3)).checked()
-
-
-def test_quantised_readings_of_a_slow_joint_are_not_stuck() -> None:
-    recording = a_recording()
-    resolution = 1e-3
-    slow = 0.01 * recording.time[:, None] + np.zeros(3)
-    replace(
-        recording,
-        position=np.round(slow / resolution) * resolution,
-        commanded_position=slow,
-    ).checked()
-
-
-@pytest.mark.parametrize(
-    ("expected", "named"),
-    [
-        (("elbow", "shoulder", "wrist"), "shoulder"),
-        (("shoulder", "elbow", "hand"), "hand"),
-        (("shoulder", "elbow"), "wrist"),
-    ],
-)
-def test_joints_that_are_not_the_models_are_refused_by_name(
-    expected: tuple[str, ...], named: str
-) -> None:
-    with pytest.raises(RecordingError) as refused:
-        a_recording().checked(expected)
-    assert (refused.value.check, refused.value.joint) == ("joints", named)
-
-
-@pytest.mark.parametrize(("leap", "refused"), [(599.0, False), (601.0, True), (2e9, True)])
-def test_a_clock_that_leaps_is_refused_at_its_sample(leap: float, refused: bool) -> None:
-    good = a_recording()
-    time = good.time.copy()
-    time[50:] += leap
-    leaping = replace(good, time=time)
-    if not refused:
-        assert leaping.checked() is leaping
-        return
-    with pytest.raises(RecordingError, match=r"leaps by .* at sample 50; .* cut the recording"):
-        leaping.checked()
+    @pytest.mark.parametrize(
+        "expected",
+        [
+            ("elbow", "shoulder", "wrist"),
+            ("shoulder", "elbow", "hand"),
+            ("shoulder", "elbow"),
+        ],
+    )
+    def test_joints_that_are_not_the_models_are_refused(self, expected: tuple[str, ...]) -> None:
+        with pytest.raises(RecordingError, match=f"the model's are {', '.join(expected)}"):
+            a_recording().checked(expected)
 
 
 def test_reported_gaps_and_jumps_of_the_clock_split_a_recording() -> None:
