@@ -139,8 +139,9 @@ class RepeatedEstimate:
     @property
     def std(self) -> Array:
         """Standard deviation over the repetitions (p,), NaN for one."""
-        many = len(self.repetitions) > 1
-        return self.values.std(axis=0, ddof=1) if many else np.full(len(self.pooled.values), np.nan)
+        if len(self.repetitions) == 1:
+            return np.full(len(self.pooled.values), np.nan)
+        return np.asarray(self.values.std(axis=0, ddof=1))
 
     @property
     def scatter_std(self) -> Array:
