@@ -155,7 +155,7 @@ class RepeatedEstimate:
         Root mean square of the repetitions' own standard deviations over sqrt(R).
         """
         variances = [np.diag(one.covariance) for one in self.repetitions]
-        return np.sqrt(np.mean(variances, axis=0)) / np.sqrt(len(variances))
+        return np.asarray(np.sqrt(np.mean(variances, axis=0) / len(variances)))
 
 
 def no_narrower(covariance: Array, values: Array) -> Array:
