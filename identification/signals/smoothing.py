@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from math import comb, factorial
 from typing import Final
 
 import numpy as np
@@ -60,10 +62,8 @@ class SmoothingSpline:
 
         Times outside the knots extrapolate the first or last piece.
         """
-        knots = _knots(len(self.coefficients) - DEGREE)
-        spline = scipy.interpolate.BSpline(knots, self.coefficients, DEGREE)
-        at = (np.asarray(time, dtype=np.float64) - self.start) / self.spacing
-        return np.asarray(spline(at, derivative) / self.spacing**derivative)
+        rows = _rows(self.start, self.spacing, len(self.coefficients) - DEGREE, time, derivative)
+        return np.asarray(rows @ self.coefficients)
 
 
 def fit_smoothing_spline(
@@ -131,8 +131,7 @@ class _Problem:
         span = float(time[-1] - time[0])
         intervals = max(1, round(span / spacing))
         spacing, density = span / intervals, len(time) / intervals
-        at = np.clip((time - time[0]) / spacing, 0.0, intervals)
-        rows = scipy.interpolate.BSpline.design_matrix(at, _knots(intervals), DEGREE)
+        rows = _rows(float(time[0]), spacing, intervals, time)
         gram, penalty = _gram_band(rows), _penalty_band(intervals)
         lightest = _LIGHTEST * density
         factor = (scipy.linalg.cholesky_banded(gram + lightest * penalty, lower=True), True)
@@ -176,9 +175,36 @@ class _Problem:
         return float(np.exp(scipy.optimize.brentq(excess, lightest, heaviest, xtol=1e-4)))
 
 
-def _knots(intervals: int) -> Array:
-    """Uniform knots of a quintic spline on so many intervals, in knot units from the first."""
-    return np.arange(-DEGREE, intervals + ORDER, dtype=np.float64)
+@cache
+def _pieces(degree: int, derivative: int = 0) -> Array:
+    """Cardinal B-spline on one knot interval: powers of u by its degree + 1 basis functions.
+
+    From B(x) = sum_j (-1)^j C(d + 1, j) (x - j)_+^d / d!; basis function k sees x = u + d - k.
+    """
+    pieces = np.zeros((degree + 1, degree + 1))
+    for k in range(degree + 1):
+        for j in range(degree + 1 - k):
+            for power in range(degree + 1):
+                whole = (-1) ** j * comb(degree + 1, j) * comb(degree, power)
+                pieces[power, k] += whole * (degree - k - j) ** (degree - power) / factorial(degree)
+    for _ in range(derivative):
+        pieces = np.arange(1, len(pieces))[:, None] * pieces[1:]
+    return pieces
+
+
+def _rows(
+    start: float, spacing: float, intervals: int, time: Array, derivative: int = 0
+) -> scipy.sparse.csr_array:
+    """Basis functions, or their derivatives, at each time: sparse (m, intervals + 5)."""
+    x = (np.asarray(time, dtype=np.float64) - start) / spacing
+    interval = np.clip(np.floor(x).astype(np.int64), 0, intervals - 1)
+    pieces = _pieces(DEGREE, derivative)
+    weights = np.vander(x - interval, len(pieces), increasing=True) @ pieces
+    columns = (interval[:, None] + np.arange(ORDER)).ravel()
+    ends = np.arange(0, ORDER * len(x) + 1, ORDER)
+    return scipy.sparse.csr_array(
+        ((weights / spacing**derivative).ravel(), columns, ends), shape=(len(x), intervals + DEGREE)
+    )
 
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
@@ -193,17 +219,15 @@ def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     return band
 
 
-def _products(degree: int, derivative: int) -> Array:
-    """Integrals over one knot interval of products of B-splines' derivatives, up to cubics."""
+def _products(pieces: Array) -> Array:
+    """Integrals over one knot interval of the products of two pieces, up to cubics."""
     points, weights = np.polynomial.legendre.leggauss(4)
-    knots = np.arange(-degree, degree + 2, dtype=np.float64)
-    basis = scipy.interpolate.BSpline(knots, np.eye(degree + 1), degree)
-    values = basis((points + 1.0) / 2.0, derivative)
+    values = np.vander((points + 1.0) / 2.0, len(pieces), increasing=True) @ pieces
     return np.asarray(values.T @ (values * (weights / 2.0)[:, None]))
 
 
-_THIRD_DERIVATIVES: Final = _products(DEGREE, 3)
-_QUADRATICS: Final = _products(2, 0)
+_THIRD_DERIVATIVES: Final = _products(_pieces(DEGREE, 3))
+_QUADRATICS: Final = _products(_pieces(2))
 
 
 def _penalty_band(intervals: int) -> Array:
