@@ -10,20 +10,25 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Campaign
+from hil.campaign.link import Link
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import HilError, OutputError
+from hil.progress import Silent
+from hil.simulation import controller_settings, simulated_controller
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 SIZE = 64
@@ -148,36 +153,17 @@ def test_with_room_again_the_run_completes(disk: Disk, campaign: Campaign) -> No
 
 SHORT = {"population": 8, "generations": 1}
 """Of a search that is only to write what a search writes."""
-STAGES: dict[str, tuple[str, ...]] = {
-    "design": (
-        "design",
-        "cell/cell.toml",
-        "--settings",
-        "short.toml",
-        "-o",
-        "designed",
-        "--workers",
-        "1",
-    ),
-    "compare": ("compare", "campaign", "second", "-o", "pages/compare.html"),
-    "study": (
-        "study",
-        "-o",
-        "study",
-        "--campaign",
-        "campaign",
-        "--campaign",
-        "second",
-        "--workers",
-        "1",
-    ),
-    "rehearse": ("rehearse", "campaign", "--again"),
-    "identify": ("identify", "campaign", "--quiet"),
-    "report": ("report", "campaign"),
-    "reidentify": ("reidentify", "campaign", "--output", "batch", "--quiet"),
-    "plot": ("plot", "campaign/archives/excitation_000_a1.mcap", "--output", "plot.png"),
-    "repair": ("archive", "repair", "excitation_000_a1.mcap"),
-    "new": ("new", "--urdf", "campaign/robot.urdf", "--output", "new.toml", "--force"),
+STAGES = {
+    "design": "design cell/cell.toml --settings short.toml -o designed --workers 1",
+    "compare": "compare campaign second -o pages/compare.html",
+    "study": "study -o study --campaign campaign --campaign second --workers 1",
+    "rehearse": "rehearse campaign --again",
+    "identify": "identify campaign --quiet",
+    "report": "report campaign",
+    "reidentify": "reidentify campaign --output batch --quiet",
+    "plot": "plot campaign/archives/excitation_000_a1.mcap --output plot.png",
+    "repair": "archive repair excitation_000_a1.mcap",
+    "new": "new --urdf campaign/robot.urdf --output new.toml --force",
 }
 """What else leaves something on the disk: command and arguments, paths of which lie there."""
 WRITTEN: dict[str, tuple[str, ...]] = {
@@ -214,6 +200,16 @@ def prepared(disk: Disk, campaign: Campaign) -> Campaign:
     return campaign
 
 
+def as_before(disk: Disk, campaign: Campaign) -> None:
+    """A disk with room, a torn archive, and nothing of what the commands make."""
+    disk.empty()
+    torn = disk.root / "excitation_000_a1.mcap"
+    torn.write_bytes((campaign.folder.archives / torn.name).read_bytes()[:100_000])
+    (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
+    for made in ("designed", "pages", "study", "batch"):
+        shutil.rmtree(disk.root / made, ignore_errors=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("left", [0, 8])
 @pytest.mark.parametrize("stage", sorted(STAGES))
@@ -222,22 +218,17 @@ def test_every_command_says_that_the_disk_is_full_and_works_once_it_is_not(
 ) -> None:
     campaign = prepared
     monkeypatch.chdir(disk.root)
-    disk.empty()
-    torn = disk.root / "excitation_000_a1.mcap"
-    torn.write_bytes((campaign.folder.archives / torn.name).read_bytes()[:100_000])
-    (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
-    for made in ("designed", "pages", "study", "batch"):
-        shutil.rmtree(disk.root / made, ignore_errors=True)
+    as_before(disk, campaign)
     whole = sums(campaign)
     disk.fill(left)
-    full = hil(*STAGES[stage])
+    full = hil(*STAGES[stage].split())
     disk.empty()
     assert sums(campaign) == whole
     if full.exit_code or full.exception:
         require_told(full, disk, *WRITTEN[stage])
     else:
         assert left, "nothing can be written where nothing is left"
-    again = hil(*STAGES[stage], *_on_with_it(stage, disk, full))
+    again = hil(*STAGES[stage].split(), *_on_with_it(stage, disk, full))
     expected = {"repair": 3}.get(stage, 0)  # what was torn off is lost
     assert again.exit_code == expected, f"{again.exception!r} {again.output}"
 
@@ -256,18 +247,13 @@ def test_every_command_says_that_a_folder_is_read_only_and_changes_nothing(
     disk: Disk, prepared: Campaign, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(disk.root)
-    disk.empty()
-    for made in ("designed", "pages", "study", "batch"):
-        shutil.rmtree(disk.root / made, ignore_errors=True)
-    torn = disk.root / "excitation_000_a1.mcap"
-    torn.write_bytes((prepared.folder.archives / torn.name).read_bytes()[:100_000])
-    (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
+    as_before(disk, prepared)
     victim = prepared.folder.completed("excitation")[-1]
     victim.rename(victim.with_suffix(".away"))  # so that there is something to run
-    command = ("run", "campaign", "--no-identify") if stage == "run" else STAGES[stage]
+    command = "run campaign --no-identify" if stage == "run" else STAGES[stage]
     subprocess.run(["mount", "-o", "remount,ro", str(disk.root)], check=True)
     try:
-        refused = hil(*command)
+        refused = hil(*command.split())
     finally:
         subprocess.run(["mount", "-o", "remount,rw", str(disk.root)], check=True)
         victim.with_suffix(".away").rename(victim)
@@ -303,3 +289,46 @@ def test_an_error_has_to_name_what_on_the_disk_cannot_be_written(
     result = cast("Result", SimpleNamespace(exception=told, output=""))
     with nullcontext() if passes else pytest.raises(AssertionError):
         require_told(result, Disk(tmp_path), "campaign")
+
+
+# The folder, or a part of it, is removed while the campaign runs
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Campaign:
+    return fast_campaign(tmp_path / "campaign", fast_cell(tmp_path, repetitions=1))
+
+
+def remove_at(
+    monkeypatch: pytest.MonkeyPatch, campaign: Campaign, archive: str, parts: Sequence[str]
+) -> None:
+    """Remove parts of the folder when an archive has been written to five times."""
+    true, count = os.write, 0
+
+    def write(descriptor: int, data: Any) -> int:
+        nonlocal count
+        name = Path(f"/proc/self/fd/{descriptor}").readlink().name
+        count += name == archive
+        if count == 5 and name == archive:
+            for part in parts:
+                shutil.rmtree(campaign.folder.root / part, ignore_errors=True)
+        return true(descriptor, data)
+
+    monkeypatch.setattr(os, "write", write)
+
+
+@pytest.mark.parametrize("parts", [("archives",), ("",)], ids=["the archives", "all of it"])
+def test_a_run_whose_folder_is_removed_says_so_with_the_arm_at_rest(
+    small: Campaign, parts: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = small.folder.root
+    controller = simulated_controller(small.cell, settings=controller_settings(small.cell))
+    link = Link.over(SimulatedTransport(controller), small.cell, finish=controller.finish)
+    remove_at(monkeypatch, small, "excitation_000_a1.mcap", parts)
+    with pytest.raises(HilError) as told:
+        small.run(link, None, Silent(), accept_dry_run=True, durable=True)
+    monkeypatch.undo()
+    assert told.value.exit_code in (1, 2)
+    assert str(root) in str(told.value)
+    assert "see whether it was moved or removed" in str(told.value)
+    assert np.abs(controller.plant.velocity).max() < 1e-3
