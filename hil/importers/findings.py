@@ -249,7 +249,8 @@ def _velocities(
             f"{_missed(best):.0f} %: name the columns of both in the same order"
         )
         return
-    off: dict[tuple[tuple[str, float], ...], list[int]] = {}
+    off: dict[object, list[int]] = {}
+    readings = [tuple(_readings(one)) for one in factor]
     for k, joint in enumerate(moving):
         if itself[k] < _FOLLOWS:
             yield (
@@ -257,13 +258,13 @@ def _velocities(
                 f"{itself[k]:.2f}): are the joints in the same order?"
             )
         elif abs(factor[k] - 1.0) > _ALIKE:
-            off.setdefault(tuple(_readings(factor[k])), []).append(k)
-    for readings, group in off.items():
+            off.setdefault(readings[k] or k, []).append(k)
+    for group in off.values():
         joints = [moving[k] for k in group]
-        everyone = joints == moving and readings
+        everyone = joints == moving
         subject = "every joint" if everyone else ", ".join(names[j] for j in joints)
         shown = []
-        for words, scale in readings:
+        for words, scale in readings[group[0]]:
             changed = position.copy()
             changed[:, joints] *= scale if "positions" in words else 1.0
             if "time" not in words:
@@ -285,8 +286,9 @@ def _readings(factor: float) -> Iterator[tuple[str, float]]:
         for unit, read in permutations(units, 2):
             if (unit in _LENGTHS) == (read in _LENGTHS):
                 slips[f"{what} in {unit} read as {read}"] = (units[read] / units[unit]) ** power
+    nearest = min(slips.values(), key=lambda exact: abs(factor / exact - 1.0))
     for words, exact in slips.items():
-        if abs(factor / exact - 1.0) < _ALIKE:
+        if abs(factor / nearest - 1.0) < _ALIKE and math.isclose(exact, nearest):
             yield words, exact
 
 

@@ -91,6 +91,7 @@ class TestSlips:
         assert f"of every joint is {factor:.3g}"[:20] in sentence
         assert f"{velocity} (with 0 % of the rows outside the limits" in sentence
         assert (position is None) == (", or " not in sentence)
+        assert sentence.count("(with ") == (1 if position is None else 2)
         if position is not None:
             share = float(sentence.split(f"{position} (with ")[1].split(" %")[0])
             assert share > 50.0 or factor == pytest.approx(1 / DEGREES)
@@ -99,6 +100,7 @@ class TestSlips:
         found = warnings(arm, velocity=np.array([1.0, 3.0, 1.0, 1.0, 1.0, 1.0]))
         assert [one for one in found if "check units and gears" in one] == found
         assert "shoulder_lift_joint is 3" in found[0]
+        assert len(warnings(arm, velocity=np.array([1.0, 3.0, 1.0, 1.0, 1.0, 0.2]))) == 2
 
     def test_degrees_have_two_readings_with_errors(self, panda: Simulated) -> None:
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
