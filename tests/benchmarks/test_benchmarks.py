@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from benchmarks.archive_files import repetitions
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@cache
 def run(name: str, *arguments: str) -> dict:
     """What a benchmark prints; a warning is an error."""
     done = subprocess.run(
@@ -32,7 +30,8 @@ def run(name: str, *arguments: str) -> dict:
 @pytest.mark.slow
 class TestArchive:
     @pytest.fixture(scope="class")
-    def figures(self) -> dict:
+    @classmethod
+    def figures(cls) -> dict:
         return run("archive", "--sizes", "--repetitions", "1", "--rounds", "1")
 
     def test_ratios_are_those_of_the_times(self, figures: dict) -> None:
@@ -65,7 +64,8 @@ def test_no_two_archives_hold_the_same(tmp_path: Path) -> None:
 
 class TestDesign:
     @pytest.fixture(scope="class")
-    def figures(self) -> dict:
+    @classmethod
+    def figures(cls) -> dict:
         return run("design", "--repetitions", "1", "--individuals", "6")
 
     def test_both_sides_find_the_same_criteria(self, figures: dict) -> None:
@@ -105,7 +105,8 @@ class TestDesign:
 
 class TestIdentification:
     @pytest.fixture(scope="class")
-    def figures(self) -> dict:
+    @classmethod
+    def figures(cls) -> dict:
         return run("identification", "--repetitions", "1")
 
     def test_it_times_the_sizes_that_it_states(self, figures: dict) -> None:
