@@ -122,10 +122,6 @@ def test_the_worse_of_two_measurements_decides() -> None:
     assert judge([good, poor], 1) == judge([poor, good], 1)
 
 
-def test_nothing_measured_is_not_fit() -> None:
-    assert not judge([], 2).fit
-
-
 @pytest.mark.parametrize(
     ("one", "two", "words"),
     [
@@ -152,19 +148,10 @@ def diagnosis(*checks: Check, fit: bool = True, seconds: float = 60.0) -> Diagno
 
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
-    assert diagnosis().fit
+    assert diagnosis(warn("x"), unknown("x")).fit
     found = diagnosis(PORT)
     assert not found.fit
     assert "UDP port 1000" in found.line
-
-
-def test_an_unknown_or_warning_does_not() -> None:
-    assert diagnosis(warn("x"), unknown("x")).fit
-
-
-def test_a_short_measurement_calls_itself_provisional() -> None:
-    assert "Provisional" in diagnosis(seconds=5.0).line
-    assert "Provisional" not in diagnosis().line
 
 
 @pytest.mark.parametrize(("fit", "seconds", "status"), [
@@ -179,7 +166,8 @@ def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
     monkeypatch.setattr("hil.cli.doctor.examine", made_up)
     ran = CliRunner().invoke(app, ["--json"])
     assert ran.exit_code == status
-    assert json.loads(ran.stdout)["provisional"] is (seconds < 60)
+    found = json.loads(ran.stdout)
+    assert found["provisional"] is ("Provisional" in found["verdict"]) is (seconds < 60)
 
 
 def test_remedies_come_worst_first_and_each_command_once() -> None:
@@ -225,7 +213,8 @@ def test_the_json_says_what_the_page_says() -> None:
     assert found["checks"][0]["remedy"] == ["sudo ss -lunp"]
     assert found["latency"]["turnaround"]["late_cycles_1ms"] == 3
     empty = Diagnosis((), (), (judge([], 1), judge([], 2)), 1, 60.0)
-    assert json.loads(json.dumps(as_json(empty)))["cycles"][0]["late_per_hour_upper_95"] is None
+    (one, _) = json.loads(json.dumps(as_json(empty)))["cycles"]
+    assert (one["fit"], one["late_per_hour_upper_95"]) == (False, None)
 
 
 # --- probes ----------------------------------------------------------------------------------
@@ -353,11 +342,6 @@ def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: 
     assert by_name["route to the controller"]["status"] == "ok"
     assert found["latency"]["turnaround"]["samples"] > 100
     assert os.sched_getscheduler(0) == scheduling
-
-
-def test_a_cell_that_cannot_be_read_is_bad_input(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(app, [str(tmp_path / "none.toml")])
-    assert getattr(ran.exception, "exit_code", None) == 2
 
 
 def test_every_remedy_can_be_typed_as_it_stands(tmp_path: Path) -> None:
