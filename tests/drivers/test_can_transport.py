@@ -480,12 +480,6 @@ def test_a_motion_survives_lost_cycles(profile):
     assert len(run.seen(GapSeen)) > 10
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_mode_5_moves_too(profile):
-    (ended,) = Run(profile, mode=5).seen(MotionEnded)
-    assert ended.outcome == "completed", ended.reason
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_whole_session_over_two_serial_adapters(profile):

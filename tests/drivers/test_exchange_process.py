@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -490,15 +489,6 @@ class TestHeldUp:
             assert "answers in a row left too late" in ended[0].reason
             assert exchange.status().worst_turnaround_us > 1e6 * Slow.COST
 
-    def test_one_that_waits_for_its_answers_is_served_at_its_pace(self):
-        with running(max_late=2, preload=(__name__,)) as (exchange, controller):
-            exchange.submit(Slow())
-            controller.open = True
-            controller.cycle(60)
-            assert controller.open
-            controller.until(lambda: exchange.status().answered_late > 30)
-            assert not [e for e in exchange.events() if isinstance(e, MotionEnded)]
-
 
 class Slow(Cruise):
     """Takes longer for each step than a cycle lasts, by a quarter."""
@@ -510,36 +500,6 @@ class Slow(Cruise):
         while time.monotonic() < end:
             pass
         return super().advance()
-
-
-class Holdable(Cruise):
-    """Can rest on its way, and go on."""
-
-    def hold(self):
-        self.bounds = "stop"
-        self._from, self._target, self._time = self._velocity, 0.0, 0.0
-
-    def resume(self):
-        self._from, self._target, self._time = self._velocity, self.SPEED, 0.0
-
-
-class TestHold:
-    def test_a_motion_rests_on_its_path_and_goes_on(self):
-        with running(preload=(__name__,)) as (exchange, controller):
-            exchange.submit(Holdable())
-            controller.open = True
-            controller.until(lambda: controller.moved > 0.2)
-            exchange.hold()
-            controller.cycle(400)
-            resting = controller.moved
-            controller.cycle(100)
-            assert controller.moved == resting
-            assert controller.open
-            exchange.resume()
-            controller.until(lambda: controller.moved > resting + 0.2)
-            exchange.stop()
-            controller.until(lambda: not controller.open)
-            controller.assert_stopped_on_its_path(PERIOD)
 
 
 class TestStops:
@@ -612,17 +572,6 @@ class TestStops:
             assert "no sign of life" in the(Leaving, events).reason
             assert exchange.wait(30.0) == 0
 
-    def test_without_supervisor_and_controller_it_ends(self):
-        with running(session={"silence_timeout": 1.0}) as (exchange, controller):
-            set_going(exchange, controller)
-            silent_from = time.monotonic()
-            while exchange.alive:  # which is no sign of life
-                assert time.monotonic() - silent_from < 30.0
-                time.sleep(0.05)
-            events = exchange.events()
-            assert "no sign of life" in the(Leaving, events).reason
-            assert the(MotionEnded, events).outcome == "lost"
-
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
     def test_not_by_an_interrupt_or_a_hang_up(self, number):
         with running() as (exchange, controller):
@@ -633,65 +582,6 @@ class TestStops:
             assert controller.open
             assert controller.moved == pytest.approx(moved + 200 * PERIOD * Cruise.SPEED, rel=0.01)
             assert not [event for event in exchange.events() if isinstance(event, MotionEnded)]
-
-
-SUPERVISOR = """
-import sys, threading, time
-sys.path.insert(0, {root!r})
-from tests.drivers.rig import Cruise
-from tests.drivers.test_exchange_process import settings
-from drivers.exchange.process import ExchangeProcess
-exchange = ExchangeProcess.start(settings({port}))
-print(exchange.pid, flush=True)
-def beat():
-    while True:
-        exchange.beat()
-        time.sleep(0.05)
-threading.Thread(target=beat, daemon=True).start()
-sys.stdin.readline()
-exchange.submit(Cruise())
-print("submitted", flush=True)
-time.sleep(60)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
-def test_the_death_of_the_supervisor_stops_the_arm_on_its_path(number):
-    port = free_port()
-    script = SUPERVISOR.format(root=str(Path(__file__).parents[2]), port=port)
-    supervisor = subprocess.Popen(
-        [sys.executable, "-c", script],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    controller = UdpController(port)
-    try:
-        pid = int(supervisor.stdout.readline())
-        controller.start()
-        # Not before: what is handed over while a session begins is refused, as of the one before.
-        print(file=supervisor.stdin, flush=True)
-        said = threading.Thread(target=supervisor.stdout.readline)
-        said.start()
-        controller.until(lambda: not said.is_alive())
-        controller.open = True
-        controller.until(lambda: controller.moved > 0.2)
-        # As the end of a terminal does: to its whole process group.
-        os.killpg(supervisor.pid, number)
-        controller.until(lambda: supervisor.poll() is not None)
-        died = time.monotonic()
-        controller.until(lambda: not controller.open)
-        controller.assert_stopped_on_its_path(PERIOD)
-        controller.unanswered = 0
-        controller.until(lambda: _process_state(pid) in ("", "Z"))
-        assert time.monotonic() - died > 2.0, "it goes on answering for a while"
-    finally:
-        controller.close()
-        supervisor.kill()
-        supervisor.wait()
-        supervisor.stdin.close()
-        supervisor.stdout.close()
 
 
 def _process_state(pid: int) -> str:
@@ -757,20 +647,6 @@ class TestStart:
             assert len(report.refused) == 1 + (report.scheduling == "ordinary") + (
                 not report.memory_locked
             ) + (not report.cpu_awake)
-
-
-def test_records_that_nobody_reads_are_counted_when_they_are_overwritten():
-    with running(ring_capacity=100) as (exchange, controller):
-        reader = RingReader(exchange.ring_fd, N)
-        controller.cycle(350)
-        controller.until(lambda: exchange.status().overflow >= 250)
-        lost_so_far = exchange.status().overflow
-        records = reader.drain()
-        assert len(records) == 99
-        assert reader.overflow >= lost_so_far
-        assert records["number"][-1] == controller.number
-        controller.cycle(50)
-        assert len(reader.drain()) == 50
 
 
 def test_a_live_change_of_speed_that_a_motion_cannot_make_is_refused():

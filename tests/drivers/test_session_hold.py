@@ -13,7 +13,6 @@ from drivers import (
     OverrideChanged,
     Refused,
     RequestError,
-    SourceFailed,
     State,
 )
 from planner import JointLimits, TrajectoryPlayer, plan
@@ -115,14 +114,6 @@ class TestHold:
             rig.cycle(cycles)
         rig.run_to("completed")
 
-    def test_an_override_after_a_hold_does_not_take_its_bounds_back(self):
-        rig = playing()
-        rig.session.hold()
-        rig.cycle(10)
-        rig.session.override(0.5)
-        rig.session.resume()
-        rig.run_to("completed")
-
     def test_one_that_cannot_hold_is_stopped_on_its_path(self):
         rig, source = moving()
         rig.session.hold()
@@ -144,33 +135,11 @@ class TestHold:
         assert (rig.ended.outcome, source.stops) == ("stopped", 1)
         assert "failed to hold: SystemExit: no" in rig.ended.reason
 
-    def test_one_that_has_not_begun_begins_at_rest_and_goes_on_from_there(self):
-        rig = held_before_it_began()
-        rig.cycle(6000)
-        sent = rig.records["commanded_position"]
-        sent = sent[np.isfinite(sent).all(axis=1)]
-        assert (sent == sent[0]).all()
-        assert rig.state is State.OPEN
-        assert rig.ended is None
-        rig.session.resume()
-        rig.run_to("completed")
-        end = rig.train.joint_position(rig.axes["d"][:, 0])
-        np.testing.assert_allclose(end, START + WAY, atol=1e-6)
-
     def test_a_stop_ends_one_that_was_held_before_it_began(self):
         rig = held_before_it_began()
         rig.session.stop()
         rig.run_to("stopped")
         assert not np.nan_to_num(rig.records["commanded_velocity"]).any()
-
-    def test_one_that_was_held_and_released_before_it_began_does_not_rest(self):
-        rig = closed()
-        rig.session.request(player())
-        rig.session.hold()
-        rig.session.resume()
-        rig.open()
-        rig.cycle(60)
-        assert not at_rest(rig)
 
     def test_one_that_cannot_hold_and_has_not_begun_is_dropped(self):
         rig = closed()
@@ -371,15 +340,6 @@ def accelerating(acceleration: float, cycles: int = 40) -> np.ndarray:
     return START + 0.5 * acceleration * t**2 * np.array([0, 1, 0, 0, 0, 0])
 
 
-def test_the_source_is_told():
-    source = Overridable(np.tile(START, (20, 1)))
-    rig = running(source)
-    for fraction in (0.5, 0.0, 1.0):
-        rig.session.override(fraction)
-        rig.cycle()
-    assert source.fractions == [0.5, 0.0, 1.0]
-
-
 def test_it_may_be_told_before_the_motion_begins():
     rig = Rig()
     source = Overridable(np.tile(START, (20, 1)))
@@ -400,18 +360,6 @@ def test_the_bounds_of_an_override_are_granted_from_then_on_and_enforced():
         else:
             rig.cycle(30)
             assert rig.state is State.OPEN
-
-
-def test_a_source_that_keeps_the_bounds_of_a_plan_is_held_to_them():
-    rig = running(Overridable(accelerating(8.0 * 1.2), "plan"), guard_limits=limits(**WIDE))
-    rig.session.override(0.5)
-    assert_refused(rig, rig.cycle(2), AccelerationLimit)
-
-
-def test_those_of_a_stop_are_not_granted_by_it():
-    rig = running(Overridable(np.tile(START, (20, 1)), "stop"))
-    rig.session.override(0.5)
-    assert_refused(rig, rig.cycle(), SourceFailed)
 
 
 def test_a_stop_after_an_override_has_the_bounds_of_a_stop():

@@ -191,38 +191,6 @@ def test_after_the_end_a_new_target_begins_a_new_motion(six_axis_limits, random_
     assert events(first + second) == [(EventKind.MOTION_ENDED, 1), (EventKind.MOTION_ENDED, 2)]
 
 
-def test_a_target_where_the_arm_is_takes_no_time(six_axis_limits, random_points):
-    (point,) = random_points(10, 1)
-    for percent in (100.0, 0.0):
-        interpolator = ready(six_axis_limits, point)
-        interpolator.set_override_speed(percent)
-        queue(interpolator, [point, point])
-        (step,) = steps_to_rest(interpolator)
-        assert (step.elapsed_time, events([step])) == (
-            0.0,
-            [(EventKind.VIA_POINT_PASSED, 1), (EventKind.MOTION_ENDED, 2)],
-        )
-        np.testing.assert_array_equal(step.position, point)
-
-
-@given(st.integers(0, 10**6), st.lists(st.integers(0, 400), min_size=4, max_size=4))
-@settings(max_examples=15, deadline=None)
-def test_whenever_targets_come_the_steps_keep_the_limits(
-    six_axis_limits, random_points, seed, waits
-):
-    points = random_points(seed, 5)
-    interpolator = ready(six_axis_limits, points[0], fly=100.0)
-    steps = []
-    for target_id, (point, wait) in enumerate(zip(points[1:], waits, strict=True)):
-        queue(interpolator, [point], first=target_id)
-        steps += [interpolator.get_next_step() for _ in range(wait)]
-    while interpolator.get_current_target_id() is not None:
-        steps.append(interpolator.get_next_step())
-    assert max(worst_ratios(points[0], positions(steps), six_axis_limits)) <= 1.0 + 1e-5
-    ended = [target for kind, target in events(steps)]
-    assert ended == [0, 1, 2, 3]
-
-
 # -- more data, targets -------------------------------------------------------------------
 
 
@@ -237,19 +205,6 @@ def test_data_are_asked_for_while_few_targets_are_ahead(six_axis_limits, random_
     for step in steps_to_rest(interpolator)[:-1]:
         ahead -= len(step.events)
         assert (step.status == Status.NEED_MORE_DATA) == (ahead <= advance)
-
-
-def test_the_current_target_is_the_next_one_not_passed(six_axis_limits, random_points):
-    points = random_points(31, 4)
-    interpolator = ready(six_axis_limits, points[0], fly=100.0)
-    queue(interpolator, points[1:], first=11)
-    current, passed = 11, []
-    while interpolator.get_current_target_id() is not None:
-        assert interpolator.get_current_target_id() == current
-        for event in interpolator.get_next_step().events:
-            passed.append(event.target_id)
-            current = event.target_id + 1
-    assert passed == [11, 12, 13]
 
 
 # -- time ---------------------------------------------------------------------------------
@@ -424,22 +379,6 @@ def test_a_stopped_arm_stands_until_it_may_go_on(six_axis_limits, points):
     assert interpolator.stop_motion() == Status.OK
     interpolator.continue_motion()
     assert events(steps_to_rest(interpolator))[-1] == (EventKind.MOTION_ENDED, 3)
-
-
-def test_a_stop_before_the_first_step_holds_the_arm_where_it_is(six_axis_limits, points):
-    interpolator = ready(six_axis_limits, points[0])
-    interpolator.stop_motion()
-    queue(interpolator, points[1:2])
-    for _ in range(3):
-        step = interpolator.get_next_step()
-        assert step.status == Status.FINAL_STEP
-        np.testing.assert_array_equal(step.position, points[0])
-    interpolator.continue_motion()
-    other = ready(six_axis_limits, points[0])
-    queue(other, points[1:2])
-    np.testing.assert_array_equal(
-        positions(steps_to_rest(interpolator)), positions(steps_to_rest(other))
-    )
 
 
 def test_a_stop_outlasts_the_end_of_the_motion(six_axis_limits, points):
@@ -621,22 +560,6 @@ def test_a_moving_arm_is_not_forgotten(six_axis_limits, random_points, service, 
     )
     assert getattr(interpolator, service)() == Status.OK
     assert interpolator.get_current_target_id() is None
-
-
-def test_what_would_make_a_moving_arm_jump_is_refused(six_axis_limits, random_points):
-    a, b = random_points(52, 2)
-    interpolator = ready(six_axis_limits, a)
-    queue(interpolator, [b])
-    for _ in range(20):
-        interpolator.get_next_step()
-    assert interpolator.set_initial_position(b) == Status.INCONSISTENT
-    assert interpolator.set_interpolation_time(0.001) == Status.INCONSISTENT
-    assert interpolator.reset() == Status.INCONSISTENT
-    cartesian = interpolator.get_next_step(1)
-    assert cartesian.status == Status.OUTPUT_FORMAT == -13
-    steps_to_rest(interpolator)
-    assert interpolator.reset() == Status.OK
-    assert interpolator.get_next_step().status == Status.INCONSISTENT
 
 
 def test_a_planner_that_died_leaves_the_motion_before(six_axis_limits, random_points):
