@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import strategies as st
 
 PERIOD = 0.002
-JERK = 100.0
 
 WILD = (float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 5e-324, 3.0, -0.5, 1e-3, 1e-7)
 
@@ -151,13 +149,6 @@ def smooth(cycles: int, distance: np.ndarray) -> np.ndarray:
     return s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3) * distance
 
 
-def at_the_edge(hold: int, share: float, direction: np.ndarray) -> np.ndarray:
-    """(m, n) displacement: jerk of `share` of the bound, +, -, -, +, from rest to rest."""
-    jerk = JERK * share * np.repeat([1.0, -1.0, -1.0, 1.0], hold)[:, None] * direction
-    rows = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * PERIOD**3
-    return np.vstack([np.zeros_like(direction), rows, rows[-1:]])
-
-
 FAULTS = (
     "motion",
     "jumps",
@@ -177,40 +168,3 @@ FAULTS = (
     "override raises",
     "current",
 )
-
-
-@st.composite
-def breakages(draw) -> Breaks:
-    if draw(st.booleans()):
-        return Breaks()
-    value = draw(st.sampled_from(WILD) | st.floats(-0.01, 0.01))
-    index = draw(st.integers(0, 30))
-    return Breaks(draw(st.sampled_from(FAULTS)), index, draw(st.integers(0, 5)), value)
-
-
-@st.composite
-def displacements(draw, n: int) -> np.ndarray:
-    """(m, n) from zero, mostly within the bounds or close to them."""
-    direction = np.array(draw(st.lists(st.sampled_from([-1.0, 0.0, 1.0]), min_size=n, max_size=n)))
-    if draw(st.booleans()):
-        return smooth(draw(st.integers(1, 250)), 0.1 * direction)
-    share = draw(st.sampled_from([0.5, 0.99999, 1.0, 1.00001, 1.1, 2.5]))
-    return at_the_edge(draw(st.integers(1, 45)), share, direction)
-
-
-@st.composite
-def motions(draw, n: int) -> ScriptedMotion:
-    rows = draw(displacements(n))
-    velocity = np.diff(rows, axis=0, prepend=rows[:1]) / PERIOD
-    kind = draw(st.sampled_from([ScriptedMotion, FedMotion]))
-    return kind(rows, velocity, draw(breakages()), draw(st.sampled_from(["plan", "stop"])))
-
-
-@st.composite
-def corrections(draw, n: int, mode: int) -> ScriptedCorrection:
-    rows = draw(displacements(n))
-    rows = np.vstack([rows, rows[::-1]])
-    # An offset is a displacement; a velocity of that shape is within the bounds as well.
-    motion = rows if mode != 9 else np.zeros_like(rows)
-    current = 20.0 * rows if mode in (2, 9) else np.zeros_like(rows)
-    return ScriptedCorrection(motion, current, draw(breakages()))

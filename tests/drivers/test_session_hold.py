@@ -68,9 +68,6 @@ def held_before_it_began() -> Rig:
     return rig
 
 
-FAR = limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0))
-
-
 class IgnoresHold(Cruise):
     hold = resume = nothing
 

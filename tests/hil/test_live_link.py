@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,7 +35,6 @@ from hil.cell.cell import stays_here
 from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
-from hil.move import send, straight_way
 from hil.progress import Silent
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
@@ -348,29 +346,6 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
         told = open_archive(path).outcome
         assert told is not None
         assert told.outcome == "void"
-
-
-@pytest.mark.slow  # waits for a real second of silence; test_supervision shows the rule by itself
-def test_a_watch_that_hangs_brings_the_arm_to_rest(tmp_path: Path) -> None:
-    cell = fast_cell(tmp_path).with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
-
-    class Hangs(Pressed):
-        def show(self, progress: MotionProgress) -> None:
-            if (progress.motion_time or 0.0) > 0.5:
-                time.sleep(4.0)
-
-    with loopback_link(cell, options=PATIENT) as link:
-        where = link.connect(Stop())
-        way = straight_way(cell, where, where + np.radians([40.0, 40.0]), speed=0.02)
-        assert way.duration > 4.0
-        ended = send(way, cell, link, tmp_path / "a.mcap", stop=Stop(), watch=Hangs())
-        assert ended.outcome == "stopped"
-        assert "looks at the motion (show, request) did not return for" in ended.reason
-    archive = open_archive(tmp_path / "a.mcap")
-    sent = archive.columns["commanded_position"]
-    sent = sent[np.isfinite(sent).all(axis=1)]
-    done = (sent[-1] - where) / (way.target - where)
-    assert np.all(done < 0.9), "not gone on with to its end"
 
 
 @pytest.mark.parametrize(

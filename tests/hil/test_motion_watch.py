@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from drivers.events import MotionEnded
-from drivers.exchange.control import BINS, bin_of, quantile, upper_edge
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop
@@ -269,20 +268,3 @@ def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: Arm, tmp_path: P
 def test_an_override_is_a_fraction(override: float) -> None:
     with pytest.raises(ValueError, match="override"):
         OperatorRequest(override)
-
-
-def test_percentiles_of_latencies_are_never_too_short_and_little_too_long() -> None:
-    random = np.random.default_rng(3)
-    seconds = np.exp(random.normal(np.log(50e-6), 0.6, 20_000))
-    counts = [0] * BINS
-    for value in seconds:
-        counts[bin_of(float(value))] += 1
-    for share in (0.5, 0.99):
-        told = quantile(counts, share)
-        true = np.quantile(seconds, share, method="inverted_cdf")
-        assert told is not None
-        assert true <= told <= true * 2**0.25
-    assert quantile([0] * BINS, 0.5) is None
-    assert bin_of(float("inf")) == BINS - 1
-    assert bin_of(-1.0) == 0
-    assert all(upper_edge(k) < upper_edge(k + 1) for k in range(BINS - 1))

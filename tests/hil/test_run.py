@@ -1010,31 +1010,6 @@ def test_an_arm_that_is_changed_in_mid_campaign_stops_it(make: Make) -> None:
     assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is judged anew"
 
 
-@pytest.mark.slow
-def test_two_touched_first_repetitions_are_left_out(make: Make) -> None:
-    undisturbed = finished(make("undisturbed", repetitions=2))
-    first, second = (middle_of(undisturbed, f"excitation_00{n}_a1.mcap") for n in (0, 1))
-    campaign = make(repetitions=3)
-    result = run_pushed(campaign, Push(first), Push(second, load=-0.1))
-    assert result.complete
-    assert [one.archive for one in result.rejected] == [
-        "excitation_001_a1.mcap", "excitation_001_a2.mcap", "excitation_001_a3.mcap",
-        "excitation_000_a1.mcap",
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_minority_that_agrees_outvotes_nobody(make: Make) -> None:
-    undisturbed = finished(make("undisturbed", repetitions=3))
-    campaign = make(repetitions=3)
-    cycle = middle_of(undisturbed, "excitation_002_a1.mcap")
-    length = cycle - middle_of(undisturbed, "excitation_001_a1.mcap")
-    result = run_pushed(campaign, Push(cycle), Push(cycle + length))
-    assert result.complete
-    rejected = [one.archive for one in result.rejected]
-    assert rejected == ["excitation_002_a1.mcap", "excitation_002_a2.mcap"]
-
-
 def finished(campaign: Campaign) -> Campaign:
     campaign.run(unrehearsed=True, durable=False)
     return campaign
@@ -1205,13 +1180,3 @@ def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) ->
     with pytest.raises(OperatorStopError, match="is not accepted") as stopped:
         campaign.run(operator=Leaves(), stop=stop)
     assert stopped.value.exit_code == 130
-
-
-def test_a_real_arm_without_a_dry_run_is_asked_for_one(
-    make: Make,
-) -> None:
-    campaign = make(real=True)
-    link = simulated_link(campaign.cell, instead_of_hardware=True)
-    campaign.run(link, unrehearsed=True)
-    step = campaign.status().steps[2]
-    assert (step.name, step.state) == ("dry run", "next")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,19 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from hil.archive import Archive, ArchiveName, ArchiveSpec, open_archive
-from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, Stop, plan_around
+from hil.archive import ArchiveName, open_archive
+from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, plan_around
 from hil.cell import Cell
-from hil.demo_link import loopback_link
 from hil.identify import Identification, identify_campaign
 from hil.motion_checks import MotionChecks
 from hil.progress import Silent
 from hil.report.page import facts
 from identification.excitation import Constraints, Criteria, Excitation, sampled
-from planner import FourierSeries, TrajectoryPlayer
+from planner import FourierSeries
 
 Run = Callable[..., Campaign]
 
@@ -78,13 +74,6 @@ def test_the_criteria_of_a_plan_are_those_of_its_motion_over_all_parameters(
     assert criteria.n_samples == pytest.approx(8000, abs=1)
     assert criteria.condition is not None and criteria.scaled_condition is not None
     assert 0.0 < criteria.coupling_index < 58 * 57 / 2
-
-
-def test_the_plan_is_restored_to_the_bit(swinging: CampaignPlan, tmp_path: Path) -> None:
-    swinging.save(tmp_path / "plan.json")
-    again = CampaignPlan.load(tmp_path / "plan.json")
-    assert again.moves is None
-    assert json.dumps(again.excitation.to_dict()) == json.dumps(swinging.excitation.to_dict())
 
 
 def test_the_arm_is_taken_to_where_the_sines_begin_and_home_again(finished: Campaign) -> None:
@@ -211,55 +200,3 @@ def test_sines_beyond_a_limit_are_refused(
     wild = replace(fine, amplitude=factor * fine.amplitude, frequency=pace * fine.frequency)
     reason = checks.refusal(wild)
     assert reason is not None and broken in reason
-
-
-def live_run(
-    folder: Path, cell: Cell, *, stop_after: float | None = None
-) -> tuple[FourierSeries, Archive]:
-    """Swing about where the arm stands, over UDP; the series, and what was archived of it."""
-    local = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
-    stop, name = Stop(), folder / "excitation_000_a1.mcap"
-    spec = ArchiveSpec(
-        name, cell.joint_names, cell.period, {}, {"drive_train.json": b"{}"}, durable=False
-    )
-    with loopback_link(local, options=("--patience", "2")) as link:
-        where = link.connect(stop)
-        wide = sines(cell, length=5.0)
-        series = replace(wide, offset=where, amplitude=0.3 * wide.amplitude)
-        timer = threading.Timer(stop_after or 60.0, lambda: setattr(stop, "requested", True))
-        timer.start()
-        ended = link.run(TrajectoryPlayer(series, cell.period, cell.joint_limits), spec, stop)
-        timer.cancel()
-    assert ended.outcome == ("completed" if stop_after is None else "stopped")
-    return series, open_archive(name)
-
-
-def sent_by(archive: Archive) -> NDArray[np.float64]:
-    """The set-points of the motion, without the hold before it."""
-    (began,) = (event.time for event in archive.events if event.name == "MotionStarted")
-    first = int(np.searchsorted(archive.columns["stamp"], round(began * 1e9)))
-    sent = archive.columns["commanded_position"][first:]
-    return np.asarray(sent[~np.isnan(sent).any(axis=1)])
-
-
-@pytest.mark.slow
-def test_sines_run_over_real_sockets_as_they_are(tmp_path: Path, quick: Cell) -> None:
-    series, archive = live_run(tmp_path, quick)
-    sent = sent_by(archive)
-    assert len(sent) * quick.period >= series.duration
-    planned = series.sample(np.arange(len(sent)) * quick.period)[0]
-    assert sent == pytest.approx(planned, abs=2e-6)
-
-
-@pytest.mark.slow
-def test_sines_over_real_sockets_are_stopped_on_their_path(tmp_path: Path, quick: Cell) -> None:
-    series, archive = live_run(tmp_path, quick, stop_after=2.5)
-    sent = sent_by(archive)
-    assert np.all(sent[-1] == sent[-20]), "it rests"
-    finest, step = 1e-5, np.sqrt(6.0)  # s; rad/s, no joint is faster than 1
-    fastest = np.max(np.abs(series.sample(np.arange(0.0, series.duration, 1e-3))[1]))
-    assert fastest < 1.0
-    path = series.sample(np.arange(0.0, series.duration, finest))[0]
-    distance, _ = cKDTree(path).query(sent)
-    assert np.max(distance) <= finest * step + 1e-6
-    assert np.max(np.abs(sent[-1] - series.offset)) > 0.01, "somewhere on its way"

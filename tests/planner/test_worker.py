@@ -189,14 +189,6 @@ def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limi
     assert same(plan_in_child(points, six_axis_limits), plan(points, six_axis_limits))
 
 
-def killed(child):
-    """The process of a child that has nothing to do is killed; its number."""
-    pid = child.call(os.getpid)
-    os.kill(pid, signal.SIGKILL)
-    assert child.connection.poll(5.0), "its end is closed once all its threads have ended"
-    return pid
-
-
 def test_a_process_that_cannot_start_is_an_error_of_its_own(
     tmp_path, monkeypatch, six_axis_limits, random_points
 ):
