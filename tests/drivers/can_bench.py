@@ -8,9 +8,7 @@ import os
 import pty
 import select
 import threading
-import tomllib
 import tty
-from math import radians
 
 import numpy as np
 from can.interfaces.virtual import VirtualBus
@@ -18,7 +16,6 @@ from can.interfaces.virtual import VirtualBus
 from drivers import (
     CycleRing,
     CyclicPacket,
-    DriveTrain,
     Guard,
     GuardLimits,
     InitPacket,
@@ -30,7 +27,9 @@ from drivers.packets import next_number
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from drivers.transports.can.transport import CanTransport
-from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
+from hil.cell import Cell
+from hil.simulation import planted_truth, simulated_drive
+from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from sim_fixtures.can_end import CanFarEnd
 from tests.drivers.rig import smooth_move
 from tests.drivers.transport_contract import TransportContract
@@ -182,23 +181,7 @@ class PacedByPackets:
         self.far.close()
 
 
-def _cell() -> dict:
-    return tomllib.loads(ns16.CELL_PATH.read_text())
-
-
-def ns16_train() -> DriveTrain:
-    table = _cell()["drive_train"]
-    return DriveTrain(
-        gear_ratio=np.array(table["gear_ratio"]),
-        calibration=np.array(table["calibration"]),
-        joint_sign=np.array(table["joint_sign"]),
-        joint_offset=np.radians(table["joint_offset_deg"]),
-        torque_constant=np.array(table["torque_constant"]),
-        current_limit=np.array(table["current_limit"]),
-        k54=table["k54"],
-        k64=table["k64"],
-        k65=table["k65"],
-    )
+NS16 = Cell.load(ns16.CELL_PATH)
 
 
 def wide_limits() -> GuardLimits:
@@ -209,34 +192,17 @@ def wide_limits() -> GuardLimits:
         acceleration=np.full(N, 8.0),
         jerk=np.full(N, 100.0),
         following_error=np.full(N, 1.0),
-        current=np.array(_cell()["drive_train"]["current_limit"]),
+        current=NS16.drive_train.current_limit,
     )
 
 
 def ns16_controller(**settings) -> SimulatedController:
     """The simulated NS 16, one opening, short phases."""
-    cell = _cell()
-    table = cell["drive_train"]
-    drive = SimulatedDrive(
-        gear_ratio=table["gear_ratio"],
-        calibration=table["calibration"],
-        joint_sign=table["joint_sign"],
-        joint_offset=[radians(a) for a in table["joint_offset_deg"]],
-        torque_constant=table["torque_constant"],
-        current_limit=table["current_limit"],
-        following_error=table["following_error"],
-        encoder_counts=table["encoder_counts_per_revolution"],
-        k54=table["k54"],
-        k64=table["k64"],
-        k65=table["k65"],
-    )
-    names = ("rotor_inertia", "coulomb", "viscous", "third")
-    truth = PlantTruth(*(np.array(cell["simulation"][name]) for name in names))
     figures = {"period": 0.002, "open_intervals": 1, "cold_start": True, **settings}
     return SimulatedController(
         ns16.urdf_text(),
-        drive,
-        truth,
+        simulated_drive(NS16),
+        planted_truth(NS16),
         ControllerSettings(**figures),
         seed=1,
         initial_position=HOME,
@@ -257,7 +223,7 @@ class Run:
         self.link = PacedByPackets(self.near, self.far, self.controller, lost=lost, clock=clock)
         self.ring = CycleRing(N, 8192)
         guard = Guard(wide_limits(), PERIOD)
-        self.session = Session(ns16_train(), guard, self.ring, settle_cycles=20, mode=mode)
+        self.session = Session(NS16.drive_train, guard, self.ring, settle_cycles=20, mode=mode)
         self.session.request(smooth_move(MOVE, cycles, start=HOME))
         self.events = []
         exchange(self.link, self.session, until=self._until)

@@ -23,13 +23,13 @@ from drivers.transports.can.codecs import NEVER, words_of
 from drivers.transports.can.ends import LONGEST, SegmentAssembler, Segmenter
 from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, Frame
 from tests.drivers.can_bench import (
+    NS16,
     PROFILES,
     Cycles,
     N,
     PacedByPackets,
     Wire,
     ns16_controller,
-    ns16_train,
     random_packet,
     virtual_ends,
     wide_limits,
@@ -375,7 +375,7 @@ def test_the_load_on_a_log_of_the_bus_is_the_computed_one(profile, period):
     clock = Cycles()
     near, far = virtual_ends(profile, clock)
     logger = can.Bus(near._port._bus.channel_id, "virtual")
-    session = Session(ns16_train(), Guard(wide_limits(), period), CycleRing(6, 64))
+    session = Session(NS16.drive_train, Guard(wide_limits(), period), CycleRing(6, 64))
     link = PacedByPackets(near, far, ns16_controller(period=period), clock=clock)
     exchange(link, session, until=lambda: link.cycle == 112)
     rates = BusRates(profile)

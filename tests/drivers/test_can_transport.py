@@ -40,6 +40,7 @@ from sim_fixtures.serve import FarEndError
 from tests.drivers.can_bench import (
     HOME,
     MOVE,
+    NS16,
     PERIOD,
     PROFILES,
     CanContract,
@@ -51,7 +52,6 @@ from tests.drivers.can_bench import (
     SlcanBus,
     init_packet,
     ns16_controller,
-    ns16_train,
     virtual_ends,
     wide_limits,
 )
@@ -511,7 +511,7 @@ def test_a_receiver_too_slow_for_the_bus_loses_frames_and_sees_gaps_in_the_numbe
     clock = Cycles()
     near, far = virtual_ends(profile, clock)
     bus = near._port._bus
-    session = Session(ns16_train(), Guard(wide_limits(), PERIOD), CycleRing(N, 64))
+    session = Session(NS16.drive_train, Guard(wide_limits(), PERIOD), CycleRing(N, 64))
     link = PacedByPackets(near, far, ns16_controller(cold_start=False), clock=clock)
     exchange(link, session, until=lambda: link.cycle == 40)
     session.events()
