@@ -405,23 +405,6 @@ class TestCorrections:
         rig.run()
         assert (rig.ended.outcome, source.stops) == ("stopped", 1)
 
-    def test_a_source_may_reuse_its_arrays(self):
-        class Reusing(Correction):
-            buffer = np.zeros(N), np.zeros(N)
-
-            def advance(self):
-                for kept, given in zip(self.buffer, super().advance(), strict=True):
-                    kept[:] = given
-                return self.buffer
-
-        def replies(kind):
-            source = correction(2)
-            rig = begun(2, kind(source.motion, source.current))
-            rig.cycle(100)
-            return [reply for _, reply in rig.transcript]
-
-        assert replies(Reusing) == replies(Correction)
-
     def test_axes_in_other_slots_and_of_other_arms_get_no_correction(self):
         axes_map = np.full((4, 10), 0xFF)
         axes_map[0, 0] = 3

@@ -61,21 +61,6 @@ class TestFromRequestToRest:
             rig.train.joint_position(rig.axes["d"][:, 0]), START + MOVE, atol=1e-6
         )
 
-    def test_the_first_set_point_is_the_target_received_bit_for_bit_at_zero_velocity(self):
-        rig = Rig()
-        rig.session.request(smooth_move(MOVE, 500))
-        rig.close()
-        rng = np.random.default_rng(4)
-        rig.put_arm_at(START + rng.uniform(-1e-6, 1e-6, N))
-        received = rig.axes["d"][:, 0].copy()
-        answer = rig.cycle(mode=Mode.POSITION)
-        assert rig.state is State.OPEN
-        np.testing.assert_array_equal(answer.axes["mode"], Mode.POSITION)
-        np.testing.assert_array_equal(answer.axes["d"][:, 0], received)
-        assert not answer.axes["d"][:, 1:].any()
-        assert not answer.axes["extra"].any()
-        assert answer.status == bytes(4)
-
     def test_the_source_begins_at_that_target_and_advances_once_per_later_packet(self):
         source = Cruise()
         rig = running(source)
@@ -143,23 +128,6 @@ class TestFromRequestToRest:
             rig.cycle(1 + EXIT_RETRY_CYCLES - 1)
             assert rig.exits_asked == motion
             rig.close()
-
-    def test_axes_that_close_one_by_one_are_answered_one_by_one(self):
-        rig = running(smooth_move(MOVE, 300), 305)
-        end = rig.axes["d"][:, 0].copy()
-        for joint in range(N - 1):
-            rig.axes["mode"][joint] = Mode.CLOSED
-            rig.axes["d"][joint, 0] += 0.001
-            answer = rig.cycle()
-            assert rig.state is State.EXITING
-            np.testing.assert_array_equal(answer.axes["mode"], rig.axes["mode"])
-            np.testing.assert_array_equal(answer.axes["d"][joint + 1 :, 0], end[joint + 1 :])
-            np.testing.assert_array_equal(
-                answer.axes["d"][: joint + 1, 0], rig.axes["d"][: joint + 1, 0]
-            )
-        assert rig.ended is None
-        rig.cycle(mode=Mode.CLOSED)
-        assert rig.ended.outcome == "completed"
 
     def test_the_drive_going_off_while_leaving_does_not_spoil_a_finished_motion(self):
         rig = running(still(2), 6)
@@ -330,15 +298,6 @@ class TestStaggeredOpening:
         assert (answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
         assert rig.ended.outcome == "refused"
         assert "mode 5" in rig.ended.reason
-
-    def test_without_a_motion_another_open_mode_is_answered_by_holding(self):
-        rig = closed()
-        answer = rig.cycle(mode=Mode.POSITION_RELATIVE)
-        assert rig.state is State.OPENING
-        np.testing.assert_array_equal(answer.axes["d"][:, 0], rig.axes["d"][:, 0])
-        answer = rig.cycle(mode=Mode.DELTA_POSITION)
-        np.testing.assert_array_equal(answer.axes["mode"], Mode.DELTA_POSITION)
-        assert not answer.axes["d"].any()
 
 
 class TestOnlyAxis:

@@ -459,12 +459,6 @@ class TestConstruction:
 
 
 class TestBeforeInit:
-    @pytest.mark.parametrize("length", [12, 732, INIT_LENGTH - 1])
-    def test_a_sync_packet_is_shorter_than_an_init_packet(self, length):
-        rig = Rig()
-        assert rig.sync(1, length) is not None
-        assert rig.session.counters.malformed == 0
-
     def test_one_as_long_is_none(self):
         rig = Rig()
         assert rig.sync(1, INIT_LENGTH) is None

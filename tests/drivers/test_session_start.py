@@ -89,14 +89,6 @@ class TestHandShake:
         assert len(rig.seen(InitReceived)) == 1
         assert rig.session.counters.duplicates == 1
 
-    def test_an_init_with_an_impossible_number_of_axes_is_malformed(self):
-        rig = Rig()
-        bad = bytearray(rig.init.encode())
-        bad[12:16] = struct.pack("<i", 21)
-        assert rig.send(bytes(bad)) is None
-        assert rig.state is State.SYNC
-        assert rig.session.counters.malformed == 1
-
 
 class TestSafeAnswers:
     """What is answered where nothing moves: field by field."""

@@ -132,20 +132,60 @@ def test_a_peer_without_more_packets_closes_the_link():
         transport.receive(1.0)
 
 
+def on_time(*which: int) -> list[tuple[float, int]]:
+    """Packets that arrive in their own cycle; packet k is sent at cycle time k + 1."""
+    return [(k + 1.0, k) for k in which]
+
+
+TO_CONTROLLER = "to_controller"
+CASES = {
+    "nothing": ([Corrupt(0, offset=99)], on_time(0, 1, 2, 3), [0, 1, 2, 3], [], []),
+    "packets lost": ([Lose(1, count=2)], on_time(0, 3), [0, None, None, 3], [], []),
+    "answer lost": ([Lose(2, TO_CONTROLLER)], on_time(0, 1, 2, 3), [0, 1, None, 3], [], []),
+    "packet doubled": ([Duplicate(1)], on_time(0, 1, 1, 2, 3), [0, 1, 2, 3], [1], []),
+    "answer doubled": (
+        [Duplicate(1, TO_CONTROLLER)], on_time(0, 1, 2, 3), [0, 1, 2, 3], [1], []),
+    "late within its cycle": (
+        [Delay(1, seconds=0.0005)], [(1.0, 0), (2.25, 1), *on_time(2, 3)], [0, 1, 2, 3], [], []),
+    # The answer comes in the next cycle, which has had its own.
+    "past its cycle": (
+        [Delay(1, cycles=1.5)], [(1.0, 0), (3.0, 2), (3.5, 1), (4.0, 3)], [0, None, 2, 3], [1], []),
+    # What comes in cycle 2 is the answer to packet 1: the peer rejects it by its number.
+    "past a lost one": (
+        [Delay(1, cycles=1.25), Lose(2)], [(1.0, 0), (3.25, 1), (4.0, 3)], [0, None, 1, 3], [], []),
+    "answer late within its cycle": (
+        [Delay(1, seconds=0.0019, direction=TO_CONTROLLER)], on_time(0, 1, 2, 3), [0, 1, 2, 3],
+        [], []),
+    **{f"answer {cycles:g} cycles late": (
+        [Delay(1, cycles=cycles, direction=TO_CONTROLLER)], on_time(*range(10)),
+        [0, None, *range(2, 10)], [], [1]) for cycles in (1.0, 1.5, 2.0, 7.0)},
+    "packet overtaken": (
+        [Reorder(1)], [(1.0, 0), (3.0, 2), (3.25, 1), (4.0, 3)], [0, None, 2, 3], [1], []),
+    "answer overtaken": (
+        [Reorder(1, TO_CONTROLLER)], on_time(0, 1, 2, 3), [0, None, 2, 3], [], [1]),
+}  # fmt: skip
+"""Faults; when each packet arrives, in cycles, and which; answers by cycle, surplus and late."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_a_fault_does_to_packets_and_answers(name):
+    faults, expected, accepted, surplus, late = CASES[name]
+    peer = Script(packets(len(accepted)))
+    transport, seen = SimulatedTransport(peer, faults), []
+    with pytest.raises(TransportClosed):
+        while True:
+            packet = transport.receive(1.0)
+            seen.append((transport.now / peer.period, packet[0]))
+            transport.send(b"re:" + packet)
+    assert seen == [pytest.approx(one) for one in expected]
+    for found, replies in zip(
+        (peer.accepted, transport.surplus_replies, transport.late_replies),
+        (accepted, surplus, late), strict=True,
+    ):  # fmt: skip
+        assert [reply and reply[3] for reply in found] == replies
+
+
 class TestFaults:
-    def test_lost_to_the_pc(self):
-        peer = Script(packets(5))
-        transport = SimulatedTransport(peer, [Lose(1, count=2)])
-        assert [packet[0] for packet in answer_all(transport)] == [0, 3, 4]
-        assert [reply is None for reply in peer.accepted] == [False, True, True, False, False]
-        assert transport.now == pytest.approx(5 * 0.002)
-
-    def test_lost_to_the_controller(self):
-        peer = Script(packets(4))
-        received = answer_all(SimulatedTransport(peer, [Lose(2, "to_controller")]))
-        assert len(received) == 4
-        assert [reply is None for reply in peer.accepted] == [False, False, True, False]
-
     def test_a_loss_longer_than_the_patience_is_silence(self):
         transport = SimulatedTransport(Script(packets(100)), [Lose(0, count=60)])
         assert transport.receive(0.1) is None
@@ -162,13 +202,6 @@ class TestFaults:
         assert link.carry(1_000_000_001, "to_pc", b"x") == [(0.0, b"x")]
         assert perf_counter() - began < 1.0
 
-    def test_duplicated(self):
-        peer = Script(packets(3))
-        transport = SimulatedTransport(peer, [Duplicate(1)])
-        assert [packet[0] for packet in answer_all(transport)] == [0, 1, 1, 2]
-        assert len(peer.accepted) == 3
-        assert transport.surplus_replies == [b"re:" + bytes([1]) * 4]
-
     def test_corrupted_either_way(self):
         peer = Script(packets(3))
         faults = [Corrupt(1, offset=2, mask=0x80), Corrupt(2, "to_controller", offset=0, mask=0x01)]
@@ -176,18 +209,6 @@ class TestFaults:
         assert received[1] == bytes([1, 1, 0x81, 1])
         assert peer.accepted[2] == bytes([ord("r") ^ 1]) + b"e:" + bytes([2]) * 4
         assert received[0] == bytes(4)
-
-    def test_corruption_beyond_the_end_changes_nothing(self):
-        assert answer_all(
-            SimulatedTransport(Script(packets(1)), [Corrupt(0, offset=99)])
-        ) == packets(1)
-
-    def test_answers_doubled_reach_the_controller_once(self):
-        peer = Script(packets(3))
-        transport = SimulatedTransport(peer, [Duplicate(1, "to_controller")])
-        answer_all(transport)
-        assert [reply[3] for reply in peer.accepted] == [0, 1, 2]
-        assert [reply[3] for reply in transport.surplus_replies] == [1]
 
     def test_a_silent_controller_sends_nothing_and_is_told_that_nothing_came(self):
         peer = Script([b"a", b"", b"", b"d"])
@@ -216,69 +237,7 @@ class TestFaults:
             make()
 
 
-def arrivals(peer, faults) -> list[tuple[float, int]]:
-    """When each packet arrives, in cycles, and which; every one is answered at once."""
-    transport = SimulatedTransport(peer, faults)
-    seen = []
-    try:
-        while True:
-            packet = transport.receive(1.0)
-            seen.append((transport.now / peer.period, packet[0]))
-            transport.send(b"re:" + packet)
-    except TransportClosed:
-        return seen
-
-
 class TestDelay:
-    """Packet k is sent at cycle time k + 1; period 2 ms."""
-
-    def test_within_its_cycle_a_packet_is_late_and_its_answer_in_time(self):
-        peer = Script(packets(3))
-        seen = arrivals(peer, [Delay(1, seconds=0.0005)])
-        assert seen == [pytest.approx((time, which)) for time, which in [(1, 0), (2.25, 1), (3, 2)]]
-        assert None not in peer.accepted
-
-    def test_past_its_cycle_the_controller_has_had_no_answer(self):
-        peer = Script(packets(4))
-        seen = arrivals(peer, [Delay(1, cycles=1.5)])
-        assert seen == [pytest.approx(expected) for expected in [(1, 0), (3, 2), (3.5, 1), (4, 3)]]
-        # the answer to the late packet comes in the next cycle, which has had its own
-        assert [reply and reply[3] for reply in peer.accepted] == [0, None, 2, 3]
-
-    def test_the_answer_to_a_late_packet_meets_the_number_of_the_next_cycle(self):
-        peer = Script(packets(4))
-        transport = SimulatedTransport(peer, [Delay(1, cycles=1.25), Lose(2)])
-        answer_all(transport)
-        # what came in cycle 2 was the answer to packet 1: the peer rejects it by its number
-        assert [reply and reply[3] for reply in peer.accepted] == [0, None, 1, 3]
-        assert transport.surplus_replies == []
-
-    def test_an_answer_may_be_late_within_its_cycle(self):
-        peer = Script(packets(3))
-        transport = SimulatedTransport(peer, [Delay(1, seconds=0.0019, direction="to_controller")])
-        answer_all(transport)
-        assert [reply[3] for reply in peer.accepted] == [0, 1, 2]
-
-    @pytest.mark.parametrize("cycles", [1.0, 1.5, 2.0, 7.0])
-    def test_an_answer_past_its_cycle_came_too_late(self, cycles):
-        peer = Script(packets(10))
-        transport = SimulatedTransport(peer, [Delay(1, cycles=cycles, direction="to_controller")])
-        answer_all(transport)
-        assert [reply and reply[3] for reply in peer.accepted] == [0, None, *range(2, 10)]
-        assert transport.late_replies == [b"re:" + bytes([1]) * 4]
-
-    def test_an_overtaken_packet_comes_after_the_next(self):
-        peer = Script(packets(5))
-        assert [which for _, which in arrivals(peer, [Reorder(1)])] == [0, 2, 1, 3, 4]
-        assert [reply and reply[3] for reply in peer.accepted] == [0, None, 2, 3, 4]
-
-    def test_an_overtaken_answer_is_none(self):
-        peer = Script(packets(4))
-        transport = SimulatedTransport(peer, [Reorder(1, "to_controller")])
-        answer_all(transport)
-        assert [reply and reply[3] for reply in peer.accepted] == [0, None, 2, 3]
-        assert len(transport.late_replies) == 1
-
     def test_patience_shorter_than_the_delay_is_silence(self):
         transport = SimulatedTransport(Script([b"x", *[b""] * 50]), [Delay(0, seconds=0.05)])
         assert transport.receive(0.04) is None
@@ -306,9 +265,6 @@ class TestDelay:
 
 
 class TestFaultyLink:
-    def test_without_a_fault_everything_arrives_at_once(self):
-        assert FaultyLink([], 0.001).carry(5, "to_pc", b"x") == [(0.0, b"x")]
-
     def test_faults_of_one_packet_add_up(self):
         link = FaultyLink([Delay(3, cycles=2.0), Delay(3, seconds=0.5), Duplicate(3)], 0.25)
         assert link.carry(3, "to_pc", b"x") == [(1.0, b"x")] * 2
