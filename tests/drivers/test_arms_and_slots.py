@@ -5,8 +5,6 @@ Expected answers come from the oracle, which knows of slots and arms only what t
 
 from __future__ import annotations
 
-import struct
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -38,12 +36,6 @@ def layouts(draw, *, complete: bool = True, most: int = 20):
     axes = axes[:most]
     assume(axes)
     return tuple(draw(st.permutations(axes))), wanted, n
-
-
-def sideways(n: int, rows: int) -> np.ndarray:
-    """Each joint by its own distance, slowly enough for the guard."""
-    share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, rows))[:, None]
-    return share * np.linspace(0.0002, 0.001, n)
 
 
 def opened(slots, arm, n, **options) -> Bench:
@@ -78,35 +70,6 @@ def test_the_drive_of_the_wanted_arm_going_off_ends_open_mode_whatever_the_other
     received, answer = bench.cycle()
     assert bench.session.state is State.DRIVE_OFF
     assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
-
-
-class TestLinearTrack:
-    """Six rotary joints in the cell, an open seventh axis that the cell does not know."""
-
-    SLOTS = tuple((1, axis) for axis in (6, 0, 1, 2, 3, 4, 5))
-
-    @pytest.mark.parametrize("track", [CLOSED, OPEN])
-    def test_the_six_joints_are_moved_and_the_track_is_held(self, track):
-        bench = Bench(self.SLOTS, 1, 6)
-        bench.start()
-        path = bench.train.joint_position(bench.d1[1:]) + sideways(6, 12)
-        bench.session.request(Table(path))
-        bench.cycle()
-        bench.set_joints(OPEN)
-        bench.modes[0] = track
-        for row in path:
-            received, answer = bench.cycle()
-            assert answer.axes[0] == oracle.safe_axis(received.axes[0], drive_on=True)
-            motor = bench.train.motor_revolutions(row)
-            assert [a.floats[0] for a in answer.axes[1:]] == np.float32(motor).tolist()
-            bench.obey(answer)
-
-    def test_records_hold_the_six_joints(self):
-        bench = opened(self.SLOTS, 1, 6)
-        record = bench.ring.last(1)[0]
-        expected = bench.train.joint_position(bench.d1[1:])
-        np.testing.assert_allclose(record["position"], expected, rtol=0, atol=1e-12)
-        assert record["mode"].tolist() == [OPEN] * 6
 
 
 def lacking(arm: int, *axes: int) -> list[str]:
@@ -146,63 +109,8 @@ class TestArmWithoutAllItsJoints:
         missing = [j + 1 for j, slot in enumerate(bench.joint_slots) if slot is None]
         self.never_moved(bench, lacking(arm, *missing))
 
-    @pytest.mark.parametrize("theirs", [OPEN, CLOSED, 8])
-    def test_another_arm_at_work_is_answered_by_its_own_status_and_mode(self, theirs):
-        """This arm's drive is off: that says nothing of the axes of arm 2."""
-        slots = ((1, 5), (2, 0), (2, 1))
-        bench = Bench(slots, 1, 6)
-        bench.start()
-        bench.status = [0, ON, 0, 0]
-        bench.modes = [CLOSED, theirs, theirs]
-        received, answer = bench.cycle()
-        assert oracle.differences(answer, oracle.safe_answer(received, bench.arms)) == []
-
 
 class TestAxisMaps:
-    @pytest.mark.parametrize("none", [0xFF, -1])
-    def test_both_ways_of_saying_that_an_axis_is_not_open(self, none):
-        bench = opened(TWO_ARMS, 2, 3, none=none)
-        assert bench.seen(InitReceived)[0].unusable is None
-        assert bench.ring.last(1)[0]["mode"].tolist() == [OPEN] * 3
-
-    def bad(self, change) -> np.ndarray:
-        table = np.full((4, 10), 0xFF)
-        table[0, :6] = np.arange(6)
-        change(table)
-        return table
-
-    @pytest.mark.parametrize(
-        "change",
-        [
-            lambda t: t.__setitem__((0, 3), 2),
-            lambda t: t.__setitem__((0, 3), 6),
-            lambda t: t.__setitem__((0, 3), -2),
-            lambda t: t.__setitem__((0, 3), 2**31 - 1),
-            lambda t: t.__setitem__((0, 3), 0xFF),
-            lambda t: t.__setitem__((0, 6), 6),
-            lambda t: t.__setitem__((1, 0), 0),
-            lambda t: t.__setitem__(slice(None), 1),
-            lambda t: t.__setitem__(slice(None), 0xFF),
-            lambda t: t.__setitem__(slice(None), 0),
-        ],
-        ids=[
-            "a slot given twice",
-            "a slot beyond the packet",
-            "a negative slot",
-            "a huge slot",
-            "a slot given to nobody",
-            "more slots than axes",
-            "a slot given to two arms",
-            "every axis in slot 1",
-            "no axis open",
-            "every axis in slot 0",
-        ],
-    )
-    def test_a_map_that_cannot_be_is_answered_safely_and_never_moved(self, change):
-        slots = tuple((1, axis) for axis in range(6))
-        bench = Bench(slots, 1, 6, open_axes_map=self.bad(change))
-        TestArmWithoutAllItsJoints().never_moved(bench, ["open_axes_map"])
-
     @pytest.mark.parametrize("mode", [5, 7, 9])
     def test_without_a_map_no_open_axis_gets_an_echo_while_any_drive_is_on(self, mode):
         """Whose axis it is nobody knows; an echoed position would be a delta in mode 7."""
@@ -230,19 +138,6 @@ class TestAxisMaps:
         received, answer = bench.cycle()
         if not sound:
             assert oracle.differences(answer, oracle.safe_answer(received, (1,) * n_axes)) == []
-
-    @pytest.mark.parametrize("count", [0, -1, 21, 2**31 - 1])
-    def test_a_number_of_axes_that_cannot_be_gets_no_answer(self, count):
-        bench = Bench(TWO_ARMS, 1, 3)
-        good = bench.start()
-        assert good is not None
-        fresh = Bench(TWO_ARMS, 1, 3)
-        packet = bytearray(good)
-        packet[:4] = struct.pack("<i", 10)
-        packet[12:16] = struct.pack("<i", count)
-        assert fresh.send(bytes(packet)) is None
-        assert fresh.session.counters.malformed == 1
-        assert fresh.session.state is State.SYNC
 
 
 def test_twenty_axes_of_four_arms_at_1_ms():

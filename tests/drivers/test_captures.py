@@ -28,7 +28,7 @@ from drivers import (
     State,
     VelocityLimit,
 )
-from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, echo, is_init
+from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
 from tests.drivers.captures import CAPTURES, capture_path, conversation, read_datagrams
 from tests.drivers.rig import Table
@@ -427,36 +427,3 @@ def test_every_packet_of_either_end_decodes_field_by_field_and_encodes_bit_for_b
     assert kinds["whole"] > 0, kinds
     assert kinds["init"] == (0 if name == SEVEN_AXES else 2), kinds
     assert (kinds["long"] > 0) == (name not in (SEVEN_AXES, "a_restart506")), kinds
-
-
-@pytest.mark.parametrize("name", [name for name in CAPTURES if name != SEVEN_AXES])
-def test_the_init_packet_s_fields_stand_where_the_facts_say(shared_data: Path, name: str):
-    data = next(p for p, _ in conversation(shared_data, name) if len(p) == INIT_LENGTH)
-    init = InitPacket.decode(data)
-
-    def per_arm(offset: int, letter: str) -> np.ndarray:
-        return np.array(struct.unpack_from(f"<40{letter}", data, offset)).reshape(4, 10)
-
-    assert (init.number, init.n_axes) == (10, struct.unpack_from("<i", data, 12)[0])
-    assert init.sample_time == struct.unpack_from("<i", data, 224)[0]
-    assert init.version == struct.unpack_from("<3i", data, 708)
-    for found, offset, letter in (
-        (init.open_mode, 16, "i"),
-        (init.open_axes_map, 228, "i"),
-        (init.calibration, 388, "f"),
-        (init.current_limit, 548, "f"),
-        (init.kinematic_influence, 720, "f"),
-        (init.gear_ratio, 880, "f"),
-        (init.following_error, 1040, "f"),
-    ):
-        np.testing.assert_array_equal(found, per_arm(offset, letter))
-
-
-@pytest.mark.parametrize("name", CAPTURES)
-def test_sync_and_init_answers_of_the_foreign_program_are_echoes(shared_data: Path, name: str):
-    for packet, reply in conversation(shared_data, name):
-        number = struct.unpack_from("<i", packet)[0]
-        if len(packet) == INIT_LENGTH or (name[0] == "a" and len(packet) == 732):
-            assert echo(packet) == reply == oracle.echo(packet)
-        elif reply is not None:
-            assert struct.unpack_from("<i", reply)[0] == oracle.answer_number(number)

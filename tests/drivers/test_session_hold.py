@@ -8,10 +8,7 @@ import pytest
 from drivers import (
     AccelerationLimit,
     HoldChanged,
-    JerkLimit,
-    Mode,
     OverrideChanged,
-    Refused,
     RequestError,
     State,
 )
@@ -19,7 +16,6 @@ from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
     PERIOD,
     START,
-    Correction,
     Cruise,
     GoesOn,
     N,
@@ -68,10 +64,6 @@ def held_before_it_began() -> Rig:
     return rig
 
 
-class IgnoresHold(Cruise):
-    hold = resume = nothing
-
-
 def at_rest(rig: Rig) -> bool:
     return not rig.records[-1]["commanded_velocity"].any()
 
@@ -101,15 +93,6 @@ class TestHold:
         rig.cycle(cycles)
         rig.session.stop()
         rig.run_to("stopped")
-
-    def test_a_hold_may_be_changed_of_ones_mind_about(self):
-        rig = playing()
-        for cycles in (5, 1, 40, 2):
-            rig.session.hold()
-            rig.cycle(cycles)
-            rig.session.resume()
-            rig.cycle(cycles)
-        rig.run_to("completed")
 
     def test_one_that_cannot_hold_is_stopped_on_its_path(self):
         rig, source = moving()
@@ -178,54 +161,6 @@ class TestHold:
         rig.cycle(60)
         assert (rig.state, rig.exits_asked) == (State.OPEN, 0)
         assert not at_rest(rig)
-
-    def test_a_source_that_does_nothing_is_stopped(self):
-        source = IgnoresHold()
-        rig = running(
-            source, 300, guard_limits=limits(lower=np.full(N, -9.0), upper=np.full(N, 9.0))
-        )
-        rig.session.hold()
-        rig.cycle(2000)
-        rig.session.hold()
-        rig.cycle(3000)
-        assert source.stops == 0
-        rig.cycle()
-        assert source.stops == 1
-        rig.run_to("stopped")
-        assert rig.ended.reason == "it did not come to rest in 5000 cycles of a hold"
-
-
-class TestHoldOfCorrections:
-    """Nobody names their bounds: those of a stop are granted from hold until rest."""
-
-    def corrected(self, rows, hold_at: int):
-        source = type("Held", (Correction,), {"hold": nothing, "resume": nothing})(rows)
-        rig = running(source, mode=Mode.VELOCITY)
-        rig.cycle(hold_at)
-        assert rig.state is State.OPEN
-        rig.session.hold()
-        rig.cycle(len(rows) - hold_at + 1)
-        return rig
-
-    @staticmethod
-    def ramp(acceleration: float) -> np.ndarray:
-        """(m, n) rad/s of joint 1: from zero at this acceleration, 200 cycles in all."""
-        rows = np.zeros((201, N))
-        slopes = np.minimum(0.15 * np.arange(200), acceleration)
-        rows[1:, 0] = np.cumsum(slopes) * PERIOD
-        return rows
-
-    def test_at_rest_the_bounds_of_a_plan_are_back(self):
-        rows = np.vstack([np.zeros((30, N)), self.ramp(14.0)])
-        rig = self.corrected(rows, 20)
-        assert type(rig.refusal) is AccelerationLimit
-        assert rig.refusal.bound == pytest.approx(8.0)
-
-    def test_not_at_rest_those_of_a_stop_stay(self):
-        rows = self.ramp(14.0)
-        rig = self.corrected(rows, 20)
-        refused = rig.seen(Refused)
-        assert not any(isinstance(event.error, AccelerationLimit) for event in refused)
 
 
 class TestResume:
@@ -357,32 +292,6 @@ def test_the_bounds_of_an_override_are_granted_from_then_on_and_enforced():
         else:
             rig.cycle(30)
             assert rig.state is State.OPEN
-
-
-def test_a_stop_after_an_override_has_the_bounds_of_a_stop():
-    rig = running(Overridable(accelerating(15.9)), guard_limits=limits(**WIDE))
-    rig.session.override(1.0)
-    rig.session.stop()
-    rig.cycle(30)
-    assert rig.state is State.OPEN
-
-
-def test_corrections_may_be_overridden_too():
-    class Faded(Correction):
-        def override(self, fraction):
-            self.motion = self.motion * fraction
-
-    t = PERIOD * np.arange(1, 400)[:, None] * np.ones(N)
-    for overridden in (False, True):
-        rig = running(Faded(1.6 * 100.0 * t**2 / 2), mode=8)
-        if overridden:
-            rig.session.override(1.0)
-        answer = rig.cycle(5)
-        if overridden:
-            assert rig.state is State.OPEN
-        else:
-            assert (answer.axes["mode"] == 505).all()
-            assert type(rig.refusal) is JerkLimit
 
 
 class TestRefused:

@@ -577,22 +577,6 @@ def test_an_override_asked_for_while_resuming_keeps_the_wider_bounds_only_where_
     assert steep.player.rate == gentle.player.rate == 0.4
 
 
-def test_a_hold_waits_until_it_is_resumed(live_motions, six_axis_limits):
-    arm = Arm(live_motions[1], six_axis_limits).begin().run(500).ask("hold").run(1000)
-    assert not arm.player.finished
-    assert arm.player.rate == 0.0
-    np.testing.assert_array_equal(arm.positions[-700:], np.tile(arm.positions[-1], (700, 1)))
-    where = arm.player.motion_time
-    arm.ask("hold").ask("override", 0.5).run(100)
-    assert arm.player.motion_time == where
-    arm.ask("resume").run(300)
-    assert arm.player.rate == 0.5
-    arm.ask("resume").run(10)
-    assert arm.player.rate == 0.5
-    arm.ask("hold").run(20).ask("resume").run(500)  # in the middle of slowing down
-    assert arm.player.rate == 0.5
-
-
 def test_nothing_resumes_after_a_stop(live_motions, six_axis_limits):
     for end in ("stop", "cancel"):
         arm = Arm(live_motions[1], six_axis_limits).begin().run(500).ask("hold").run(20).ask(end)
