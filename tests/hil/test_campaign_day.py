@@ -1,4 +1,4 @@
-"""A day with a campaign."""
+"""A day with a campaign, and how it was run, as its folder tells it."""
 
 from __future__ import annotations
 
@@ -6,21 +6,33 @@ import gc
 import json
 import re
 import shlex
+import shutil
 from collections import Counter
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from hil.archive.header import motion_name
 from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, Stop
 from hil.campaign.campaign import campaign_of_design
+from hil.campaign.dry_run import Acceptance, DryRun
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.operator import RunStatus, Unattended
+from hil.campaign.status import conduct_of
+from hil.campaign.warmup import WarmMotion, WarmUp
 from hil.cell import Cell
 from hil.cli import app
 from hil.design import DesignResult
+from hil.identify import identify_campaign
+from hil.progress import Silent
+from hil.recording import dated_anew, origin_of
+from hil.report.page import when
 from hil.version import software
-from tests.hil.fast_cell import fast_campaign, fast_cell
+from sim_fixtures.ns16 import CELL_PATH
+from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "campaign.md"
 QUICK = """\
@@ -193,3 +205,123 @@ def test_a_campaign_leaves_nothing_to_the_cycle_collector(tmp_path: Path) -> Non
         assert Campaign.open(folder).run(unrehearsed=True).complete
 
     assert not left_in_cycles(work)
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A campaign without rehearsal and dry run, as a simulated arm allows."""
+    folder = tmp_path_factory.mktemp("conduct")
+    cell = fast_cell(folder, repetitions=2)
+    campaign = fast_campaign(folder / "campaign", cell, rehearsed=False)
+    campaign.run(unrehearsed=True, durable=False)
+    return campaign
+
+
+@pytest.fixture
+def folder(ran: Campaign, tmp_path: Path) -> CampaignFolder:
+    """A copy of it, to be changed."""
+    shutil.copytree(ran.folder.root, tmp_path / "campaign")
+    return CampaignFolder(tmp_path / "campaign")
+
+
+def test_every_archive_is_told_with_its_cycles(ran: Campaign) -> None:
+    found = conduct_of(ran.folder)
+    assert [one.archive for one in found.recorded] == [e.name for e in ran.folder.manifest()]
+    for one in found.recorded:
+        assert one.cycles > 0 and one.outcome == "completed" and one.when is None
+        assert one.seconds == pytest.approx((one.cycles - 1) * ran.cell.period, abs=1e-6)
+        assert (one.missed, one.late, one.lost, one.why) == (0, 0, 0, "")
+    assert found.warm_up is None
+
+
+def test_what_was_left_out_is_said(ran: Campaign) -> None:
+    steps = {one.step: one for one in conduct_of(ran.folder).steps}
+    assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
+    assert not steps["dry run"].done
+    assert steps["repetitions"].words.startswith("2 whole")
+
+
+def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolder) -> None:
+    pass_rehearsal(folder)
+    DryRun(
+        folder.plan_hash, 0.2, ("dryrun_000_a1.mcap",), 9.0, True, ("shoulder", "elbow"),
+        (0.3, 0.12), (0.01, 0.02), 1, 2, Acceptance("ada", "2026-03-01"),
+    ).save(folder.dry_run)  # fmt: skip
+    motions = tuple(WarmMotion(f"w{k}", (10.0 - k, None)) for k in range(3))
+    warm = WarmUp(folder.plan_hash, ("shoulder", "elbow"), 0.002, motions, "not warm")
+    warm.save(folder.warmup)
+    name = "excitation_001_a9.mcap"
+    shutil.copy(folder.archives / "excitation_001_a1.mcap", folder.archives / name)
+    folder.add(name, "rejected", "it was held")
+    found = conduct_of(folder)
+    steps = {one.step: one for one in found.steps}
+    assert steps["rehearsal"].done
+    assert "accepted by ada at 2026-03-01" in steps["dry run"].words
+    assert "shoulder 30%, elbow 12%" in steps["dry run"].details[0]
+    assert not steps["warm-up"].done and steps["warm-up"].words == "not warm after 3 motions"
+    (drifting,) = steps["warm-up"].details
+    assert "still changed by 11.11% a motion; below 0.20% was wanted" in drifting
+    assert "1 rejected" in steps["repetitions"].words
+    assert found.warm_up is not None
+    assert found.warm_up.friction == [[10.0, None], [9.0, None], [8.0, None]]
+    assert found.warm_up.change[0] is None
+    assert found.warm_up.change[1] == pytest.approx(1.0 / 9.5)
+    assert (found.recorded[-1].outcome, found.recorded[-1].why) == ("rejected", "it was held")
+
+
+def test_what_is_of_another_plan_does_not_count(folder: CampaignFolder) -> None:
+    pass_rehearsal(folder)
+    folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
+    (step,) = (one for one in conduct_of(folder).steps if one.step == "rehearsal")
+    assert not step.done and "another cell, URDF or plan" in step.words
+
+
+def test_what_cannot_be_read_is_told_and_stops_nothing(folder: CampaignFolder) -> None:
+    for path in (folder.rehearsal, folder.dry_run, folder.warmup):
+        path.write_text("{")
+    gone = folder.manifest()[-1]
+    (folder.archives / gone.name).unlink()
+    found = conduct_of(folder)
+    assert all(not one.done for one in found.steps[:3])
+    assert ["cannot be read" in found.steps[0].words, "damaged" in found.steps[1].words] == [
+        True
+    ] * 2
+    assert gone.name not in {one.archive for one in found.recorded}
+
+
+def test_identify_puts_it_into_the_results(ran: Campaign) -> None:
+    found = identify_campaign(ran.folder.root, Silent())
+    assert found.results.conduct == conduct_of(ran.folder)
+
+
+def test_a_motion_in_real_time_has_the_date_on_which_it_began_and_virtual_time_has_none() -> None:
+    cell = Cell.load(CELL_PATH)
+    assert "recorded_at" not in origin_of(cell)
+    said = origin_of(cell, virtual=False)
+    assert said["simulated"] == "yes"
+    assert datetime.fromisoformat(said["recorded_at"]).tzinfo is not None
+    earlier = {**said, "recorded_at": "2026-03-01T08:00:00+00:00"}
+    assert dated_anew(earlier)["recorded_at"] >= said["recorded_at"]
+    assert "recorded_at" not in dated_anew({"simulated": "yes"})
+
+
+def test_the_report_says_from_when_to_when(ran: Campaign) -> None:
+    recorded = conduct_of(ran.folder).recorded
+    assert when(recorded).startswith("No date")
+    dates = ("2026-03-01T10:05:00+00:00", "2026-03-01T08:01:30+00:00")
+    dated = [
+        one.model_copy(update={"when": date}) for one, date in zip(recorded[:2], dates, strict=True)
+    ]
+    assert when(dated).startswith("2026-03-01 08:01 to 10:05, ")
+
+
+def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
+    stopped = MotionFailedError(
+        motion_name("excitation", 0), "stopped", "stopped by the operator", None,
+        "excitation_000_a1.mcap",
+    )  # fmt: skip
+    assert str(stopped).startswith(
+        "repetition 1 (excitation_000_a1.mcap) was stopped by the operator; everything recorded"
+    )
+    lost = MotionFailedError(motion_name("dryrun", 1), "lost", "the link went silent")
+    assert lost.sentence == "dry run 2 was lost: the link went silent"

@@ -1,8 +1,12 @@
-"""What supervises a run: its view of the exchange, its own pace, a screen that fails, and rest."""
+"""What supervises a run: a motion that is watched and steered, signs of life, failing screens."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,17 +15,271 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.events import MotionStarted
+from drivers.events import MotionEnded, MotionStarted
 from drivers.exchange import control as control_memory
 from drivers.exchange.event_log import NO_SUPERVISOR, EventsLost
 from drivers.record import cycle_dtype
 from drivers.states import State
-from hil.archive import open_archive
-from hil.campaign import live_link
+from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
+from hil.campaign import Stop, live_link
+from hil.campaign.intervals import START_TOLERANCE
+from hil.campaign.link import Link
 from hil.campaign.live_link import STALL, ExchangeView, Heartbeat, Standstill
-from hil.campaign.operator import OperatorRequest, RunStatus, RunWatch, Stop
+from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
+from hil.cell import Cell
+from hil.errors import ControllerFault
+from hil.simulation import simulated_link
 from hil.testing import faulty_link
+from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell
+
+
+class Watcher:
+    """Wishes what a script says at a moment of the motion."""
+
+    def __init__(self, script: Callable[[float], OperatorRequest]) -> None:
+        self._script, self._time, self._held = script, 0.0, 0
+        self.seen: list[MotionProgress] = []
+
+    def show(self, progress: MotionProgress) -> None:
+        self.seen.append(progress)
+        self._time = progress.motion_time or 0.0
+
+    def request(self) -> OperatorRequest:
+        return self._script(self._time)
+
+
+@dataclass
+class WatchedArm:
+    """A connected arm and a motion from where it stands and back, some seconds long."""
+
+    cell: Cell
+    link: Link
+    motion: PiecewiseCubic
+
+    @classmethod
+    def connected(cls, cell: Cell) -> WatchedArm:
+        link = simulated_link(cell)
+        where = link.connect(Stop())
+        away = where + 0.6 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+        moves = (Move(away, speed=0.6), Move(where, speed=0.6))
+        return cls(cell, link, plan_moves(where, moves, cell.joint_limits).trajectory)
+
+    def run(
+        self, path: Path, watch: Watcher, stop: Stop | None = None, override: float = 1.0
+    ) -> MotionEnded:
+        limits = self.cell.joint_limits
+        player = TrajectoryPlayer(
+            self.motion, self.cell.period, limits, start_tolerance=START_TOLERANCE
+        )
+        return self.link.run(
+            player, spec(self.cell, path), stop or Stop(), override=override, watch=watch
+        )
+
+
+def spec(cell: Cell, path: Path) -> ArchiveSpec:
+    return ArchiveSpec(
+        path, cell.joint_names, cell.period, {"kind": "move"},
+        {"drive_train.json": cell.drive_table.model_dump_json().encode()}, durable=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def arm(cell: Cell) -> WatchedArm:
+    return WatchedArm.connected(cell)
+
+
+def commanded(archive: Archive) -> np.ndarray:
+    """Set-points (k, n) that were sent."""
+    rows = archive.columns["commanded_position"]
+    return rows[np.isfinite(rows).all(axis=1)]
+
+
+def require_on_path(arm: WatchedArm, points: np.ndarray) -> None:
+    """Each set-point lies on the planned path, whatever the time law."""
+    times = np.linspace(0.0, arm.motion.duration, 40_000)
+    planned = arm.motion.sample(times)[0]
+    for point in points[:: len(points) // 50 + 1]:
+        assert np.abs(planned - point).max(axis=1).min() < 2e-4
+
+
+def test_a_dry_run_is_slow_from_its_first_cycle(arm: WatchedArm, tmp_path: Path) -> None:
+    person = Watcher(lambda _: OperatorRequest())
+    ended = arm.run(tmp_path / "a.mcap", person, override=0.2)
+    assert ended.outcome == "completed"
+    points = commanded(open_archive(tmp_path / "a.mcap"))
+    steps = np.abs(np.diff(points, axis=0)).max(axis=0) / arm.cell.period
+    planned = np.abs(arm.motion.sample(np.linspace(0, arm.motion.duration, 9999))[1]).max(axis=0)
+    np.testing.assert_allclose(steps, 0.2 * planned, rtol=1e-3)
+    assert len(points) * arm.cell.period == pytest.approx(5.0 * arm.motion.duration, abs=1.0)
+    require_on_path(arm, points)
+    assert {progress.override for progress in person.seen} == {0.2}
+
+
+def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: WatchedArm, tmp_path: Path) -> None:
+    person = Watcher(lambda time: OperatorRequest(0.1 if time > 0.3 else 1.0))
+    arm.run(tmp_path / "a.mcap", person, override=0.2)
+    assert {progress.override for progress in person.seen} == {0.2, 0.1}
+    assert person.seen[-2].rate == pytest.approx(0.1)
+
+
+def test_a_hold_rests_on_the_path_and_is_gone_on_from(arm: WatchedArm, tmp_path: Path) -> None:
+    asked = 0
+
+    def script(time: float) -> OperatorRequest:
+        nonlocal asked
+        held = time > 0.4 and asked < 12
+        asked += held
+        return OperatorRequest(0.5, held)
+
+    person = Watcher(script)
+    ended = arm.run(tmp_path / "a.mcap", person)
+    assert ended.outcome == "completed"
+    held = [progress for progress in person.seen if progress.held]
+    assert held
+    assert held[-1].rate == 0.0
+    points = commanded(open_archive(tmp_path / "a.mcap"))
+    rests = (np.diff(points, axis=0) == 0.0).all(axis=1)
+    moving = np.flatnonzero(~rests)
+    assert rests[moving[0] : moving[-1]].sum() > 10, "no rest in the midst of the motion"
+    require_on_path(arm, points)
+    np.testing.assert_allclose(points[-1], arm.motion.sample(np.array([1e9]))[0][0], atol=2e-3)
+
+
+def test_a_stop_ends_a_hold(arm: WatchedArm, tmp_path: Path) -> None:
+    stop, asked = Stop(), 0
+
+    def script(time: float) -> OperatorRequest:
+        nonlocal asked
+        asked += time > 0.4
+        stop.requested = asked > 20
+        return OperatorRequest(held=time > 0.4)
+
+    ended = arm.run(tmp_path / "a.mcap", Watcher(script), stop)
+    assert ended.outcome == "stopped"
+    archive = open_archive(tmp_path / "a.mcap")
+    assert archive.complete
+    require_on_path(arm, commanded(archive))
+
+
+def test_nothing_begins_while_a_hold_is_wished_for(arm: WatchedArm, tmp_path: Path) -> None:
+    stop, asked = Stop(), 0
+
+    def script(_: float) -> OperatorRequest:
+        nonlocal asked
+        asked += 1
+        stop.requested = asked > 5
+        return OperatorRequest(held=True)
+
+    person = Watcher(script)
+    ended = arm.run(tmp_path / "a.mcap", person, stop)
+    assert (ended.outcome, ended.interval) == ("stopped", -1)
+    assert not open_archive(tmp_path / "a.mcap").n_samples
+
+
+@pytest.mark.parametrize("what", ["stop", "hold"])
+def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
+    arm: WatchedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """A slow disk: nothing has been asked of the controller yet, and nothing is."""
+    stop, pressed = Stop(), 0
+    opened = arm.link._open
+
+    def slowly(given: ArchiveSpec) -> ArchiveWriter:
+        nonlocal pressed
+        pressed = 1
+        stop.requested = what == "stop"
+        return opened(given)
+
+    def script(_: float) -> OperatorRequest:
+        nonlocal pressed
+        pressed += pressed > 0
+        stop.requested = stop.requested or pressed > 5
+        return OperatorRequest(held=pressed > 0)
+
+    monkeypatch.setattr(arm.link, "_open", slowly)
+    ended = arm.run(tmp_path / "a.mcap", Watcher(script), stop)
+    assert (ended.outcome, ended.reason, ended.interval) == ("stopped", "it had not begun", -1)
+    archive = open_archive(tmp_path / "a.mcap")
+    assert archive.complete
+    assert not archive.n_samples
+
+
+def test_a_motion_held_before_it_begins_rests_and_what_was_wished_is_archived(
+    arm: WatchedArm, tmp_path: Path
+) -> None:
+    asked = 0
+
+    def script(_: float) -> OperatorRequest:
+        nonlocal asked
+        asked += 1
+        if asked <= 2:  # until it was asked for
+            return OperatorRequest()
+        return OperatorRequest(0.5, held=asked < 20)
+
+    ended = arm.run(tmp_path / "a.mcap", Watcher(script))
+    assert ended.outcome == "completed"
+    archive = open_archive(tmp_path / "a.mcap")
+    names = [event.name for event in archive.events]
+    assert names.index("HoldChanged") < names.index("MotionStarted")
+    told = [(event.name, *event.data.values()) for event in archive.events if event.data]
+    assert told == [("OverrideChanged", 0.5), ("HoldChanged", True), ("HoldChanged", False)]
+    points = commanded(archive)
+    assert (points[:50] == points[0]).all()
+    require_on_path(arm, points)
+
+
+def test_what_is_shown_is_what_is_archived(arm: WatchedArm, tmp_path: Path) -> None:
+    person = Watcher(lambda _: OperatorRequest())
+    arm.run(tmp_path / "a.mcap", person)
+    columns = open_archive(tmp_path / "a.mcap").columns
+    moving = [progress for progress in person.seen if progress.state is State.OPEN]
+    assert moving
+    ratio, table = arm.cell.drive_train.gear_ratio[0], arm.cell.drive_table
+    for progress in moving:
+        assert progress.position is not None
+        assert progress.current is not None
+        same = (columns["position"] == progress.position).all(axis=1)
+        same &= (columns["target_current"] == progress.current).all(axis=1)
+        row = int(np.argmax(same))
+        assert same[row]
+        error = columns["target_position"][row] - progress.position
+        np.testing.assert_array_equal(progress.following_error, error)
+        assert progress.following_share is not None
+        # The first joint has no coupling to any other: its share by hand.
+        by_hand = abs(error[0] * ratio) / (2.0 * np.pi) / table.following_error[0]
+        assert progress.following_share[0] == pytest.approx(by_hand, rel=1e-5)
+        share = np.abs(progress.current) / table.current_limit
+        np.testing.assert_allclose(progress.current_share, share, rtol=1e-5)
+        assert progress.latency is None
+        assert progress.duration == arm.motion.duration
+    cycles = [progress.cycles for progress in person.seen]
+    assert cycles == sorted(cycles)
+    assert any("first set-point" in event for event in person.seen[-1].events)
+
+
+class Stubborn:
+    """A motion that knows no override: it rests."""
+
+    start = property(lambda self: np.zeros(6))
+    finished = True
+    bounds = "plan"
+
+    def begin(self, position: np.ndarray) -> None: ...
+    def advance(self) -> tuple[np.ndarray, np.ndarray]: ...  # type: ignore[empty-body]
+    def stop(self) -> None: ...
+
+
+def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm, tmp_path: Path) -> None:
+    with pytest.raises(ControllerFault, match="knows no override"):
+        arm.link.run(Stubborn(), spec(arm.cell, tmp_path / "a.mcap"), Stop(), override=0.2)  # type: ignore[arg-type]
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("override", [-0.1, 1.1, float("nan")])
+def test_an_override_is_a_fraction(override: float) -> None:
+    with pytest.raises(ValueError, match="override"):
+        OperatorRequest(override)
 
 
 class Exchange:
@@ -266,3 +524,36 @@ def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) ->
     assert re.search(r"moved at .* rad/s while the arm was to stand still", rejected.reason)
     again = [path.name for path in pushed.folder.completed("standstill")]
     assert again == ["standstill_000_a2.mcap"]
+
+
+PROGRAM = """
+import sys
+import numpy as np
+from hil.campaign.live_link import LARGE, return_large_arrays
+
+def mapped():
+    return int(open("/proc/self/statm").read().split()[0]) * 4096
+
+if "adapted" not in sys.argv:
+    return_large_arrays()
+teacher = np.ones(4_000_000)
+del teacher  # glibc now takes what is smaller from its heap
+before = mapped()
+arrays = [np.ones(2 * LARGE // 8) for _ in range(40)]
+small = [np.ones(100) for _ in range(1000)]  # above them, and stay
+del arrays
+print(before, mapped())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the heap of glibc")
+def test_what_is_freed_is_not_kept_below_what_is_not() -> None:
+    def kept(*words: str) -> int:
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, check=True
+        )
+        before, after = map(int, done.stdout.split())
+        return after - before
+
+    assert kept() < 2 * 2**20
+    assert kept("adapted") > 8 * 2**20, "glibc returns them by itself: this is not needed any more"

@@ -1,4 +1,4 @@
-"""The simulated controller as the PC sees it: packets, phases, and how well it follows."""
+"""The simulated controller: packets, phases and open modes as the PC sees them."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from sim_fixtures import (
     ns16,
 )
 from sim_fixtures.controller import RUN_UP, OwnMotion
+from sim_fixtures.program import MISSING, Answer, LoopProgram, StartStep
 from tests.fault_matrix import small_cell
 
 Array = NDArray[np.float64]
@@ -632,3 +633,513 @@ def test_a_posture_of_another_arm_is_refused() -> None:
 def test_an_arm_without_velocity_limits_does_not_move_by_itself(speed: float) -> None:
     with pytest.raises(SettingError, match="velocity limits"):
         OwnMotion([(0.0, 0.0)], speed=[1.0, speed], period=PERIOD)
+
+
+AXES = small_cell.AXES
+STATUS_EXIT = 1
+Fields = dict[int, Any]
+"""What is answered: field number 1..5 to values."""
+
+
+def packet_of(controller: SimulatedController, n: int = AXES) -> CyclicPacket:
+    packet = controller.next_packet()
+    assert packet
+    return CyclicPacket.decode(packet, n)
+
+
+def reply_to(received: CyclicPacket, fields: Fields, *, status: int = 0, mode: int | None = None):
+    reply = CyclicPacket.zeros(next_number(received.number), len(received.axes))
+    reply.axes["mode"] = received.axes["mode"] if mode is None else mode
+    for number, values in fields.items():
+        reply.axes["d"][:, number - 1] = values
+    return CyclicPacket(reply.number, bytes((status, 0, 0, 0)), bytes(4), reply.axes).encode()
+
+
+def answered(controller: SimulatedController, fields: Fields | None = None, **options: Any):
+    received = packet_of(controller)
+    controller.accept(reply_to(received, fields or {}, **options))
+    return received
+
+
+def opened(**settings: Any) -> SimulatedController:
+    controller = small_cell.controller(**settings)
+    for _ in range(500):
+        if controller.phase is Phase.OPEN:
+            return controller
+        packet = controller.next_packet()
+        assert packet is not None, controller.reason
+        controller.accept(echo(packet) if controller.phase is Phase.START else safe(packet))
+    raise AssertionError(controller.phase)
+
+
+def safe(packet: bytes) -> bytes:
+    """Targets back in modes led by the PC, nothing in the others."""
+    received = CyclicPacket.decode(packet, AXES)
+    led = np.isin(received.axes["mode"], (1, 4, 5, 0))
+    return reply_to(received, {1: np.where(led, received.axes["d"][:, 0], 0.0)})
+
+
+def drive_at_speed(controller: SimulatedController, speed: float = 0.03, cycles: int = 300):
+    """Bring motor 1 up to `speed` [rev per cycle]; the last target sent."""
+    target = np.array(controller.servo.target)
+    for k in range(cycles):
+        delta = np.array([speed * min(1.0, k / (cycles - 50)), 0.0])
+        target = target + delta
+        answered(controller, {1: target, 2: delta})
+    assert controller.phase is Phase.OPEN, controller.reason
+    return target
+
+
+class TestFields:
+    @pytest.mark.parametrize("mode", [1, 4, 5])
+    def test_in_modes_led_by_the_pc_d1_and_d2_are_the_target(self, mode: int) -> None:
+        controller = opened(open_mode=mode)
+        target = np.float32(np.array(controller.servo.target) + 1e-3)
+        fields: Fields = {1: target, 2: 1e-3}
+        answered(controller, fields | ({4: 1e-3} if mode == 1 else {}))
+        after = packet_of(controller).axes
+        np.testing.assert_array_equal(after["mode"], mode)
+        np.testing.assert_array_equal(after["d"][:, 0], target)
+        np.testing.assert_array_equal(after["d"][:, 1], np.float32(1e-3))
+
+    @pytest.mark.parametrize("mode", [2, 7, 8, 9])
+    def test_in_the_others_the_controller_keeps_its_own_target(self, mode: int) -> None:
+        controller = opened(open_mode=mode)
+        before = packet_of(controller).axes["d"][:, 0].copy()
+        controller.accept(None)
+        controller = opened(open_mode=mode)
+        # whatever D1 says in modes 2, 8 and 9; an offset in mode 7 is not reported either
+        for _ in range(5):
+            answered(controller, {1: 0.002})
+        np.testing.assert_array_equal(packet_of(controller).axes["d"][:, 0], before)
+
+    def test_mode_7_adds_d1_to_the_controllers_own_target(self) -> None:
+        controller = opened(open_mode=7)
+        own = np.array(controller.servo.target)
+        for k in range(200):
+            answered(controller, {1: 0.2 * min(1.0, k / 150)})
+        np.testing.assert_allclose(controller.servo.target, own + 0.2, atol=1e-7)
+        np.testing.assert_allclose(controller.servo.measured, own + 0.2, atol=0.01)
+
+    def test_mode_4_without_a_feed_forward_ignores_d4_and_d5(self) -> None:
+        def run(fields: Fields) -> bytes:
+            controller = opened()
+            target = np.array(controller.servo.target)
+            for _ in range(20):
+                answered(controller, {1: target} | fields)
+            return packet_of(controller).axes.tobytes()
+
+        assert run({}) == run({4: 0.01, 5: 1.0})
+
+    @pytest.mark.parametrize("mode", [2, 8])
+    def test_modes_2_and_8_add_d4_to_the_speed_demanded(self, mode: int) -> None:
+        controller = opened(open_mode=mode)
+        own = np.array(controller.servo.measured)
+        speed = np.array([0.004, -0.004])
+        for k in range(600):
+            answered(controller, {4: speed * min(1.0, k / 100)})
+        moved = np.array(controller.servo.measured) - own
+        # the position loop pulls back until its demand cancels what is added
+        gain = controller.settings.servo.position_gain * controller.period
+        np.testing.assert_allclose(moved, speed / gain, rtol=0.1)
+
+    @pytest.mark.parametrize("mode", [1, 2, 9])
+    def test_modes_1_2_and_9_add_d5_to_the_target_current(self, mode: int) -> None:
+        controller = opened(open_mode=mode)
+        first = packet_of(controller)
+        extra = np.array([0.25, -0.125])
+        target = {1: first.axes["d"][:, 0]} if mode == 1 else {}
+        controller.accept(reply_to(first, target | {5: extra}))
+        with_it = packet_of(controller).axes["d"][:, 4]
+
+        plain = opened(open_mode=mode)
+        answered(plain, target)
+        without = packet_of(plain).axes["d"][:, 4]
+        np.testing.assert_allclose(with_it - without, extra, atol=1e-6)
+
+    def test_in_mode_1_d4_takes_the_place_of_d2_in_the_speed_loop(self) -> None:
+        def current_after(d2: float, d4: float) -> Any:
+            controller = opened(open_mode=1)
+            target = np.array(controller.servo.target)
+            for k in range(3):
+                answered(controller, {1: target + d2 * (k + 1), 2: d2, 4: d4})
+            return packet_of(controller).axes["d"][:, 4]
+
+        with_it, without = current_after(1e-3, 1e-3), current_after(1e-3, 0.0)
+        as_mode_4 = opened()
+        target = np.array(as_mode_4.servo.target)
+        for k in range(3):
+            answered(as_mode_4, {1: target + 1e-3 * (k + 1), 2: 1e-3})
+        np.testing.assert_array_equal(with_it, packet_of(as_mode_4).axes["d"][:, 4])
+        assert np.all(with_it > without)
+
+    def test_a_current_cannot_be_added_beyond_the_limit(self) -> None:
+        controller = opened(open_mode=9)
+        answered(controller, {5: 100.0})
+        limit = small_cell.TABLE["current_limit"]
+        np.testing.assert_allclose(packet_of(controller).axes["d"][:, 4], limit, rtol=1e-6)
+
+    @pytest.mark.parametrize("field", [1, 2])
+    def test_a_number_that_is_none_trips_the_drive(self, field: int) -> None:
+        controller = opened()
+        answered(controller, {1: controller.servo.target} | {field: np.nan})
+        assert packet_of(controller).status[0] == 0
+
+
+class TestWithoutAnAnswer:
+    def test_hold_keeps_the_last_target(self) -> None:
+        controller = opened(missed_replies=10)
+        target = drive_at_speed(controller, speed=0.002)
+        for _ in range(3):
+            packet_of(controller)
+            controller.accept(None)
+        assert controller.phase is Phase.OPEN
+        np.testing.assert_allclose(controller.servo.target, np.float32(target))
+
+    def test_continue_goes_on_at_the_last_velocity_then_ramps_down(self) -> None:
+        controller = opened(missed_replies=4, while_silent="continue", ramp_time=0.1)
+        target = drive_at_speed(controller)
+        targets, reasons = [], []
+        for _ in range(300):
+            packet_of(controller)
+            controller.accept(None)
+            targets.append(controller.servo.target[0])
+            reasons.append(controller.reason)
+        steps = np.diff([target[0], *targets])
+        np.testing.assert_allclose(steps[:4], 0.03, rtol=1e-3)
+        assert np.all(np.diff(steps[4:110]) <= 1e-9)
+        np.testing.assert_allclose(np.diff(steps[5:100]), -0.03 * 0.001 / 0.1, rtol=1e-3)
+        np.testing.assert_array_equal(steps[110:], 0.0)
+        assert reasons[2:5] == ["", *["no valid reply in 4 cycles of open mode"] * 2]
+        # 0.2 s after the ramp the integral parts still unwind
+        assert np.abs(controller.plant.velocity).max() < 1e-3 * small_cell.SPEED[0]
+
+    def test_axes_open_again_only_once_the_ramp_is_over(self) -> None:
+        controller = opened(while_silent="continue", ramp_time=0.2)
+        drive_at_speed(controller)
+        packet_of(controller)
+        controller.accept(None)
+        closed = 0
+        while controller.phase is Phase.CLOSED:
+            packet_of(controller)
+            controller.accept(None)
+            closed += 1
+        assert controller.phase is Phase.OPENING
+        assert closed >= 200
+        assert not any(controller.servo.delta)
+
+    def test_drive_off_takes_the_drive_away_with_the_last_missing_answer(self) -> None:
+        controller = opened(missed_replies=3, while_silent="drive_off")
+        for _ in range(2):
+            assert packet_of(controller).status[0] == 5
+            controller.accept(None)
+        assert answered(controller, {1: controller.servo.target}).status[0] == 5
+        for _ in range(3):
+            assert packet_of(controller).status[0] == 5
+            controller.accept(None)
+        assert packet_of(controller).status[0] == 0
+        assert controller.phase is Phase.TRIPPED
+        for _ in range(200):
+            answered(controller)
+        assert controller.phase is Phase.DRIVE_OFF, "it stays off until somebody switches it on"
+        controller.drive_on()
+        answered(controller)
+        assert controller.phase is Phase.DRIVING_ON
+
+
+class TestLeaving:
+    def test_axes_close_one_after_the_other(self) -> None:
+        controller = opened(closing_cycles=2, closing_stagger=3)
+        answered(controller, {1: controller.servo.target}, status=STATUS_EXIT)
+        modes = [tuple(answered(controller).axes["mode"].tolist()) for _ in range(7)]
+        assert modes == [(4, 4)] * 2 + [(0, 4)] * 3 + [(0, 0)] * 2
+
+    def test_an_axis_that_leaves_by_itself_stays_closed_until_all_open_again(self) -> None:
+        controller = opened()
+        controller.axis_leaves(2)
+        for _ in range(3):
+            received = answered(controller, {1: controller.servo.target})
+            assert received.axes["mode"].tolist() == [4, 0]
+        answered(controller, {1: controller.servo.target}, status=STATUS_EXIT)
+        seen = []
+        for _ in range(30):
+            packet = controller.next_packet()
+            assert packet
+            controller.accept(safe(packet))
+            seen.append(tuple(CyclicPacket.decode(packet, AXES).axes["mode"].tolist()))
+        assert seen == sorted(seen[:7], reverse=True) + sorted(seen[7:])
+        assert seen[-1] == (4, 4)
+
+
+class TestPauses:
+    @pytest.mark.parametrize("mode", [500, 502])
+    def test_every_axis_reports_it_for_so_long_then_closed_axes(self, mode: int) -> None:
+        controller = opened()
+        controller.pause(mode, 5)
+        modes = [tuple(answered(controller).axes["mode"].tolist()) for _ in range(6)]
+        assert modes == [(mode, mode)] * 5 + [(0, 0)]
+
+    def test_without_a_drive_there_is_nothing_to_pause(self) -> None:
+        controller = opened()
+        controller.emergency_stop()
+        controller.pause(502, 5)
+        assert answered(controller).axes["mode"].tolist() == [4, 4]
+        assert controller.phase is Phase.TRIPPED
+
+
+def test_modes_without_a_meaning_are_refused() -> None:
+    for change in ({"open_mode": 3}, {"while_silent": "panic"}, {"arm": 5}, {"ramp_time": 0.0}):
+        with pytest.raises(SettingError):
+            small_cell.controller(**change)
+
+
+FINE = Answer(valid=True)
+SHORT: dict[str, Any] = {
+    "drive_off_cycles": 2,
+    "driving_on_cycles": 3,
+    "closed_cycles": 2,
+    "closing_cycles": 2,
+    "opening_stagger": 2,
+}
+
+
+def program(**changes: Any) -> LoopProgram:
+    return LoopProgram(3, ControllerSettings(**(SHORT | changes)))
+
+
+def advance(loop: LoopProgram, cycles: int = 1, answer: Answer = FINE) -> None:
+    for _ in range(cycles):
+        loop.advance(answer, at_rest=True)
+
+
+def advance_to(loop: LoopProgram, phase: Phase) -> None:
+    for _ in range(100):
+        if loop.phase is phase:
+            return
+        advance(loop)
+    raise AssertionError(f"{phase!r} never came; stuck in {loop.phase!r}")
+
+
+def test_a_warm_start_begins_with_init() -> None:
+    loop = program(cold_start=False)
+    assert loop.start_step is StartStep.INIT
+    advance(loop)
+    assert loop.phase is Phase.DRIVE_OFF
+
+
+def test_an_init_packet_that_nobody_answers_ends_the_session() -> None:
+    loop = program(cold_start=False)
+    advance(loop, answer=MISSING)
+    assert loop.phase is Phase.ENDED
+    assert "init" in loop.reason
+
+
+def test_phases_last_as_long_as_set() -> None:
+    loop = program()
+    advance_to(loop, Phase.DRIVE_OFF)
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
+
+
+def test_one_axis_opens_alone() -> None:
+    """The others stay closed, and the PC has the arm as soon as that axis is open."""
+    loop = program(only_axis=2)
+    advance_to(loop, Phase.OPEN)
+    assert loop.open_axes == [False, True, False]
+    assert loop.intervals == 1
+    with pytest.raises(SettingError, match="only_axis"):
+        program(only_axis=4)
+
+
+def test_axes_open_one_after_the_other() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPENING)
+    seen = []
+    while loop.phase is Phase.OPENING:
+        seen.append(loop.open_axes)
+        advance(loop)
+    assert seen == [
+        [True, False, False],
+        [True, False, False],
+        [True, True, False],
+        [True, True, False],
+        [True, True, True],
+    ]
+    assert loop.phase is Phase.OPEN
+    assert loop.intervals == 1
+
+
+def lose_opening(loop: LoopProgram) -> None:
+    advance_to(loop, Phase.OPENING)
+    while loop.phase is Phase.OPENING:
+        advance(loop, answer=MISSING)
+
+
+def test_after_a_lost_opening_the_axes_stay_closed_for_a_while() -> None:
+    loop = program(reopening_time=0.05)
+    advance_to(loop, Phase.OPENING)
+    assert loop.openings_lost == 0
+    lose_opening(loop)
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.CLOSED] * 50
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, exit=True))
+    phases = []
+    while loop.phase is not Phase.OPENING:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases == [Phase.CLOSING] * 2 + [Phase.CLOSED] * 2
+
+
+def test_after_so_many_lost_openings_in_a_row_the_session_ends_with_a_reason() -> None:
+    loop = program(lost_openings=3)
+    for lost in (1, 2, 3):
+        assert not loop.gave_up
+        lose_opening(loop)
+        assert loop.openings_lost == lost
+    assert loop.gave_up
+    advance_to(loop, Phase.ENDED)
+    assert loop.reason == (
+        "open mode was lost 3 times in a row: no valid reply in 1 cycle of open mode"
+    )
+
+
+def test_openings_that_end_by_508_are_lost_like_any_other() -> None:
+    """With a pause before the next, and an end of the session after so many."""
+    loop = program(lost_openings=3, reopening_time=0.05)
+    for lost in (1, 2, 3):
+        advance_to(loop, Phase.OPEN)
+        advance(loop, answer=Answer(valid=True, following_error=True))
+        assert loop.openings_lost == lost
+        if lost < 3:
+            closed = 0
+            while loop.phase is not Phase.OPENING:
+                closed += 1
+                advance(loop)
+            assert closed == 50
+    assert loop.gave_up
+    assert loop.reason == (
+        "open mode was lost 3 times in a row: the PC reported a following error (508)"
+    )
+
+
+def test_an_opening_that_the_pc_ends_makes_the_lost_ones_forgotten() -> None:
+    loop = program(lost_openings=2)
+    for _ in range(5):
+        lose_opening(loop)
+        advance_to(loop, Phase.OPEN)
+        advance(loop, answer=Answer(valid=True, exit=True))
+        assert loop.openings_lost == 0
+    assert not loop.gave_up
+
+
+def test_finish_does_not_wait_for_the_next_opening() -> None:
+    loop = program(reopening_time=1.0)
+    lose_opening(loop)
+    loop.finish()
+    advance(loop, 3)
+    assert loop.phase is Phase.SHUTDOWN
+
+
+def test_an_emergency_stop_while_giving_up_still_ends_the_session() -> None:
+    loop = program(lost_openings=1)
+    lose_opening(loop)
+    loop.trip("emergency stop")
+    advance_to(loop, Phase.ENDED)
+    assert loop.gave_up
+
+
+def test_replies_missed_before_open_mode_are_told_from_those_in_it() -> None:
+    loop = program(missed_replies=5)
+    advance_to(loop, Phase.CLOSED)
+    while loop.phase is not Phase.OPENING:
+        advance(loop, answer=MISSING)
+    while loop.phase is Phase.OPENING:
+        advance(loop, answer=MISSING)
+    assert loop.reason == "no valid reply in 5 cycles in a row, the last 3 of them in open mode"
+
+
+def test_long_silence_ends_the_session() -> None:
+    loop = program(silence_limit=20)
+    advance_to(loop, Phase.CLOSED)
+    for _ in range(30):
+        advance(loop, answer=MISSING)
+    assert loop.phase is Phase.ENDED
+
+
+def test_a_trip_in_open_mode_drops_the_drive_before_the_modes() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    loop.trip("test")
+    assert not loop.powered
+    assert loop.braked
+    assert all(loop.open_axes)
+    advance(loop, 2)
+    assert loop.phase is Phase.DRIVE_OFF
+    assert not any(loop.open_axes)
+
+
+def test_leaving_while_axes_are_opening_opens_no_further_axis() -> None:
+    for leave in ("trip", "exit"):
+        loop = program()
+        advance_to(loop, Phase.OPENING)
+        if leave == "trip":
+            loop.trip("test")
+        else:
+            advance(loop, answer=Answer(valid=True, exit=True))
+        assert loop.open_axes == [True, False, False]
+        advance(loop, 2)
+        assert not any(loop.open_axes)
+
+
+def test_finish_waits_until_the_arm_stands() -> None:
+    loop = program()
+    advance_to(loop, Phase.OPEN)
+    loop.finish()
+    loop.advance(FINE, at_rest=False)
+    assert loop.phase is Phase.OPEN
+    loop.advance(FINE, at_rest=True)
+    assert loop.phase is Phase.CLOSING
+    phases = []
+    while loop.phase is not Phase.ENDED:
+        phases.append(loop.phase)
+        advance(loop)
+    assert phases[-3:] == [Phase.SHUTDOWN, Phase.SHUTDOWN, Phase.ENDING]
+
+
+def test_the_program_ends_by_itself_after_its_intervals() -> None:
+    loop = program(open_intervals=1)
+    advance_to(loop, Phase.OPEN)
+    advance(loop, answer=Answer(valid=True, exit=True))
+    advance_to(loop, Phase.ENDED)
+    assert loop.intervals == 1
+
+
+def test_finish_in_drive_off_ends_without_driving_on() -> None:
+    loop = program()
+    advance_to(loop, Phase.DRIVE_OFF)
+    loop.finish()
+    advance(loop, 3)
+    assert loop.phase is Phase.ENDED
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"lost_openings": 0},
+        {"reopening_time": -1.0},
+        {"period": 0.0005},
+        {"substeps": 0},
+        {"missed_replies": 0},
+        {"open_mode": 3},
+    ],
+)
+def test_impossible_settings_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(SettingError):
+        ControllerSettings(**change)
