@@ -7,7 +7,6 @@ import pytest
 
 from drivers import (
     AxisLeft,
-    CyclicPacket,
     GapSeen,
     Guard,
     InitReceived,
@@ -44,41 +43,61 @@ from tests.drivers.rig import (
     still,
 )
 
+OFF = "the drive went off"
+PAUSED = "the controller paused the exchange"
+
 
 class TestLostMotion:
-    def test_the_drive_going_off_in_open_mode_ends_the_motion(self):
+    @pytest.mark.parametrize(
+        ("change", "state", "reason"),
+        [
+            ({"status": 0}, State.DRIVE_OFF, OFF),
+            ({"mode": Mode.CLOSED}, State.CLOSED, "the controller closed open mode"),
+            ({"mode": Mode.DRIVING_ON}, State.DRIVING_ON, "the drive was switched on again"),
+            ({"mode": Mode.PAUSE_BY_CONTROLLER}, State.FREEZING, PAUSED),
+            ({"mode": Mode.FOLLOWING_ERROR}, State.FAULTED, ""),
+            ({"mode": Mode.END_OF_SESSION}, State.ENDED, ""),
+        ],
+    )
+    def test_open_mode_going_away_ends_the_motion(self, change, state, reason):
         rig, source = moving()
-        rig.status = 0
-        packet = rig.packet()
-        answer = CyclicPacket.decode(rig.send(packet), N)
-        assert rig.state is State.DRIVE_OFF
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive went off")
-        np.testing.assert_array_equal(answer.axes, CyclicPacket.decode(packet, N).axes)
+        rig.cycle(**change)
+        assert rig.state is state
+        assert rig.ended.outcome == "lost"
+        assert reason in rig.ended.reason
         advances = source.advances
         rig.cycle(5)
         assert source.advances == advances
+
+    @pytest.mark.parametrize(
+        ("waits", "change", "reason"),
+        [
+            (Mode.CLOSED, {"status": 0}, OFF),
+            (Mode.DRIVING_ON, {"status": 0}, OFF),
+            (Mode.CLOSED, {"mode": Mode.DRIVING_ON}, "the drive was switched on again"),
+            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_PC}, PAUSED),
+            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_CONTROLLER}, PAUSED),
+        ],
+    )
+    def test_a_waiting_motion_is_lost_and_another_may_follow(self, waits, change, reason):
+        rig = Rig()
+        rig.session.request(source := Cruise())
+        rig.start()
+        rig.cycle(mode=waits)
+        assert rig.session.requested
+        rig.cycle(**change)
+        assert rig.ended == MotionEnded("lost", reason, -1, rig.ended.cycle)
+        rig.cycle(3, status=5)
+        rig.session.request(still(3))
+        rig.open()
+        rig.run_to("completed")
+        assert source.begun_at is None
 
     def test_a_drive_that_comes_back_in_open_mode_is_switched_off_again(self):
         rig, _ = moving()
         rig.cycle(status=0)
         assert all_drive_off(rig.cycle(status=5))
         assert rig.state is State.FAULTED
-
-    @pytest.mark.parametrize(
-        ("mode", "state"),
-        [
-            (Mode.CLOSED, State.CLOSED),
-            (Mode.DRIVING_ON, State.DRIVING_ON),
-            (Mode.PAUSE_BY_CONTROLLER, State.FREEZING),
-            (Mode.FOLLOWING_ERROR, State.FAULTED),
-            (Mode.END_OF_SESSION, State.ENDED),
-        ],
-    )
-    def test_open_mode_going_away_ends_the_motion(self, mode, state):
-        rig, _ = moving()
-        rig.cycle(mode=mode)
-        assert rig.state is state
-        assert rig.ended.outcome == "lost"
 
     def test_one_axis_leaving_open_mode_while_moving_asks_for_drive_off(self):
         rig, _ = moving()
@@ -136,18 +155,6 @@ class TestLostMotion:
         rig.cycle(mode=pause)
         assert all_drive_off(rig.cycle(mode=Mode.POSITION))
 
-    @pytest.mark.parametrize("pause", [Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER])
-    def test_a_waiting_motion_is_lost_by_a_pause(self, pause):
-        rig = closed()
-        rig.session.request(still(3))
-        rig.cycle(mode=pause)
-        assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
-        assert rig.ended.reason == "the controller paused the exchange"
-        rig.session.request(still(3))
-        rig.cycle(3)
-        rig.open()
-        rig.run_to("completed")
-
     def test_a_motion_asked_for_while_axes_of_the_last_are_open_was_in_no_interval(self):
         rig = running(still(3))
         while rig.session.requested:
@@ -157,28 +164,6 @@ class TestLostMotion:
         rig.session.request(still(3))
         assert all_drive_off(rig.cycle(status=5))
         assert (rig.ended.outcome, rig.ended.interval) == ("lost", -1)
-
-    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.DRIVING_ON])
-    def test_a_waiting_motion_is_lost_when_the_drive_goes_off(self, mode):
-        rig = Rig()
-        source = Cruise()
-        rig.session.request(source)
-        rig.start()
-        rig.cycle(mode=mode)
-        assert rig.session.requested
-        rig.cycle(status=0)
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive went off")
-        rig.status = 5
-        rig.open()
-        rig.cycle(10)
-        assert source.begun_at is None
-
-    def test_a_waiting_motion_is_lost_when_the_drive_is_switched_on_again(self):
-        rig = Rig()
-        rig.session.request(still(3))
-        rig.close()
-        rig.cycle(mode=Mode.DRIVING_ON)
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the drive was switched on again")
 
     def test_a_motion_requested_while_the_drive_is_off_waits_for_it(self):
         rig = closed()

@@ -177,8 +177,6 @@ def test_a_refusal_comes_with_its_flight_recorder(
 
 # --- A motion on a real link that is watched, steered and looked at by a viewer from elsewhere
 
-"""A test asks what happens, not how fast: the controller waits where this machine pauses."""
-
 
 class Person:
     """Slows the motion, holds it, has it go on, holds it again and stops it there."""
