@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Final
 
@@ -99,32 +100,12 @@ class Sources:
                     yield base
 
     def circles(self) -> list[str]:
-        """Groups of modules that import one another (Tarjan's components of more than one)."""
-        index: dict[str, int] = {}
-        low: dict[str, int] = {}
-        stack: list[str] = []
-        found = []
-
-        def visit(name: str) -> None:
-            index[name] = low[name] = len(index)
-            stack.append(name)
-            for other in sorted(self.imports[name]):
-                if other not in index:
-                    visit(other)
-                    low[name] = min(low[name], low[other])
-                elif other in stack:
-                    low[name] = min(low[name], index[other])
-            if low[name] == index[name]:
-                group = [stack.pop()]
-                while group[-1] != name:
-                    group.append(stack.pop())
-                if len(group) > 1:
-                    found.append(", ".join(sorted(group)))
-
-        for name in self.files:
-            if name not in index:
-                visit(name)
-        return found
+        """Modules that import one another, as a way round; one circle at most."""
+        try:
+            TopologicalSorter(self.imports).prepare()
+        except CycleError as error:
+            return [", ".join(error.args[1])]
+        return []
 
     def inner_imports(self) -> list[str]:
         """Imports of ours inside functions."""

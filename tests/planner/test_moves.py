@@ -504,34 +504,14 @@ def bits(motion: PiecewiseCubic) -> bytes:
     return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
 
 
-def rates_of(draw, n: int) -> JointLimits:
-    """Limits of joints of very different nature."""
-    exponents = st.lists(st.floats(-2.0, 1.0), min_size=4, max_size=4)
-    span, velocity, ramp, rise = 10.0 ** np.array([draw(exponents) for _ in range(n)]).T
-    acceleration = velocity / ramp
-    return JointLimits(-span, span, velocity, acceleration, acceleration / rise)
-
-
 @st.composite
 def populations(draw):
-    """Motions that planners stumble over, together: still, microscopic, along limits."""
-    n, count, k = draw(st.integers(1, 6)), draw(st.integers(1, 5)), draw(st.integers(2, 6))
-    limits = rates_of(draw, n)
-    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    points = random.uniform(limits.lower, limits.upper, (count, k, n))
-    for row in points.reshape(-1, n)[1:]:
-        kind = draw(st.sampled_from(["random", "random", "limits", "same", "tiny", "one joint"]))
-        before = points[0, 0]
-        if kind == "limits":
-            row[:] = np.where(random.random(n) < 0.5, limits.lower, limits.upper)
-        elif kind == "same":
-            row[:] = before
-        elif kind == "tiny":
-            row[:] = before * (1.0 - 10.0 ** draw(st.integers(-15, -4)))
-        elif kind == "one joint":
-            row[1:] = before[1:]
-    speed = random.uniform(0.05, 1.0, (count, n))
-    return points, limits, speed, draw(st.sampled_from([0.0, 0.01, 0.07, 0.25, 0.5, 1.0]))
+    """Such routes of one robot, at shares of its speed, for one fly-by."""
+    limits = draw(robots())
+    points = draw(st.lists(routes(limits), min_size=1, max_size=5))
+    speed = [draw(st.lists(shares, min_size=limits.n_joints, max_size=limits.n_joints)) for _ in
+             points]  # fmt: skip
+    return points, limits, np.array(speed), draw(st.sampled_from([0.0, 0.01, 0.07, 0.25, 0.5, 1.0]))
 
 
 class TestPopulation:
@@ -547,9 +527,9 @@ class TestPopulation:
         assert bits(alone) == bits(together[index])
         moves = [
             Move(point, joint_speed=speed[index], fly=FlyPercent(100.0 * fly))
-            for point in points[index, 1:]
+            for point in points[index][1:]
         ]
-        assert bits(plan_moves(points[index, 0], moves, limits).trajectory) == bits(alone)
+        assert bits(plan_moves(points[index][0], moves, limits).trajectory) == bits(alone)
 
     def test_what_cannot_be_planned_is_an_error_in_its_place(self, six_axis_limits, random_points):
         good, outside, unknown = random_points(0), random_points(1), random_points(2)
