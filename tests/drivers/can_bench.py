@@ -31,7 +31,7 @@ from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from sim_fixtures.can_end import CanFarEnd
-from tests.drivers.rig import smooth_move
+from tests.drivers.rig import limits, smooth_move
 from tests.drivers.transport_contract import TransportContract
 
 N = 6
@@ -185,15 +185,8 @@ NS16 = Cell.load(ns16.CELL_PATH)
 
 
 def wide_limits() -> GuardLimits:
-    return GuardLimits(
-        lower=np.full(N, -4.0),
-        upper=np.full(N, 4.0),
-        velocity=np.full(N, 2.0),
-        acceleration=np.full(N, 8.0),
-        jerk=np.full(N, 100.0),
-        following_error=np.full(N, 1.0),
-        current=NS16.drive_train.current_limit,
-    )
+    far, current = np.full(N, 4.0), NS16.drive_train.current_limit
+    return limits(lower=-far, upper=far, following_error=np.ones(N), current=current)
 
 
 def ns16_controller(**settings) -> SimulatedController:

@@ -48,6 +48,21 @@ def drive_train() -> DriveTrain:
     )
 
 
+def train_of(n: int) -> DriveTrain:
+    """An arm of so many joints, each unlike the next."""
+    return DriveTrain(
+        gear_ratio=np.where(np.arange(n) % 3, 1.0, -1.0) * np.linspace(120.0, 60.0, n),
+        calibration=np.linspace(-1.0, 2.0, n),
+        joint_sign=np.where(np.arange(n) % 2, 1.0, -1.0),
+        joint_offset=np.linspace(0.3, -0.2, n),
+        torque_constant=np.ones(n),
+        current_limit=np.full(n, 20.0),
+        k54=0.01 if n >= 6 else 0.0,
+        k64=0.002 if n >= 6 else 0.0,
+        k65=0.03 if n >= 6 else 0.0,
+    )
+
+
 def limits(**changes) -> GuardLimits:
     standard = GuardLimits(
         lower=np.full(N, -2.0),

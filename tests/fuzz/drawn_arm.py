@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from drivers import DriveTrain, GuardLimits, InitPacket
-from tests.drivers.arms_bench import train_of
 from tests.drivers.model_controller import Controller
+from tests.drivers.rig import train_of
 
 CYCLE_MS = 2
 """Of every arm: the tables of motions are made for it, and would be too fast in a shorter one."""
