@@ -37,6 +37,8 @@ from tests.fault_matrix import small_cell
 
 Array = NDArray[np.float64]
 Make = Callable[..., SimulatedController]
+Fields = dict[int, Any]
+"""What is answered: field number 1..5 to values."""
 HOME = np.radians([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
 NOISY = {"current_noise": 0.02, "current_resolution": 0.005}
 QUICK: dict[str, Any] = {"drive_off_cycles": 3, "driving_on_cycles": 4, "closed_cycles": 5}
@@ -59,28 +61,26 @@ def make(drive: SimulatedDrive, truth: PlantTruth) -> Make:
 
 def receive(controller: SimulatedController) -> CyclicPacket:
     packet = controller.next_packet()
-    assert packet is not None
-    return CyclicPacket.decode(packet, 6)
+    assert packet
+    return CyclicPacket.decode(packet, len(controller.plant.position))
 
 
 def answer(
-    received: CyclicPacket,
-    *,
-    status: int = 0,
-    position: Array | None = None,
-    delta: Array | None = None,
-    modes: list[int] | None = None,
+    received: CyclicPacket, fields: Fields | None = None, *, status: int = 0, modes: Any = None
 ) -> bytes:
-    reply = CyclicPacket.zeros(next_number(received.number), 6)
+    """With these fields, or with the target received."""
+    reply = CyclicPacket.zeros(next_number(received.number), len(received.axes))
     reply.axes["mode"] = received.axes["mode"] if modes is None else modes
-    reply.axes["d"][:, 0] = received.axes["d"][:, 0] if position is None else position
-    reply.axes["d"][:, 1] = 0.0 if delta is None else delta
+    for number, values in (fields or {1: received.axes["d"][:, 0]}).items():
+        reply.axes["d"][:, number - 1] = values
     return CyclicPacket(reply.number, bytes((status, 0, 0, 0)), bytes(4), reply.axes).encode()
 
 
-def step(controller: SimulatedController, **reply: Any) -> CyclicPacket:
+def step(
+    controller: SimulatedController, fields: Fields | None = None, **options: Any
+) -> CyclicPacket:
     received = receive(controller)
-    controller.accept(answer(received, **reply))
+    controller.accept(answer(received, fields, **options))
     return received
 
 
@@ -174,7 +174,7 @@ class TestOpenMode:
         run_to(controller, Phase.OPENING)
         before = step(controller).axes["d"][:, 0].copy()
         nudge = np.full(6, 0.001)
-        step(controller, position=before + nudge, modes=[4] * 6)
+        step(controller, {1: before + nudge}, modes=[4] * 6)
         after = receive(controller).axes["d"][:, 0]
         np.testing.assert_allclose(after - before, [0.001, 0, 0, 0, 0, 0], atol=1e-5)
 
@@ -182,7 +182,7 @@ class TestOpenMode:
         controller = make()
         run_to(controller, Phase.OPEN)
         resting = controller.plant.position.copy()
-        step(controller, modes=[505] * 6, position=np.zeros(6))
+        step(controller, {1: 0.0}, modes=[505] * 6)
         after = step(controller)
         assert after.status[0] == 0
         np.testing.assert_array_equal(after.axes["mode"], 0)
@@ -194,7 +194,7 @@ class TestOpenMode:
         controller = make()
         run_to(controller, Phase.OPEN)
         before = receive(controller)
-        controller.accept(answer(before, modes=[4, 4, 508, 4, 4, 4], position=np.zeros(6)))
+        controller.accept(answer(before, {1: 0.0}, modes=[4, 4, 508, 4, 4, 4]))
         after = step(controller)
         assert after.status[0] == 5
         np.testing.assert_array_equal(after.axes["mode"], 0)
@@ -225,7 +225,7 @@ class TestOpenMode:
         far = np.array(controller.servo.target)
         far[2] += 5.0
         for _ in range(3):
-            step(controller, position=far)
+            step(controller, {1: far})
         assert controller.phase is Phase.TRIPPED
         assert "axis 3" in controller.reason
         dropped = step(controller)
@@ -635,30 +635,8 @@ def test_an_arm_without_velocity_limits_does_not_move_by_itself(speed: float) ->
         OwnMotion([(0.0, 0.0)], speed=[1.0, speed], period=PERIOD)
 
 
-AXES = small_cell.AXES
+AXES = small_cell.N
 STATUS_EXIT = 1
-Fields = dict[int, Any]
-"""What is answered: field number 1..5 to values."""
-
-
-def packet_of(controller: SimulatedController, n: int = AXES) -> CyclicPacket:
-    packet = controller.next_packet()
-    assert packet
-    return CyclicPacket.decode(packet, n)
-
-
-def reply_to(received: CyclicPacket, fields: Fields, *, status: int = 0, mode: int | None = None):
-    reply = CyclicPacket.zeros(next_number(received.number), len(received.axes))
-    reply.axes["mode"] = received.axes["mode"] if mode is None else mode
-    for number, values in fields.items():
-        reply.axes["d"][:, number - 1] = values
-    return CyclicPacket(reply.number, bytes((status, 0, 0, 0)), bytes(4), reply.axes).encode()
-
-
-def answered(controller: SimulatedController, fields: Fields | None = None, **options: Any):
-    received = packet_of(controller)
-    controller.accept(reply_to(received, fields or {}, **options))
-    return received
 
 
 def opened(**settings: Any) -> SimulatedController:
@@ -676,7 +654,7 @@ def safe(packet: bytes) -> bytes:
     """Targets back in modes led by the PC, nothing in the others."""
     received = CyclicPacket.decode(packet, AXES)
     led = np.isin(received.axes["mode"], (1, 4, 5, 0))
-    return reply_to(received, {1: np.where(led, received.axes["d"][:, 0], 0.0)})
+    return answer(received, {1: np.where(led, received.axes["d"][:, 0], 0.0)})
 
 
 def drive_at_speed(controller: SimulatedController, speed: float = 0.03, cycles: int = 300):
@@ -685,7 +663,7 @@ def drive_at_speed(controller: SimulatedController, speed: float = 0.03, cycles:
     for k in range(cycles):
         delta = np.array([speed * min(1.0, k / (cycles - 50)), 0.0])
         target = target + delta
-        answered(controller, {1: target, 2: delta})
+        step(controller, {1: target, 2: delta})
     assert controller.phase is Phase.OPEN, controller.reason
     return target
 
@@ -696,8 +674,8 @@ class TestFields:
         controller = opened(open_mode=mode)
         target = np.float32(np.array(controller.servo.target) + 1e-3)
         fields: Fields = {1: target, 2: 1e-3}
-        answered(controller, fields | ({4: 1e-3} if mode == 1 else {}))
-        after = packet_of(controller).axes
+        step(controller, fields | ({4: 1e-3} if mode == 1 else {}))
+        after = receive(controller).axes
         np.testing.assert_array_equal(after["mode"], mode)
         np.testing.assert_array_equal(after["d"][:, 0], target)
         np.testing.assert_array_equal(after["d"][:, 1], np.float32(1e-3))
@@ -705,19 +683,19 @@ class TestFields:
     @pytest.mark.parametrize("mode", [2, 7, 8, 9])
     def test_in_the_others_the_controller_keeps_its_own_target(self, mode: int) -> None:
         controller = opened(open_mode=mode)
-        before = packet_of(controller).axes["d"][:, 0].copy()
+        before = receive(controller).axes["d"][:, 0].copy()
         controller.accept(None)
         controller = opened(open_mode=mode)
         # whatever D1 says in modes 2, 8 and 9; an offset in mode 7 is not reported either
         for _ in range(5):
-            answered(controller, {1: 0.002})
-        np.testing.assert_array_equal(packet_of(controller).axes["d"][:, 0], before)
+            step(controller, {1: 0.002})
+        np.testing.assert_array_equal(receive(controller).axes["d"][:, 0], before)
 
     def test_mode_7_adds_d1_to_the_controllers_own_target(self) -> None:
         controller = opened(open_mode=7)
         own = np.array(controller.servo.target)
         for k in range(200):
-            answered(controller, {1: 0.2 * min(1.0, k / 150)})
+            step(controller, {1: 0.2 * min(1.0, k / 150)})
         np.testing.assert_allclose(controller.servo.target, own + 0.2, atol=1e-7)
         np.testing.assert_allclose(controller.servo.measured, own + 0.2, atol=0.01)
 
@@ -726,8 +704,8 @@ class TestFields:
             controller = opened()
             target = np.array(controller.servo.target)
             for _ in range(20):
-                answered(controller, {1: target} | fields)
-            return packet_of(controller).axes.tobytes()
+                step(controller, {1: target} | fields)
+            return receive(controller).axes.tobytes()
 
         assert run({}) == run({4: 0.01, 5: 1.0})
 
@@ -737,7 +715,7 @@ class TestFields:
         own = np.array(controller.servo.measured)
         speed = np.array([0.004, -0.004])
         for k in range(600):
-            answered(controller, {4: speed * min(1.0, k / 100)})
+            step(controller, {4: speed * min(1.0, k / 100)})
         moved = np.array(controller.servo.measured) - own
         # the position loop pulls back until its demand cancels what is added
         gain = controller.settings.servo.position_gain * controller.period
@@ -746,15 +724,15 @@ class TestFields:
     @pytest.mark.parametrize("mode", [1, 2, 9])
     def test_modes_1_2_and_9_add_d5_to_the_target_current(self, mode: int) -> None:
         controller = opened(open_mode=mode)
-        first = packet_of(controller)
+        first = receive(controller)
         extra = np.array([0.25, -0.125])
         target = {1: first.axes["d"][:, 0]} if mode == 1 else {}
-        controller.accept(reply_to(first, target | {5: extra}))
-        with_it = packet_of(controller).axes["d"][:, 4]
+        controller.accept(answer(first, target | {5: extra}))
+        with_it = receive(controller).axes["d"][:, 4]
 
         plain = opened(open_mode=mode)
-        answered(plain, target)
-        without = packet_of(plain).axes["d"][:, 4]
+        step(plain, target)
+        without = receive(plain).axes["d"][:, 4]
         np.testing.assert_allclose(with_it - without, extra, atol=1e-6)
 
     def test_in_mode_1_d4_takes_the_place_of_d2_in_the_speed_loop(self) -> None:
@@ -762,28 +740,28 @@ class TestFields:
             controller = opened(open_mode=1)
             target = np.array(controller.servo.target)
             for k in range(3):
-                answered(controller, {1: target + d2 * (k + 1), 2: d2, 4: d4})
-            return packet_of(controller).axes["d"][:, 4]
+                step(controller, {1: target + d2 * (k + 1), 2: d2, 4: d4})
+            return receive(controller).axes["d"][:, 4]
 
         with_it, without = current_after(1e-3, 1e-3), current_after(1e-3, 0.0)
         as_mode_4 = opened()
         target = np.array(as_mode_4.servo.target)
         for k in range(3):
-            answered(as_mode_4, {1: target + 1e-3 * (k + 1), 2: 1e-3})
-        np.testing.assert_array_equal(with_it, packet_of(as_mode_4).axes["d"][:, 4])
+            step(as_mode_4, {1: target + 1e-3 * (k + 1), 2: 1e-3})
+        np.testing.assert_array_equal(with_it, receive(as_mode_4).axes["d"][:, 4])
         assert np.all(with_it > without)
 
     def test_a_current_cannot_be_added_beyond_the_limit(self) -> None:
         controller = opened(open_mode=9)
-        answered(controller, {5: 100.0})
+        step(controller, {5: 100.0})
         limit = small_cell.TABLE["current_limit"]
-        np.testing.assert_allclose(packet_of(controller).axes["d"][:, 4], limit, rtol=1e-6)
+        np.testing.assert_allclose(receive(controller).axes["d"][:, 4], limit, rtol=1e-6)
 
     @pytest.mark.parametrize("field", [1, 2])
     def test_a_number_that_is_none_trips_the_drive(self, field: int) -> None:
         controller = opened()
-        answered(controller, {1: controller.servo.target} | {field: np.nan})
-        assert packet_of(controller).status[0] == 0
+        step(controller, {1: controller.servo.target} | {field: np.nan})
+        assert receive(controller).status[0] == 0
 
 
 class TestWithoutAnAnswer:
@@ -791,7 +769,7 @@ class TestWithoutAnAnswer:
         controller = opened(missed_replies=10)
         target = drive_at_speed(controller, speed=0.002)
         for _ in range(3):
-            packet_of(controller)
+            receive(controller)
             controller.accept(None)
         assert controller.phase is Phase.OPEN
         np.testing.assert_allclose(controller.servo.target, np.float32(target))
@@ -801,7 +779,7 @@ class TestWithoutAnAnswer:
         target = drive_at_speed(controller)
         targets, reasons = [], []
         for _ in range(300):
-            packet_of(controller)
+            receive(controller)
             controller.accept(None)
             targets.append(controller.servo.target[0])
             reasons.append(controller.reason)
@@ -817,11 +795,11 @@ class TestWithoutAnAnswer:
     def test_axes_open_again_only_once_the_ramp_is_over(self) -> None:
         controller = opened(while_silent="continue", ramp_time=0.2)
         drive_at_speed(controller)
-        packet_of(controller)
+        receive(controller)
         controller.accept(None)
         closed = 0
         while controller.phase is Phase.CLOSED:
-            packet_of(controller)
+            receive(controller)
             controller.accept(None)
             closed += 1
         assert controller.phase is Phase.OPENING
@@ -831,36 +809,36 @@ class TestWithoutAnAnswer:
     def test_drive_off_takes_the_drive_away_with_the_last_missing_answer(self) -> None:
         controller = opened(missed_replies=3, while_silent="drive_off")
         for _ in range(2):
-            assert packet_of(controller).status[0] == 5
+            assert receive(controller).status[0] == 5
             controller.accept(None)
-        assert answered(controller, {1: controller.servo.target}).status[0] == 5
+        assert step(controller, {1: controller.servo.target}).status[0] == 5
         for _ in range(3):
-            assert packet_of(controller).status[0] == 5
+            assert receive(controller).status[0] == 5
             controller.accept(None)
-        assert packet_of(controller).status[0] == 0
+        assert receive(controller).status[0] == 0
         assert controller.phase is Phase.TRIPPED
         for _ in range(200):
-            answered(controller)
+            step(controller)
         assert controller.phase is Phase.DRIVE_OFF, "it stays off until somebody switches it on"
         controller.drive_on()
-        answered(controller)
+        step(controller)
         assert controller.phase is Phase.DRIVING_ON
 
 
 class TestLeaving:
     def test_axes_close_one_after_the_other(self) -> None:
         controller = opened(closing_cycles=2, closing_stagger=3)
-        answered(controller, {1: controller.servo.target}, status=STATUS_EXIT)
-        modes = [tuple(answered(controller).axes["mode"].tolist()) for _ in range(7)]
+        step(controller, {1: controller.servo.target}, status=STATUS_EXIT)
+        modes = [tuple(step(controller).axes["mode"].tolist()) for _ in range(7)]
         assert modes == [(4, 4)] * 2 + [(0, 4)] * 3 + [(0, 0)] * 2
 
     def test_an_axis_that_leaves_by_itself_stays_closed_until_all_open_again(self) -> None:
         controller = opened()
         controller.axis_leaves(2)
         for _ in range(3):
-            received = answered(controller, {1: controller.servo.target})
+            received = step(controller, {1: controller.servo.target})
             assert received.axes["mode"].tolist() == [4, 0]
-        answered(controller, {1: controller.servo.target}, status=STATUS_EXIT)
+        step(controller, {1: controller.servo.target}, status=STATUS_EXIT)
         seen = []
         for _ in range(30):
             packet = controller.next_packet()
@@ -876,14 +854,14 @@ class TestPauses:
     def test_every_axis_reports_it_for_so_long_then_closed_axes(self, mode: int) -> None:
         controller = opened()
         controller.pause(mode, 5)
-        modes = [tuple(answered(controller).axes["mode"].tolist()) for _ in range(6)]
+        modes = [tuple(step(controller).axes["mode"].tolist()) for _ in range(6)]
         assert modes == [(mode, mode)] * 5 + [(0, 0)]
 
     def test_without_a_drive_there_is_nothing_to_pause(self) -> None:
         controller = opened()
         controller.emergency_stop()
         controller.pause(502, 5)
-        assert answered(controller).axes["mode"].tolist() == [4, 4]
+        assert step(controller).axes["mode"].tolist() == [4, 4]
         assert controller.phase is Phase.TRIPPED
 
 
