@@ -8,19 +8,14 @@ import numpy as np
 import pytest
 
 from drivers import (
-    CycleRing,
-    DriveTrain,
-    Guard,
-    GuardLimits,
     MotionEnded,
     Refused,
-    Session,
     SimulatedTransport,
     exchange,
 )
 from planner import TrajectoryPlayer, plan
 from sim_fixtures import Phase
-from tests.fault_matrix import small_cell
+from tests.fault_matrix import faulty_runs, small_cell
 from tests.fault_matrix.faulty_runs import LIMITS, N
 
 HOME = np.array(small_cell.HOME)
@@ -62,14 +57,8 @@ def run(
     others=frozenset(),
     **settings,
 ):
-    table = {name: np.array(value) for name, value in small_cell.TABLE.items()}
-    limits = GuardLimits(
-        LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk,
-        following_error=np.full(N, small_cell.FOLLOWING_ERROR), current=table["current_limit"],
-    )  # fmt: skip
-    ring = CycleRing(N, 8192)
-    session = Session(
-        DriveTrain(**table), Guard(limits, period), ring, mode=mode, arm=arm, settle_cycles=10,
+    session = faulty_runs.session(
+        following_error=small_cell.FOLLOWING_ERROR, period=period, mode=mode, arm=arm,
         other_axes=others,
     )  # fmt: skip
     controller = small_cell.controller(
@@ -85,7 +74,7 @@ def run(
     assert [end.outcome for end in ends] == ["completed"], ends
     assert controller.phase is Phase.ENDED
     assert controller.rejected_replies == 0
-    return controller, ring.last(8192)
+    return controller, session._ring.last(8192)
 
 
 def move(period: float = 0.001) -> TrajectoryPlayer:

@@ -235,25 +235,19 @@ def motion(start: Array, way: Array, share: float = 1.0) -> TrajectoryPlayer:
     return TrajectoryPlayer(path, PERIOD, LIMITS, start_tolerance=5e-3)
 
 
-def session(current_share: float = 1.0) -> Session:
+def session(
+    current_share: float = 1.0,
+    following_error: float = SESSION_THRESHOLD,
+    period: float = PERIOD,
+    **options: Any,
+) -> Session:
     table: dict[str, Any] = {name: np.array(value) for name, value in small_cell.TABLE.items()}
-    guard = GuardLimits(
-        lower=LIMITS.lower,
-        upper=LIMITS.upper,
-        velocity=LIMITS.velocity,
-        acceleration=LIMITS.acceleration,
-        jerk=LIMITS.jerk,
-        following_error=np.full(N, SESSION_THRESHOLD),
-        current=current_share * table["current_limit"],
-    )
-    return Session(
-        DriveTrain(**table),
-        Guard(guard, PERIOD),
-        CycleRing(N, 8192),
-        max_gap=MAX_GAP,
-        settle_cycles=10,
-        silence_timeout=SILENCE,
-    )
+    limits = GuardLimits(
+        LIMITS.lower, LIMITS.upper, LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk,
+        np.full(N, following_error), current_share * table["current_limit"],
+    )  # fmt: skip
+    ring = CycleRing(N, 8192)
+    return Session(DriveTrain(**table), Guard(limits, period), ring, settle_cycles=10, **options)
 
 
 class Watched:
@@ -301,7 +295,7 @@ class Run:
     cycles: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.session = session(self.current_share)
+        self.session = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
         self.events: list[Any] = []
         self._still_from: int | None = None
         self._still_until: int | None = None

@@ -26,7 +26,7 @@ from hil.campaign import (
     NotRehearsedError,
     Stop,
 )
-from hil.campaign.intervals import START_TOLERANCE
+from hil.campaign.intervals import player_of
 from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
@@ -36,9 +36,10 @@ from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
-from planner import Move, TrajectoryPlayer, plan_moves
+from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
+from tests.hil.test_supervision import spec as spec_of
 
 PATIENT = ("--patience", "2")
 """A test asks what happens, not how fast: the controller waits where this machine pauses."""
@@ -212,11 +213,8 @@ def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
         away = where + 0.6 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
         moves = (Move(away, speed=0.3), Move(where, speed=0.3))
         motion = plan_moves(where, moves, cell.joint_limits).trajectory
-        player = TrajectoryPlayer(
-            motion, cell.period, cell.joint_limits, start_tolerance=START_TOLERANCE
-        )
-        drives = {"drive_train.json": cell.drive_table.model_dump_json().encode()}
-        spec = ArchiveSpec(path, cell.joint_names, cell.period, {"kind": "move"}, drives)
+        player = player_of(cell, motion)
+        spec = spec_of(cell, path)
         person = Person(stop)
         with Viewer(link.live.port) as viewer:
             viewer.subscribe("/hil/cycle", "/hil/events")
@@ -290,7 +288,6 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
 ) -> None:
     """Stop or hold while the archive is created, hold while the motion is handed over."""
     cell = cell.with_link(transport="udp", host="192.0.2.1", bind="127.0.0.1")
-    drives = {"drive_train.json": cell.drive_table.model_dump_json().encode()}
     with loopback_link(cell, options=PATIENT) as link:
         assert link.only_simulated  # though the cell's own host is none of this computer
         where = link.connect(Stop())
@@ -318,10 +315,8 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             monkeypatch.setattr(link, "open_archive", opened)
             monkeypatch.setattr(link.exchange, "submit", asked)
             path = tmp_path / f"{number}.mcap"
-            player = TrajectoryPlayer(
-                motion, cell.period, cell.joint_limits, start_tolerance=START_TOLERANCE
-            )
-            spec = ArchiveSpec(path, cell.joint_names, cell.period, {"kind": "move"}, drives)
+            player = player_of(cell, motion)
+            spec = spec_of(cell, path)
             ended = link.run(player, spec, stop, watch=person)
             assert ended.outcome == "stopped", what
             archive = open_archive(path)
@@ -334,11 +329,9 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
 
         monkeypatch.undo()
         link.view.inits += 1  # as by another init packet, whose limits nobody has seen
-        player = TrajectoryPlayer(
-            motion, cell.period, cell.joint_limits, start_tolerance=START_TOLERANCE
-        )
+        player = player_of(cell, motion)
         path = tmp_path / "anew.mcap"
-        spec = ArchiveSpec(path, cell.joint_names, cell.period, {"kind": "move"}, drives)
+        spec = spec_of(cell, path)
         with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
             link.run(player, spec, Stop())
         told = open_archive(path).outcome

@@ -22,7 +22,7 @@ from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop, live_link
-from hil.campaign.intervals import START_TOLERANCE
+from hil.campaign.intervals import player_of
 from hil.campaign.link import Link
 from hil.campaign.live_link import STALL, ExchangeView, Heartbeat, Standstill
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
@@ -30,7 +30,7 @@ from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_link
 from hil.testing import faulty_link
-from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
+from planner import Move, PiecewiseCubic, plan_moves
 from tests.hil.fast_cell import fast_campaign, fast_cell
 
 
@@ -68,10 +68,7 @@ class WatchedArm:
     def run(
         self, path: Path, watch: Watcher, stop: Stop | None = None, override: float = 1.0
     ) -> MotionEnded:
-        limits = self.cell.joint_limits
-        player = TrajectoryPlayer(
-            self.motion, self.cell.period, limits, start_tolerance=START_TOLERANCE
-        )
+        player = player_of(self.cell, self.motion)
         return self.link.run(
             player, spec(self.cell, path), stop or Stop(), override=override, watch=watch
         )
