@@ -573,12 +573,6 @@ bound_names = st.sampled_from(sorted(FACTORS))
 values = st.floats(allow_nan=True, allow_infinity=True)
 
 
-def of_kind(kind: str) -> CorrectionGuard:
-    checks = CorrectionGuard(Guard(BOUNDS, PERIOD), kind)
-    checks.begin()
-    return checks
-
-
 def profile(jerks, order: int) -> np.ndarray:
     """Joint 3 under a piecewise constant jerk, summed up `order` times, (m, n)."""
     rows = np.array(jerks)[:, None] * np.eye(N)[2]
@@ -606,7 +600,7 @@ def test_what_passes_keeps_the_bounds_by_differences_of_ones_own(jerk_shares, bo
     if data.draw(st.booleans()):
         where = data.draw(st.integers(0, len(rows) - 1)), data.draw(st.integers(0, N - 1))
         rows[where] = data.draw(values)
-    sent = passed(of_kind(kind), rows, bounds)
+    sent = passed(correcting(kind), rows, bounds)
     assert np.isfinite(sent).all()
     from_zero = np.vstack([np.zeros((3, N)), sent])
     highest = {"velocity": (0, 1, 2), "offset": (1, 2, 3)}[kind]
@@ -630,11 +624,11 @@ def test_what_keeps_its_bounds_passes(jerk_shares, bounds):
         # As a position, an offset has the change of that jerk for one: at most twice as much.
         # 60 cycles of the largest jerk stay below the other two bounds only if they are short.
         rows = profile([100.0 * factor_j * share for share in jerk_shares[:25]], 2) * scale
-        assert len(passed(of_kind(kind), rows, bounds)) == len(rows)
+        assert len(passed(correcting(kind), rows, bounds)) == len(rows)
 
 
 def test_wider_bounds_stay_in_force_until_no_difference_reaches_back_to_them():
-    checks = of_kind("velocity")
+    checks = correcting("velocity")
     rows = profile([290.0] * 10, 2)
     for cycle, row in enumerate(rows[:5]):
         checks.check_motion(row, "stop", cycle)
@@ -648,7 +642,7 @@ def test_wider_bounds_stay_in_force_until_no_difference_reaches_back_to_them():
 def test_no_correction_that_is_not_finite_passes(joint, value):
     row = np.zeros(N)
     row[joint] = value
-    checks = of_kind("velocity")
+    checks = correcting("velocity")
     for check in (
         lambda: checks.check_motion(row, "plan", 1),
         lambda: checks.check_current(row, None, 1),
@@ -662,7 +656,7 @@ def test_no_correction_that_is_not_finite_passes(joint, value):
 
 
 def test_the_end_is_judged_by_what_was_sent_last():
-    checks = of_kind("velocity")
+    checks = correcting("velocity")
     checks.check_end(0)
     checks.check_current(np.full(N, 0.1), None, 1)
     with pytest.raises(CorrectionNotEnded):
