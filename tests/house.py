@@ -31,8 +31,8 @@ TARGETS: Final[Mapping[str, int | None]] = {
 CEILINGS: Final[Mapping[str, int]] = {
     "product lines": 89_500,
     "product files": 338,
-    "test lines": 87_800,
-    "test files": 386,
+    "test lines": 84_200,
+    "test files": 350,
     "import circles": 0,
     "imports inside functions": 35,
     "files with one importer": 19,
