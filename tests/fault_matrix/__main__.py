@@ -24,7 +24,7 @@ def expected(first: str) -> dict[str, Outcomes]:
     _, _, text = DOCUMENT.read_text("utf-8").partition(f"| fault | {first} |")
     rest, _, rows = text.partition("\n|---")
     columns = [first, *_cells(rest)]
-    table = {}
+    table: dict[str, Outcomes] = {}
     for line in rows.partition("\n\n")[0].splitlines()[1:]:
         fault, *cells = _cells(line)
         outcomes = (tuple(cell.split(" / ")) for cell in cells)

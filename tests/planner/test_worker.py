@@ -248,7 +248,7 @@ def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits,
 def test_ctrl_c_ends_a_search_and_its_workers():
     script = """
 import numpy as np
-from planner import WorkerProcess, map_in_children
+from planner.worker import WorkerProcess, map_in_children
 with WorkerProcess() as one, WorkerProcess() as other:
     print(*(child.call(__import__("os").getpid) for child in (one, other)), flush=True)
     map_in_children([one, other], np.negative, [[k] for k in range(10**7)], lambda k: (k,))
