@@ -71,8 +71,6 @@ LONG: Final = (
     "hil/test_testing_plugin.py",
     "hil/test_view.py",
     "hil/test_viewers.py",
-    "identification/test_calibration.py",
-    "identification/test_causes.py",
     "identification/test_gains.py",
     "identification/test_instrumental.py",
     "identification/test_low_passes.py",

@@ -20,7 +20,7 @@ out; :func:`compare` says how much torque that is, after it has read the text ba
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
@@ -328,55 +328,49 @@ def random_states(arm: Arm, count: int = STATES) -> Motion:
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 
 
+def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array, bool]]:
+    """Yield words, torque (m, n) and whether the format has room for it, of each part.
+
+    Dry friction that the format has room for is left to :func:`_dry`.
+    """
+    model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
+    yield "the links", _rigid(arm, motion), True
+    for kind in model.friction.kinds:
+        if kind not in _DRY or kind not in form.friction:
+            of_kind = [isinstance(one.term, kind) and not one.motor for one in terms]
+            yield kind.words, _friction(arm, motion, of_kind), kind in form.friction
+    diagonal = np.diag(np.diag(arm.rotors))
+    motors = [one.motor and not (form.rotors and isinstance(one.term, _DRY)) for one in terms]
+    yield "rotor inertias", qdd @ diagonal, form.rotors
+    yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.rotors
+    yield "friction of coupled motors", _friction(arm, motion, motors), form.rotors
+    yield "the payload", model.load_torque(*motion[1:4]) - model.elements.known(q), form.payload
+    for one in model.elements.placed:
+        torque, own = np.zeros(q.shape), arm.values[model.element_part][one.part]
+        torque[:, one.joint] = one.columns(q) @ own + one.known(q)
+        room = form.springs and isinstance(one.element, TorsionSpring)
+        yield f"{type(one.element).__name__} of {one.element.joint}", torque, room
+
+
 def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     """Return the torque (m, n) of each part of the model that a format has no place for."""
-    model, q, qdd = arm.model, motion.position, motion.acceleration
-    own = model.friction.kinds
-    left = {}
-    for kind in own:
-        if kind not in form.friction:
-            of_kind = [isinstance(t.term, kind) and not t.motor for t in model.friction.terms]
-            left[kind.words] = _friction(arm, motion, of_kind)
+    model, left = arm.model, dict[str, Array]()
+    for words, torque, room in _parts(form, arm, motion):
+        if not room:
+            left[words] = left.get(words, 0.0) + torque
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
-    rounded = model.torque(base, *motion[1:]) - _rigid(arm, motion) - qdd @ arm.rotors
-    if np.abs(rounded).max() > AGREES * np.abs(model.torque(base, *motion[1:])).max():
+    whole = model.torque(base, *motion[1:])
+    rounded = whole - _rigid(arm, motion) - motion.acceleration @ arm.rotors
+    if np.abs(rounded).max() > AGREES * np.abs(whole).max():
         left["what rounded angles of the URDF make of the base parameters"] = rounded
-    if not form.rotors:
-        diagonal = np.diag(arm.rotors)
-        left["rotor inertias"] = qdd * diagonal
-        left["inertia of coupled motors"] = qdd @ (arm.rotors - np.diag(diagonal))
-        motors = [term.motor for term in model.friction.terms]
-        left["friction of coupled motors"] = _friction(arm, motion, motors)
-    if not form.payload:
-        left["the payload"] = model.load_torque(*motion[1:4]) - model.elements.known(q)
-    for one in model.elements.placed:
-        if not (form.springs and isinstance(one.element, TorsionSpring)):
-            words = f"{type(one.element).__name__} of {one.element.joint}"
-            left.setdefault(words, np.zeros(q.shape))[:, one.joint] += one.columns(q) @ arm.values[
-                model.element_part
-            ][one.part] + one.known(q)
     return left
 
 
 def _said(form: Format, arm: Arm, motion: Motion) -> Array:
     """Return the torque (m, n) of what a format has room for, without dry friction."""
-    smooth = tuple(kind for kind in form.friction if kind not in _DRY)
-    model = arm.model
-    torque = _rigid(arm, motion) + motion.acceleration @ arm.rotors * form.rotors
-    terms = [
-        isinstance(one.term, smooth) and (form.rotors or not one.motor)
-        for one in model.friction.terms
-    ]
-    torque += _friction(arm, motion, terms)
-    if form.payload:
-        known = model.elements.known(motion.position)
-        torque += model.load_torque(*motion[1:4]) - known
-    if form.springs:
-        for joint in range(model.n_joints):
-            stiffness, rest = arm.spring(joint)
-            torque[:, joint] += stiffness * (motion.position[:, joint] - rest)
-    return torque
+    parts = [torque for _, torque, room in _parts(form, arm, motion) if room]
+    return np.asarray(np.sum(parts, axis=0))
 
 
 def _rigid(arm: Arm, motion: Motion) -> Array:

@@ -40,14 +40,9 @@ class FrictionCurve(NamedTuple):
 def friction_curve(
     model: RobotModel, values: Array, joint: int, low: float, high: float
 ) -> FrictionCurve:
-    """Return the curve of a joint, from 0, for parameters (p,) and speeds from low to high.
+    """Return the curve of a joint, from 0, for parameters (p,).
 
-    Args:
-        model: the robot.
-        values: its parameters.
-        joint: which.
-        low: lowest speed [rad/s or m/s], at most zero.
-        high: highest speed, at least zero.
+    Speeds reach from `low`, at most zero, to `high`, at least zero [rad/s or m/s].
     """
     law = model.friction.laws[joint]
     table = model.friction.table(values[model.friction_part])
@@ -57,21 +52,17 @@ def friction_curve(
     steps[0] = 1e-6 * steps[1]
     speed = np.concatenate([low * steps[::-1], high * steps])
     sliding = coefficients @ law.columns(speed, law.sign(speed))
-    if law.presliding == 0.0:
-        nothing = np.full(TRAVELS, np.nan)
-        return FrictionCurve(speed, sliding, nothing, nothing)
-    travel = np.linspace(0.0, _TURNED * law.presliding, TRAVELS)
-    state = 1.0 - 2.0 * np.exp(-travel / law.presliding)
-    turning = coefficients @ law.columns(np.zeros(TRAVELS), state)
+    share = np.linspace(0.0, _TURNED, TRAVELS)  # of the presliding displacement
+    travel = share * (law.presliding or np.nan)
+    state = np.where(np.isnan(travel), np.nan, 1.0 - 2.0 * np.exp(-share))
+    turning = coefficients @ law.columns(np.zeros(TRAVELS), state) + 0.0 * travel
     return FrictionCurve(speed, sliding, travel, turning)
 
 
 def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array:
     """Measured torque (m, n) less what parameters (p,) predict without the joints' friction."""
     without = values.copy()
-    for index, term in enumerate(model.friction.terms, model.base.rank):
-        if not term.motor:
-            without[index] = 0.0
+    without[model.friction_part] *= [term.motor for term in model.friction.terms]
     return samples.torque - samples.predicted_torque(model, without)
 
 

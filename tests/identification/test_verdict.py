@@ -503,20 +503,22 @@ class TestCausesOfWholeRecordings:
 class TestCausesOfParts:
     """What is wrong in some of the recordings only."""
 
-    def test_a_load_in_the_second_half_is_weighed(self, model: RobotModel) -> None:
-        load = LOAD * (np.arange(1250) >= 625)
-        (cause,) = causes(model, [recorded(model, 1, load)])
-        assert cause.fault.kind == "payload"
-        assert cause.fault.part is not None
-        assert cause.fault.part.words == "0.mcap from 5 s on"
-        assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
-
-    def test_load_in_two_of_four_recordings(self, model: RobotModel) -> None:
-        load = np.full(1250, LOAD)
-        runs = [recorded(model, k, load if k in (1, 3) else None) for k in range(4)]
+    @pytest.mark.parametrize(
+        ("seeds", "loaded", "words"),
+        [((1,), 0.5, "0.mcap from 5 s on"), (range(4), (1, 3), "1.mcap, 3.mcap")],
+    )
+    def test_a_load_is_weighed(
+        self, model: RobotModel, seeds: Sequence[int], loaded: Any, words: str
+    ) -> None:
+        """In the second half of one recording, or in two of four."""
+        if loaded == 0.5:
+            runs = [recorded(model, 1, LOAD * (np.arange(1250) >= 625))]
+        else:
+            load = np.full(1250, LOAD)
+            runs = [recorded(model, k, load if k in loaded else None) for k in seeds]
         (cause,) = causes(model, runs)
         assert cause.fault.kind == "payload"
-        assert cause.fault.part is not None and cause.fault.part.words == "1.mcap, 3.mcap"
+        assert cause.fault.part is not None and cause.fault.part.words == words
         assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
 
     def test_friction_of_one_recording(self, model: RobotModel) -> None:
