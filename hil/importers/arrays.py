@@ -29,9 +29,6 @@ from hil.reading import opened, text_of
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 
-MOST_BYTES: Final = 4 << 30
-"""Of messages that become arrays, all topics together."""
-
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
@@ -46,7 +43,6 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
     layouts: dict[str, MessageLayout] = {}
     found: dict[str, list[tuple[int, bytes]]] = {}
-    held_bytes = 0
     for name, stamp, data in mcap_messages.messages(path, known.keys() - refused.keys()):
         if name in refused:
             continue
@@ -63,13 +59,6 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
             found.pop(name, None)
             continue
         found.setdefault(name, []).append((stamp, data[:size]))
-        held_bytes += size
-        if held_bytes > MOST_BYTES:
-            raise SourceError(
-                path,
-                f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
-                remedy="cut it, or leave out topics (`mcap filter`)",
-            )
     arrays: dict[str, NDArray[Any]] = {}
     for name, messages in found.items():
         try:

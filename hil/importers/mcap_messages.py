@@ -3,45 +3,27 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
-from mcap.reader import McapReader, NonSeekingReader, SeekingReader, make_reader
+from isal.isal_zlib import crc32
 from mcap.records import Channel, Schema
 
 from hil.archive import container
+from hil.archive.container import Damage, Record
 from hil.errors import SourceError
 from hil.reading import opened
 
 LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usual are one to sixteen million."""
-
-
-def check_sizes(stream: BinaryIO) -> None:
-    """Go through the chunks of a file, which is at its beginning afterwards.
-
-    Raises:
-        Damage: it is cut off, or a chunk is not of the size that it claims, or too large.
-        ValueError: the index lists what is no chunk, or one twice.
-        Exception: what the readers of the index say of bytes that are none.
-    """
-    size = stream.seek(0, os.SEEK_END)
-    stream.seek(0)
-    begun = set()
-    for record in container.records(stream, size, only=(container.CHUNK,), check_end=False):
-        head = container.chunk(record)
-        container.decompressed(head, record.offset, largest=LARGEST_CHUNK)
-        begun.add(record.offset)
-    stream.seek(0)
-    summary = make_reader(stream).get_summary()
-    offsets = [index.chunk_start_offset for index in summary.chunk_indexes] if summary else []
-    if len(set(offsets)) != len(offsets) or not begun.issuperset(offsets):
-        raise ValueError("its index does not fit its chunks")
-    stream.seek(0)
-
+MOST_BYTES: Final = 4 << 30
+"""Of messages that are read, all topics together."""
+_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_READ: Final = (container.SCHEMA, container.CHANNEL, container.MESSAGE, container.CHUNK)
 
 JOINT_STATES = frozenset({"sensor_msgs/msg/JointState", "sensor_msgs/JointState"})
 """Names of the type that ROS 2 has for joint states."""
@@ -78,67 +60,80 @@ def topics(path: Path) -> dict[str, Topic]:
     Raises:
         SourceError: it cannot be read, is no MCAP file or is cut off.
     """
+    schemas: dict[int, Schema] = {}
+    found: dict[str, Topic] = {}
     with _opened(path) as stream:
-        check_sizes(stream)
-        summary = make_reader(stream).get_summary()
-        if summary is not None and summary.channels:
-            channels = [(summary.schemas.get(c.schema_id), c) for c in summary.channels.values()]
-        else:
-            channels = _scanned(stream)
-    return {channel.topic: _topic(schema, channel) for schema, channel in channels}
+        for record in _records(stream):
+            if record.opcode == container.SCHEMA:
+                schema = container.item(record)
+                schemas.setdefault(schema.id, schema)
+            elif record.opcode == container.CHANNEL:
+                channel: Channel = container.item(record)
+                kind = schemas.get(channel.schema_id, Schema(0, b"", "", "without schema"))
+                topic = Topic(kind.name, channel.message_encoding, kind.encoding, kind.data)
+                found.setdefault(channel.topic, topic)
+    return found
 
 
 def messages(path: Path, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
     """Topic, log time [ns] and data of messages of some topics, by their time.
 
     Raises:
-        SourceError: the file cannot be read or is cut off.
+        SourceError: the file cannot be read, is cut off, or holds too many bytes of them.
     """
+    names: dict[int, str] = {}
+    found: list[tuple[str, int, bytes]] = []
+    held_bytes = 0
     with _opened(path) as stream:
-        check_sizes(stream)
-        for _, channel, message in _reader(stream).iter_messages(wanted):
-            yield channel.topic, message.log_time, message.data
+        for record in _records(stream):
+            if record.opcode == container.CHANNEL:
+                channel: Channel = container.item(record)
+                names.setdefault(channel.id, channel.topic)
+            elif record.opcode == container.MESSAGE:
+                number, _, log_time, _ = _HEAD.unpack_from(record.body)
+                if names[number] in wanted:
+                    found.append((names[number], log_time, record.body[_HEAD.size :]))
+                    held_bytes += len(record.body)
+            if held_bytes > MOST_BYTES:
+                raise SourceError(
+                    path,
+                    f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
+                    remedy="cut it, or leave out topics (`mcap filter`)",
+                )
+    yield from sorted(found, key=lambda message: message[1])
 
 
-def _reader(stream: BinaryIO) -> McapReader:
-    """One that goes by the index, or one that goes through the file where the index is not whole.
+def _records(stream: BinaryIO) -> Iterator[Record]:
+    """Schemas, channels and messages in the order of the file, those in chunks as well.
 
-    The latter keeps all messages that are wanted in memory, to put them in order.
+    Raises:
+        Damage: it is cut off, or a chunk is not what it claims to be, or too large.
     """
-    summary = make_reader(stream).get_summary()
-    stream.seek(0)
-    if summary is not None and summary.channels and summary.chunk_indexes:
-        return SeekingReader(stream, validate_crcs=True)
-    return NonSeekingReader(stream, validate_crcs=True)
-
-
-def _scanned(stream: BinaryIO) -> list[tuple[Schema | None, Channel]]:
-    """The channels of a file without index that have messages."""
-    stream.seek(0)
-    found: dict[int, tuple[Schema | None, Channel]] = {}
-    for schema, channel, _ in NonSeekingReader(stream).iter_messages(log_time_order=False):
-        found.setdefault(channel.id, (schema, channel))
-    return list(found.values())
-
-
-def _topic(schema: Schema | None, channel: Channel) -> Topic:
-    if schema is None:
-        return Topic("without schema", channel.message_encoding)
-    return Topic(schema.name, channel.message_encoding, schema.encoding, schema.data)
+    size = os.fstat(stream.fileno()).st_size
+    for record in container.records(stream, size, only=_READ):
+        if record.opcode != container.CHUNK:
+            yield record
+            continue
+        head = container.chunk(record)
+        data = container.decompressed(head, record.offset, largest=LARGEST_CHUNK)
+        if head.uncompressed_crc and crc32(data) != head.uncompressed_crc:
+            raise Damage(record.offset, "(chunk) fails its checksum")
+        yield from container.split(data, record.offset)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """The file; whatever the readers say of it becomes our error."""
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """The file; whatever reading it says becomes our error."""
     try:
         with opened(path) as stream:
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # nobody lists what the readers raise for bytes that are no MCAP
+    except (Damage, KeyError, struct.error) as error:
+        place = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
         raise SourceError(
             path,
-            f"is no MCAP file, or cut off ({type(error).__name__}: {error})",
+            f"is no MCAP file, or cut off ({place}{type(error).__name__}: {error})",
             remedy="recover it first (`hil archive repair` for archives of hil, `mcap recover` "
             "for others)",
         ) from error

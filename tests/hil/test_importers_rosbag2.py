@@ -31,9 +31,9 @@ from hil.errors import InputError, SourceError
 from hil.importers import (
     ColumnMap,
     Robot,
-    arrays,
     import_log,
     import_rosbag2,
+    mcap_messages,
     recorded_joints,
     rosbag2,
 )
@@ -802,18 +802,25 @@ class TestMcap:
     def test_more_numbers_than_fit_into_memory(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(arrays, "MOST_BYTES", 600)
+        monkeypatch.setattr(mcap_messages, "MOST_BYTES", 600)
         path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
         with pytest.raises(SourceError, match="too large to be read at once"):
             read_mcap(path)
 
-    def test_an_index_that_points_elsewhere(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("checked", [True, False])
+    def test_an_index_that_points_elsewhere(self, checked: bool, tmp_path: Path) -> None:
+        """Refused where the summary has a checksum; nothing is found by it in any case."""
         path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
-        data = path.read_bytes()
+        data = bytearray(path.read_bytes())
         with path.open("rb") as stream:
             records = list(container.records(stream, len(data)))
         first = next(record for record in records if record.opcode == container.CHUNK)
-        entry = data.rindex(struct.pack("<Q", first.offset))
-        path.write_bytes(data[:entry] + struct.pack("<Q", 17) + data[entry + 8 :])
-        with pytest.raises(SourceError, match="index does not fit"):
-            read_mcap(path)
+        struct.pack_into("<Q", data, data.rindex(struct.pack("<Q", first.offset)), 17)
+        if not checked:
+            struct.pack_into("<I", data, len(data) - len(container.MAGIC) - 4, 0)
+        path.write_bytes(data)
+        if checked:
+            with pytest.raises(SourceError, match="fails its checksum"):
+                read_mcap(path)
+        else:
+            assert read_mcap(path)["/a/x"].tolist() == list(range(100))
