@@ -164,8 +164,7 @@ class TestRoundTrip:
         }
 
     def test_an_archive_without_a_cycle_is_whole_all_the_same(self, tmp_path):
-        write(tmp_path / NAME, records(0))
-        archive = open_archive(tmp_path / NAME)
+        archive = open_archive(write(tmp_path / NAME, records(0)))
         assert archive.complete
         assert archive.n_samples == 0
 
@@ -285,19 +284,18 @@ class TestBadInput:
             writer(tmp_path / NAME)
         assert (tmp_path / NAME).read_bytes() == b"precious"
 
-    def test_a_missing_folder_is_named(self, tmp_path):
-        with pytest.raises(ArchiveWriteError, match=r"nowhere.*cannot be created: No such file"):
-            writer(tmp_path / "nowhere" / NAME)
-
-    def test_metadata_must_not_contradict_the_name(self, tmp_path):
-        sentence = "kind is 'validation', but the file name says 'excitation'"
+    @pytest.mark.parametrize(
+        ("name", "metadata", "sentence"),
+        [
+            (f"nowhere/{NAME}", {}, r"nowhere.*cannot be created: No such file"),
+            (NAME, {"kind": "validation"}, "'validation', but the file name says 'excitation'"),
+            ("x.mcap", {}, "None is no kind of archive; use standstill"),
+        ],
+    )
+    def test_what_cannot_begin_leaves_no_file(self, tmp_path, name, metadata, sentence):
         with pytest.raises(ArchiveWriteError, match=sentence):
-            writer(tmp_path / NAME, metadata={"kind": "validation"})
-        assert not (tmp_path / NAME).exists()
-
-    def test_a_file_of_another_name_needs_a_kind(self, tmp_path):
-        with pytest.raises(ArchiveWriteError, match="None is no kind of archive; use standstill"):
-            writer(tmp_path / "x.mcap")
+            writer(tmp_path / name, metadata=metadata)
+        assert not (tmp_path / name).exists()
 
     def test_records_of_another_arm_are_refused(self, tmp_path):
         with writer(tmp_path / NAME) as archive, pytest.raises(ValueError, match="expected"):

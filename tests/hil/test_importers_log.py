@@ -351,32 +351,26 @@ class TestMapFile:
         assert loaded.drive.coupling == ((2, 1, 32.0),)
         assert loaded.position.side == "motor"
 
+    RATE = "sample_rate = 5\n"
+    POSITION = "[position]\ncolumns = 'q{}'\n"
+    COUPLED = "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n"
+
     @pytest.mark.parametrize(
         ("text", "sentence"),
         [
-            ("sample_rate = 5\n", "position: is missing"),
-            ("[position]\ncolumns = 'q{}'\n", "either a time column or sample_rate"),
-            ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nunit = 'inch'\n", "'inch' is no unit"),
-            ("sample_rate = 5\n[position]\ncolumn = 'q{}'\n", "position.column"),
-            (
-                "sample_rate = -5\n[position]\ncolumns = 'q{}'\n",
-                "sample_rate: must be a number",
-            ),
-            (
-                "sample_rate = 5\n[position]\ncolumns = 'q{}'\nside = 'motor'\n",
-                "drive.gear_ratio is needed",
-            ),
-            ("sample_rate = 5\n[position]\ncolumns = -1\n", "position.columns: must be a name"),
-            ("sample_rate = 5\n[position]\nscale = 'x'\n", "position.scale: must be a number"),
-            ("sample_rate = 5\nposition = 3\n", "position: must be a table"),
-            ("sample_rate = 5\n[position]\nfiles = 3\n", "position.files: must be a name with"),
+            (RATE, "position: is missing"),
+            (POSITION, "either a time column or sample_rate"),
+            (f"{RATE}{POSITION}unit = 'inch'\n", "'inch' is no unit"),
+            (f"{RATE}[position]\ncolumn = 'q{{}}'\n", "position.column"),
+            (f"sample_rate = -5\n{POSITION}", "sample_rate: must be a number"),
+            (f"{RATE}{POSITION}side = 'motor'\n", "drive.gear_ratio is needed"),
+            (f"{RATE}[position]\ncolumns = -1\n", "position.columns: must be a name"),
+            (f"{RATE}[position]\nscale = 'x'\n", "position.scale: must be a number"),
+            (f"{RATE}position = 3\n", "position: must be a table"),
+            (f"{RATE}[position]\nfiles = 3\n", "position.files: must be a name with"),
             ("sample_rate = \n", "cannot be read"),
-            ("sample_rate = 5\n[position]\ncolumns = 'q{}'\nscale = 0.0\n", "position.scale"),
-            (
-                "sample_rate = 5\n[position]\ncolumns = 'q{}'\n"
-                "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n",
-                "another joint",
-            ),
+            (f"{RATE}{POSITION}scale = 0.0\n", "position.scale"),
+            (f"{RATE}{POSITION}{COUPLED}", "another joint"),
         ],
     )
     def test_a_bad_one_is_refused_by_field(self, tmp_path, text, sentence):
