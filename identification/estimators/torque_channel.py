@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, NamedTuple, Self
+from typing import Final
 
 import numpy as np
 import scipy
@@ -35,20 +35,6 @@ _WORTHWHILE: Final = 0.05
 _COARSE: Final = 4.0
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
 _SHORTEST: Final = 12  # samples
-
-
-class LowPassFit(NamedTuple):
-    """The low-pass of one shape that fits best.
-
-    Attributes:
-        misfit: mean over the joints of the log of the residual's standard deviation.
-        bandwidth: [Hz].
-        shape: how it falls off.
-    """
-
-    misfit: float
-    bandwidth: float
-    shape: LowPassShape
 
 
 def torque_noiseless_above(recording: Recording) -> float | None:
@@ -85,27 +71,22 @@ def possible_low_passes(
             options if left out.
     """
     still = options.torque_delay if undelayed is None else undelayed
-    wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH)
+    wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH, torque_bandwidth=None)
     channels = {
         delay: _Channel.of(recording, model, noise_variance, replace(wide, torque_delay=delay))
         for delay in {still, options.torque_delay}
     }
     # What a delay by itself explains as well is no low-pass.
-    unfiltered = min(float(np.nanmean(one.log_residuals())) for one in channels.values())
-    enough = unfiltered + math.log(1.0 - _WORTHWHILE)
+    enough = min(one.misfit() for one in channels.values()) + math.log(1.0 - _WORTHWHILE)
     found = []
     for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
-        fits = [(channels[delay].best(shape), delay) for delay in delays for shape in shapes]
-        fits = [one for one in fits if one[0].misfit < enough]
-        if fits:
-            fit, delay = min(fits, key=lambda one: one[0].misfit)
+        fits = [
+            (*channels[delay].best(shape), delay, shape) for delay in delays for shape in shapes
+        ]
+        misfit, width, delay, shape = min(fits, key=lambda one: one[0])
+        if misfit < enough:
             found.append(
-                replace(
-                    options,
-                    torque_delay=delay,
-                    torque_bandwidth=fit.bandwidth,
-                    torque_shape=fit.shape,
-                )
+                replace(options, torque_delay=delay, torque_bandwidth=width, torque_shape=shape)
             )
     return tuple(found)
 
@@ -119,7 +100,6 @@ class _Channel:
         time: (m,) [s].
         segments: stretches without a gap.
         blocks: per joint the columns of its row and, last, the torque of known loads (m, c + 1).
-        columns: parameters that the columns belong to.
         torque: recorded (m, n).
         usable: (m, n).
     """
@@ -128,7 +108,6 @@ class _Channel:
     time: Array
     segments: tuple[slice, ...]
     blocks: tuple[Array, ...]
-    columns: Sequence[NDArray[np.intp]]
     torque: Array
     usable: NDArray[np.bool_]
 
@@ -139,81 +118,70 @@ class _Channel:
         model: RobotModel,
         noise_variance: Array | None,
         options: Preprocessing,
-    ) -> Self:
-        unfiltered = replace(options, torque_bandwidth=None)
-        samples = prepare(recording, model, noise_variance=noise_variance, options=unfiltered)
+    ) -> _Channel:
+        samples = prepare(recording, model, noise_variance=noise_variance, options=options)
         # The ends that the narrowest filter knows badly count for none.
         usable = samples.usable & ~torn_rows(recording, LONGEST_END)[:, None]
-        load = np.zeros_like(samples.torque)
-        if model.has_load:
-            load = model.load_torque(*samples.motion[1:4])
-        regressor = samples.regressor(model)
+        load = samples.known_torque(model)
         every = max(1, round(1.0 / (_RATE * float(np.median(np.diff(recording.time))))))
-        average, segments = _averaging(samples.segments, every)
+        counts = [(one.stop - one.start) // every for one in samples.segments]
+        lasting = [
+            (one.start, count)
+            for one, count in zip(samples.segments, counts, strict=True)
+            if count >= _SHORTEST
+        ]
+
+        def average(values: Array) -> Array:
+            """Mean of so many rows each: the same for torque and regressor, as a filter is."""
+            parts = [
+                values[start : start + count * every].reshape(count, every, *values.shape[1:])
+                for start, count in lasting
+            ]
+            return np.concatenate([part.mean(axis=1) for part in parts])
+
+        edges = np.cumsum([0, *(count for _, count in lasting)]).tolist()
         return cls(
             model=model,
             time=average(recording.time),
-            segments=segments,
+            segments=tuple(slice(a, b) for a, b in pairwise(edges)),
             blocks=tuple(
-                average(np.column_stack([block, load[:, joint]]))
-                for joint, block in enumerate(regressor.blocks)
+                average(np.column_stack([block, own]))
+                for block, own in zip(samples.regressor(model).blocks, load.T, strict=True)
             ),
-            columns=regressor.columns,
             torque=average(samples.torque + load),
             usable=average(usable.astype(np.float64)) == 1.0,
         )
 
-    def log_residuals(
-        self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER
-    ) -> Array:
-        """Log of the residual's standard deviation per joint (n,), NaN where one never moves."""
-        factor = Factor.zero(self.model)
-        for joint, (block, used) in enumerate(zip(self.blocks, self.columns, strict=True)):
-            rows, seen = self.usable[:, joint], block
-            if bandwidth is not None:
-                parts = [(self.time[one], block[one]) for one in self.segments]
-                seen = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
-            table = np.column_stack([seen[:, :-1], self.torque[:, joint] - seen[:, -1]])[rows]
-            index = np.append(used, self.model.n_parameters)
-            factor.gram[joint][np.ix_(index, index)] = table.T @ table
-            factor.samples[joint] = np.count_nonzero(rows)
-        return np.asarray(np.log(estimate(self.model, factor).noise_std))
+    def misfit(self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER) -> float:
+        """Mean log of the joints' residual standard deviations, of those that move."""
 
-    def best(self, shape: LowPassShape) -> LowPassFit:
-        """The bandwidth with which a shape fits best."""
+        def rows() -> Iterator[list[Array]]:
+            tables = []
+            for joint, block in enumerate(self.blocks):
+                if bandwidth is not None:
+                    parts = [(self.time[one], block[one]) for one in self.segments]
+                    block = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
+                table = np.column_stack([block[:, :-1], self.torque[:, joint] - block[:, -1]])
+                tables.append(table[self.usable[:, joint]].T)
+            yield tables
+
+        count = np.count_nonzero(self.usable, axis=0)
+        found = estimate(self.model, Factor.from_blocks(self.model, rows(), count))
+        return float(np.nanmean(np.log(found.noise_std)))
+
+    def best(self, shape: LowPassShape) -> tuple[float, float]:
+        """Misfit with a shape, and the bandwidth [Hz] with which it fits best."""
 
         def misfit(log_bandwidth: float) -> float:
-            return float(np.nanmean(self.log_residuals(math.exp(log_bandwidth), shape)))
+            return self.misfit(math.exp(log_bandwidth), shape)
 
         highest = 0.25 / float(np.median(np.diff(self.time)))
         ends = np.log(LOWEST_BANDWIDTH), np.log(max(highest, 2.0 * LOWEST_BANDWIDTH))
         count = max(4, round(_COARSE * (ends[1] - ends[0]) / np.log(10.0)) + 1)
         grid = np.linspace(*ends, count)
-        coarse = [misfit(point) for point in grid]
-        best = int(np.argmin(coarse))
+        best = int(np.argmin([misfit(point) for point in grid]))
         around = grid[max(best - 1, 0)], grid[min(best + 1, count - 1)]
         fine = scipy.optimize.minimize_scalar(
             misfit, bounds=around, method="bounded", options={"xatol": 0.02}
         )
-        return LowPassFit(float(fine.fun), float(np.exp(fine.x)), shape)
-
-
-def _averaging(
-    segments: Sequence[slice], every: int
-) -> tuple[Callable[[Array], Array], tuple[slice, ...]]:
-    """Mean of so many rows each, and the segments (long enough for a filter) of such means.
-
-    A mean is linear and the same for torque and regressor: what relates them stays.
-    """
-    counts = [(one.stop - one.start) // every for one in segments]
-    lasting = [(s.start, c) for s, c in zip(segments, counts, strict=True) if c >= _SHORTEST]
-
-    def average(values: Array) -> Array:
-        parts = [
-            values[start : start + count * every].reshape(count, every, *values.shape[1:])
-            for start, count in lasting
-        ]
-        return np.concatenate([part.mean(axis=1) for part in parts])
-
-    edges = np.concatenate([[0], np.cumsum([count for _, count in lasting])]).astype(int).tolist()
-    return average, tuple(slice(a, b) for a, b in pairwise(edges))
+        return float(fine.fun), float(np.exp(fine.x))
