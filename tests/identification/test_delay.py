@@ -24,11 +24,12 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.signals.smoothing import low_pass
 from tests.identification.simulated_ns16 import ns16_model, simulated_recording
+from tests.identification.two_link import MODEL, URDF, truth
 from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+TRUTH = truth()
 STEP = 1e-3
 
 
@@ -79,16 +80,14 @@ def simulated() -> tuple[Recording, float]:
 
 
 class TestCommonDelay:
-    def test_it_is_exact_without_noise(self, model: RobotModel, truth: Array) -> None:
-        recording = a_recording(model, truth, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
-        assert estimate_delays(recording, model).common == pytest.approx(3.7e-4, abs=5e-6)
+    def test_it_is_exact_without_noise(self) -> None:
+        recording = a_recording(MODEL, TRUTH, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
+        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=5e-6)
 
-    def test_noise_does_not_bias_it_and_its_interval_is_honest(
-        self, model: RobotModel, truth: Array
-    ) -> None:
+    def test_noise_does_not_bias_it_and_its_interval_is_honest(self) -> None:
         """Mean within its standard error, scatter over seeds as claimed."""
         found = [
-            estimate_delays(a_recording(model, truth, 1.6e-3, seed=seed), model)
+            estimate_delays(a_recording(MODEL, TRUTH, 1.6e-3, seed=seed), MODEL)
             for seed in range(12)
         ]
         error = np.array([one.common - 1.6e-3 for one in found])
@@ -100,60 +99,54 @@ class TestCommonDelay:
         assert all(one.agree and one.significant for one in found)
 
     @pytest.mark.parametrize("planted", [-0.043, 0.01, 0.048])
-    def test_a_delay_of_many_cycles_is_found(
-        self, model: RobotModel, truth: Array, planted: float
-    ) -> None:
-        found = estimate_delays(a_recording(model, truth, planted), model)
+    def test_a_delay_of_many_cycles_is_found(self, planted: float) -> None:
+        found = estimate_delays(a_recording(MODEL, TRUTH, planted), MODEL)
         assert found.common == pytest.approx(planted, abs=3e-4)
         np.testing.assert_array_equal(found.applied, found.common)
 
-    def test_a_longer_one_than_was_sought_is_not_determined(
-        self, model: RobotModel, truth: Array
-    ) -> None:
-        found = estimate_delays(a_recording(model, truth, 0.06), model)
+    def test_a_longer_one_than_was_sought_is_not_determined(self) -> None:
+        found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
         assert found.reason == "the residual still falls at the longest delay that was tried"
         np.testing.assert_array_equal(found.applied, 0.0)
 
-    def test_uneven_time_does_not_matter(self, model: RobotModel, truth: Array) -> None:
+    def test_uneven_time_does_not_matter(self) -> None:
         time = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))
-        recording = a_recording(model, truth, 3.7e-4, time=time, torque_noise=0.3)
-        assert estimate_delays(recording, model).common == pytest.approx(3.7e-4, abs=1e-4)
+        recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
+        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
 
-    def test_the_torque_may_have_come_through_a_low_pass(
-        self, model: RobotModel, truth: Array
-    ) -> None:
+    def test_the_torque_may_have_come_through_a_low_pass(self) -> None:
         time = np.arange(0.0, 8.0, 0.004)
-        recording = a_recording(model, truth, 0.003, time=time, torque_noise=0.3)
+        recording = a_recording(MODEL, TRUTH, 0.003, time=time, torque_noise=0.3)
         assert recording.torque is not None
         filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
-        found = estimate_delays(filtered, model, options=Preprocessing(torque_bandwidth=8.0))
+        found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
         assert found.common == pytest.approx(0.003, abs=4e-4)
 
-    def test_the_known_torque_of_a_payload_is_late_as_well(self, truth: Array) -> None:
+    def test_the_known_torque_of_a_payload_is_late_as_well(self) -> None:
         """It is taken off where the samples were prepared, at another delay."""
         load = Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None), payload=load)
-        found = estimate_delays(a_recording(model, truth, 0.01, torque_noise=0.1), model)
+        found = estimate_delays(a_recording(model, TRUTH, 0.01, torque_noise=0.1), model)
         assert found.common == pytest.approx(0.01, abs=1e-4)
 
-    def test_it_is_found_beyond_the_one_assumed(self, model: RobotModel, truth: Array) -> None:
-        recording = a_recording(model, truth, 0.004)
-        found = estimate_delays(recording, model, options=Preprocessing(torque_delay=0.003))
+    def test_it_is_found_beyond_the_one_assumed(self) -> None:
+        recording = a_recording(MODEL, TRUTH, 0.004)
+        found = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.003))
         assert found.common == pytest.approx(0.004, abs=3e-4)
         assert found.significant
-        right = estimate_delays(recording, model, options=Preprocessing(torque_delay=0.004))
+        right = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.004))
         assert not right.significant
         np.testing.assert_array_equal(right.applied, 0.004)
 
-    def test_presliding_friction_is_read_at_the_same_time(self, truth: Array) -> None:
+    def test_presliding_friction_is_read_at_the_same_time(self) -> None:
         law = FrictionLaw(third=None, presliding=1e-3)
         model = RobotModel.from_urdf(URDF, friction=law)
         time = np.arange(6000) * STEP
         late = motion(time - 0.005)
         direction = model.friction.direction(time, late[0], late[1])
         recording = replace(
-            a_recording(model, truth, 0.0),
-            torque=model.torque(truth, *late, direction),
+            a_recording(model, TRUTH, 0.0),
+            torque=model.torque(TRUTH, *late, direction),
         )
         assert estimate_delays(recording, model).common == pytest.approx(0.005, abs=5e-5)
 
@@ -189,19 +182,17 @@ class TestUndeterminedDelay:
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
 
-    def test_a_wide_one_is_applied_where_it_is_significant(
-        self, model: RobotModel, truth: Array
-    ) -> None:
-        found = estimate_delays(a_recording(model, truth, 0.045, speed=0.2, seed=2), model)
+    def test_a_wide_one_is_applied_where_it_is_significant(self) -> None:
+        found = estimate_delays(a_recording(MODEL, TRUTH, 0.045, speed=0.2, seed=2), MODEL)
         assert found.reason is not None and found.significant
         np.testing.assert_array_equal(found.applied, found.common)
         (line,) = found.describe()
         assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
-    def test_without_motion_there_is_no_row(self, model: RobotModel, truth: Array) -> None:
-        still = a_recording(model, truth, 0.0, speed=0.0)
+    def test_without_motion_there_is_no_row(self) -> None:
+        still = a_recording(MODEL, TRUTH, 0.0, speed=0.0)
         with pytest.raises(IdentificationError, match="not one usable sample"):
-            estimate_delays(still, model)
+            estimate_delays(still, MODEL)
 
     @pytest.mark.slow
     def test_a_torque_through_a_low_pass_does_not_tell_it(self, shared_data: Path) -> None:
@@ -214,10 +205,8 @@ class TestUndeterminedDelay:
 
 class TestDeviatingAxes:
     @pytest.mark.parametrize("planted", [[3.7e-4, -1.3e-3], [0.004, 0.0], [-0.045, 0.045]])
-    def test_an_axis_with_another_delay_is_found(
-        self, model: RobotModel, truth: Array, planted: list[float]
-    ) -> None:
-        found = estimate_delays(a_recording(model, truth, np.array(planted)), model)
+    def test_an_axis_with_another_delay_is_found(self, planted: list[float]) -> None:
+        found = estimate_delays(a_recording(MODEL, TRUTH, np.array(planted)), MODEL)
         assert not found.agree and found.significant
         assert found.applied == pytest.approx(planted, abs=3e-4)
         assert any("predicts better than the delay of the others" in s for s in found.describe())
@@ -234,9 +223,7 @@ class TestDeviatingAxes:
         assert found.deviations[2] == pytest.approx(0.006, abs=1e-4)
         assert found.common == pytest.approx(planted, abs=5e-5)
 
-    def test_an_axis_that_stands_takes_the_delay_of_the_others(
-        self, model: RobotModel, truth: Array
-    ) -> None:
+    def test_an_axis_that_stands_takes_the_delay_of_the_others(self) -> None:
         time = np.arange(6000) * STEP
         keep = np.array([1.0, 0.0])
         rng = np.random.default_rng(1)
@@ -245,40 +232,40 @@ class TestDeviatingAxes:
         recording = Recording(
             time=time,
             position=q + 1e-6 * rng.standard_normal(q.shape),
-            joint_names=model.joint_names,
-            torque=model.torque(truth, *late) + 0.1 * rng.standard_normal(q.shape),
+            joint_names=MODEL.joint_names,
+            torque=MODEL.torque(TRUTH, *late) + 0.1 * rng.standard_normal(q.shape),
         )
-        assert estimate_delays(recording, model).applied == pytest.approx([7e-4, 7e-4], abs=1e-4)
+        assert estimate_delays(recording, MODEL).applied == pytest.approx([7e-4, 7e-4], abs=1e-4)
 
 
 PLANTED = np.array([0.37e-3, -1.3e-3])  # s
 
 
 class TestCompensation:
-    def test_torques_belong_to_their_positions(self, model: RobotModel, truth: Array) -> None:
-        late = a_recording(model, truth, PLANTED, torque_noise=0.0, position_noise=0.0)
+    def test_torques_belong_to_their_positions(self) -> None:
+        late = a_recording(MODEL, TRUTH, PLANTED, torque_noise=0.0, position_noise=0.0)
         time = late.time
         gap = np.zeros(len(time), dtype=np.bool_)
         gap[2500] = True
         torn = replace(late, gap_before=gap)
         there = compensate(torn, PLANTED)
         assert there.torque is not None
-        exact = model.torque(truth, *motion(there.time))
+        exact = MODEL.torque(TRUTH, *motion(there.time))
         clear = np.abs(motion(there.time)[1]) > 0.1  # Coulomb friction jumps between samples
         assert np.abs(there.torque - exact)[clear].max() < 2e-3
         assert len(there.segments()) == 2
         # Nothing was read across the gap: the samples beside it that would need it are gone.
         assert there.n_samples == torn.n_samples - 2 * 3
 
-    def test_by_nothing_it_changes_nothing(self, model: RobotModel, truth: Array) -> None:
-        recording = a_recording(model, truth, 0.0)
+    def test_by_nothing_it_changes_nothing(self) -> None:
+        recording = a_recording(MODEL, TRUTH, 0.0)
         same = compensate(recording, [0.0, 0.0])
         assert recording.torque is not None
         np.testing.assert_array_equal(same.torque, recording.torque)
         np.testing.assert_array_equal(same.time, recording.time)
 
-    def test_what_cannot_be_compensated_is_refused(self, model: RobotModel, truth: Array) -> None:
-        recording = a_recording(model, truth, 0.0)
+    def test_what_cannot_be_compensated_is_refused(self) -> None:
+        recording = a_recording(MODEL, TRUTH, 0.0)
         with pytest.raises(IdentificationError, match="shorter than the delay"):
             compensate(recording, [100.0, 0.0])
 
@@ -287,33 +274,31 @@ class TestDelayUncertainty:
     def fit(self, model: RobotModel, samples: Samples) -> Estimate:
         return estimate(model, Factor.of(model, samples), np.array([1.0, 25.0]))
 
-    def test_the_sensitivity_is_the_slope_of_the_estimate(
-        self, model: RobotModel, truth: Array
-    ) -> None:
+    def test_the_sensitivity_is_the_slope_of_the_estimate(self) -> None:
         """Against fits with a delay half a millisecond shorter and longer."""
-        recording = a_recording(model, truth, 0.004, torque_noise=0.0, position_noise=1e-8)
+        recording = a_recording(MODEL, TRUTH, 0.004, torque_noise=0.0, position_noise=1e-8)
 
         def samples(delay: float) -> Samples:
             options = Preprocessing(torque_delay=delay, left_out="slow", rigid_bandwidth=40.0)
-            return prepare(recording, model, options=options)
+            return prepare(recording, MODEL, options=options)
 
         middle = samples(0.004)
-        fitted, products = self.fit(model, middle), rate_products(model, middle)
+        fitted, products = self.fit(MODEL, middle), rate_products(MODEL, middle)
         fitted = replace(fitted, noise_std=np.array([1.0, 0.2]))  # as weighted
-        wider = with_uncertain_delay(fitted, Factor.of(model, middle), products, 0.25)
-        ends = [self.fit(model, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
+        wider = with_uncertain_delay(fitted, Factor.of(MODEL, middle), products, 0.25)
+        ends = [self.fit(MODEL, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
         slope = (ends[1] - ends[0]) / 1e-3
         added = wider.covariance - fitted.covariance
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)
 
-    def test_what_is_undetermined_stays_so(self, model: RobotModel, truth: Array) -> None:
-        samples = prepare(a_recording(model, truth, 0.0), model)
-        fitted, products = self.fit(model, samples), rate_products(model, samples)
+    def test_what_is_undetermined_stays_so(self) -> None:
+        samples = prepare(a_recording(MODEL, TRUTH, 0.0), MODEL)
+        fitted, products = self.fit(MODEL, samples), rate_products(MODEL, samples)
         covariance = fitted.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0
         covariance[0, 0] = np.inf
         unknown = replace(fitted, covariance=covariance)
-        wider = with_uncertain_delay(unknown, Factor.of(model, samples), products, 1.0)
+        wider = with_uncertain_delay(unknown, Factor.of(MODEL, samples), products, 1.0)
         assert np.isinf(wider.covariance[0, 0])
         np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

@@ -22,26 +22,17 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.signals.samples import Samples, prepare
 from identification.validation.prediction import over_all, prediction_error
 from sim_fixtures.ns16 import urdf_text
-from tests.identification.two_link import as_samples, sine_motion
+from tests.identification.two_link import URDF, as_samples, sine_motion, truth
 from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 NOISE = np.array([3.0, 0.6])
 
 
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third="quadratic", offset=True))
-
-
-@pytest.fixture(scope="module")
-def truth(model: RobotModel) -> Array:
-    """The two-link arm of the URDF, without offsets and without quadratic friction."""
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, [4, 2], [1.5, 0.8], [0, 0], [0, 0]])
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third="quadratic", offset=True))
+# Without offsets and without quadratic friction.
+TRUTH = np.concatenate([truth(), np.zeros(4)])
 
 
 def a_motion(seed: int, n: int = 2, duration: float = 12.0, step: float = 5e-3) -> Motion:
@@ -67,13 +58,11 @@ def factors(model: RobotModel, values: Array, seed: int = 0) -> tuple[PhaseFacto
     return fitted, unseen
 
 
-def test_parameters_that_are_nothing_go_and_those_that_matter_stay(
-    model: RobotModel, truth: Array
-) -> None:
+def test_parameters_that_are_nothing_go_and_those_that_matter_stay() -> None:
     nothing = {"f2_1", "f2_2", "fo_1", "fo_2"}
     gone: list[str] = []
     for seed in range(0, 40, 2):
-        result = eliminate(model, *factors(model, truth, seed))
+        result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
         gone += result.removed
         assert not {"f0_1", "f0_2", "f1_1", "f1_2", "mc2z", "I2yy"} & set(result.removed)
     counts = {name: gone.count(name) for name in nothing}
@@ -81,17 +70,15 @@ def test_parameters_that_are_nothing_go_and_those_that_matter_stay(
     assert set(gone) <= nothing | {"mc2x", "mc1x"}  # small in the URDF: 0.12 and 0.03 kg m
 
 
-def test_a_step_is_the_least_squares_fit_of_the_columns_left(
-    model: RobotModel, truth: Array
-) -> None:
-    runs = [samples_of(model, truth, a_motion(k), NOISE, k) for k in (1, 2)]
-    training, unseen = (PhaseFactor.from_samples(model, run) for run in runs)
+def test_a_step_is_the_least_squares_fit_of_the_columns_left() -> None:
+    runs = [samples_of(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
+    training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in runs)
     weights = np.array([0.2, 3.0])
-    result = eliminate(model, training, unseen, weights=weights)
-    kept = [model.parameter_names.index(name) for name in result.estimate.names]
+    result = eliminate(MODEL, training, unseen, weights=weights)
+    kept = [MODEL.parameter_names.index(name) for name in result.estimate.names]
     rows, torque = [], []
     for run in runs:
-        dense = model.regressor(*run.motion[1:]).dense(model.n_parameters)
+        dense = MODEL.regressor(*run.motion[1:]).dense(MODEL.n_parameters)
         rows.append(np.where(run.usable[..., None], dense, 0.0))
         torque.append(np.where(run.usable, run.torque, 0.0))
     scale = np.sqrt(weights)
@@ -109,25 +96,23 @@ def test_a_step_is_the_least_squares_fit_of_the_columns_left(
     assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
 
 
-def test_the_held_out_errors_are_those_of_the_prediction(model: RobotModel, truth: Array) -> None:
-    runs = [samples_of(model, truth, a_motion(k), NOISE, k) for k in (1, 2)]
-    result = eliminate(model, *(PhaseFactor.from_samples(model, run) for run in runs))
-    (expected,) = prediction_error(model, result.values, runs[1:])
+def test_the_held_out_errors_are_those_of_the_prediction() -> None:
+    runs = [samples_of(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
+    result = eliminate(MODEL, *(PhaseFactor.from_samples(MODEL, run) for run in runs))
+    (expected,) = prediction_error(MODEL, result.values, runs[1:])
     assert result.chosen.held_out == pytest.approx(expected.overall, rel=1e-7)
 
 
-def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter(
-    model: RobotModel, truth: Array
-) -> None:
-    training, unseen = factors(model, truth)
-    result = eliminate(model, training, unseen)
-    full = estimate(model, training.total)
+def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter() -> None:
+    training, unseen = factors(MODEL, TRUTH)
+    result = eliminate(MODEL, training, unseen)
+    full = estimate(MODEL, training.total)
     relative = full.std / np.abs(full.values)
     assert result.steps[0].removed is None
     assert result.steps[0].spread == pytest.approx(relative.max() / relative.min(), rel=1e-9)
     assert result.steps[1].removed == full.names[int(relative.argmax())]
     assert result.steps[0].largest_relative_std == pytest.approx(relative.max(), rel=1e-9)
-    assert [step.left for step in result.steps] == list(range(model.n_parameters, 0, -1))
+    assert [step.left for step in result.steps] == list(range(MODEL.n_parameters, 0, -1))
     errors = [step.in_sample for step in result.steps]
     # Weighted they must rise; unweighted, with joints of different noise, they nearly do.
     assert errors[-1] > 5.0 * errors[0]
@@ -135,14 +120,12 @@ def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter(
     assert len(set(removed)) == len(removed)
 
 
-def test_a_parameter_that_unseen_motion_needs_stays_whatever_the_rule_of_thumb_says(
-    model: RobotModel, truth: Array
-) -> None:
-    values = truth.copy()
-    values[model.parameter_names.index("fo_2")] = 1.0
-    training, unseen = factors(model, values)
-    blind = eliminate(model, training, unseen, rule=CutRule(spread=4.0, overall=9.0, axis=9.0))
-    result = eliminate(model, training, unseen, rule=CutRule(spread=4.0))
+def test_a_parameter_that_unseen_motion_needs_stays_whatever_the_rule_of_thumb_says() -> None:
+    values = TRUTH.copy()
+    values[MODEL.parameter_names.index("fo_2")] = 1.0
+    training, unseen = factors(MODEL, values)
+    blind = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0, overall=9.0, axis=9.0))
+    result = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0))
     assert "f1_1" in blind.removed  # a friction of 1.5 N·m·s/rad, among a noise of 3 N·m
     assert "f1_1" in result.refused
     assert "f1_1" in result.reason
@@ -164,7 +147,7 @@ def test_no_removal_up_to_the_cut_costs_more_than_the_rule_gives_away(seed: int)
         assert result.chosen.spread < rule.spread
 
 
-def test_what_the_motion_does_not_determine_goes_first(model: RobotModel, truth: Array) -> None:
+def test_what_the_motion_does_not_determine_goes_first() -> None:
     motion = a_motion(1)
     held = Motion(
         motion.time,
@@ -172,10 +155,10 @@ def test_what_the_motion_does_not_determine_goes_first(model: RobotModel, truth:
         motion.velocity * [1.0, 0.0],
         motion.acceleration * [1.0, 0.0],
     )
-    runs = [samples_of(model, truth, m, NOISE, 3) for m in (held, held)]
-    training, unseen = (PhaseFactor.from_samples(model, run) for run in runs)
-    result = eliminate(model, training, unseen)
-    full = estimate(model, training.total)
+    runs = [samples_of(MODEL, TRUTH, m, NOISE, 3) for m in (held, held)]
+    training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in runs)
+    result = eliminate(MODEL, training, unseen)
+    full = estimate(MODEL, training.total)
     lost = [
         after for before, after in pairwise(result.steps) if np.isinf(before.largest_relative_std)
     ]
@@ -185,24 +168,24 @@ def test_what_the_motion_does_not_determine_goes_first(model: RobotModel, truth:
     assert np.all(np.isfinite(result.estimate.std))
 
 
-def test_the_estimate_that_is_left_is_one_like_every_other(model: RobotModel, truth: Array) -> None:
+def test_the_estimate_that_is_left_is_one_like_every_other() -> None:
     covered = []
     for seed in range(0, 60, 2):
-        result = eliminate(model, *factors(model, truth, seed))
+        result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
         one = result.estimate
-        true = truth[[model.parameter_names.index(name) for name in one.names]]
+        true = TRUTH[[MODEL.parameter_names.index(name) for name in one.names]]
         covered.append(np.abs(one.values - true) < one.interval_factor * one.std)
     assert 0.88 <= np.mean(np.concatenate(covered)) <= 0.995
-    assert one.units == tuple(model.units[model.parameter_names.index(name)] for name in one.names)
+    assert one.units == tuple(MODEL.units[MODEL.parameter_names.index(name)] for name in one.names)
     assert "essential" in one.method
     assert "cluster-robust" in one.method
 
 
-def test_empty_factors_are_refused(model: RobotModel, truth: Array) -> None:
-    _, unseen = factors(model, truth)
-    empty = PhaseFactor.zero(model)
+def test_empty_factors_are_refused() -> None:
+    _, unseen = factors(MODEL, TRUTH)
+    empty = PhaseFactor.zero(MODEL)
     with pytest.raises(IdentificationError, match="not one usable fitted"):
-        eliminate(model, empty, unseen)
+        eliminate(MODEL, empty, unseen)
 
 
 def test_the_ns16_loses_parameters_and_predicts_no_worse() -> None:
@@ -281,11 +264,11 @@ def factors_of(model: RobotModel, runs: list[Samples]) -> list[PhaseFactor]:
     return [PhaseFactor.from_samples(model, run) for run in runs]
 
 
-def test_the_relative_error_is_that_of_the_prediction(model: RobotModel, truth: Array) -> None:
-    runs = runs_of(model, truth, 3, 2)
-    values = 1.1 * truth
-    both = sum(factors_of(model, runs), PhaseFactor.zero(model)).total
-    expected = over_all(prediction_error(model, values, runs)).overall
+def test_the_relative_error_is_that_of_the_prediction() -> None:
+    runs = runs_of(MODEL, TRUTH, 3, 2)
+    values = 1.1 * TRUTH
+    both = sum(factors_of(MODEL, runs), PhaseFactor.zero(MODEL)).total
+    expected = over_all(prediction_error(MODEL, values, runs)).overall
     assert both.relative_error(values) == pytest.approx(expected, rel=1e-9)
 
 
@@ -331,35 +314,33 @@ def part_of(run: Samples, rows: slice) -> Samples:
     )
 
 
-def test_too_short_a_motion_has_no_part_to_choose_on(model: RobotModel, truth: Array) -> None:
-    training, unseen = factors_of(model, runs_of(model, truth, 1, 2))
-    assert choose_essential(model, training, [unseen]).blind is not None
-    assert choose_essential(model, training.blocks(slice(0, 20)), [unseen]).blind is None
+def test_too_short_a_motion_has_no_part_to_choose_on() -> None:
+    training, unseen = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 2))
+    assert choose_essential(MODEL, training, [unseen]).blind is not None
+    assert choose_essential(MODEL, training.blocks(slice(0, 20)), [unseen]).blind is None
 
 
-def test_the_rule_of_thumb_is_the_path_that_no_held_out_error_stops(
-    model: RobotModel, truth: Array
-) -> None:
-    training, *held_out = factors_of(model, runs_of(model, truth, 1, 3))
-    found = choose_essential(model, training, held_out)
+def test_the_rule_of_thumb_is_the_path_that_no_held_out_error_stops() -> None:
+    training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 3))
+    found = choose_essential(MODEL, training, held_out)
     assert found.by_spread.spread < CutRule().spread
     assert found.by_spread.left <= found.elimination.chosen.left
     assert found.elimination.chosen.held_out <= found.by_spread.held_out + 2 * CutRule().overall
 
 
-def test_many_recordings_cost_no_more_than_few(model: RobotModel, truth: Array) -> None:
+def test_many_recordings_cost_no_more_than_few() -> None:
     """Blocks are merged; the error over all of them is the same sum."""
-    training, *held_out = factors_of(model, runs_of(model, truth, 1, 9))
-    found = choose_essential(model, training, held_out)
-    total = sum(held_out, PhaseFactor.zero(model)).total
+    training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
+    found = choose_essential(MODEL, training, held_out)
+    total = sum(held_out, PhaseFactor.zero(MODEL)).total
     assert found.elimination.chosen.held_out == pytest.approx(
         total.relative_error(found.elimination.values), rel=1e-9
     )
 
 
-def test_without_held_out_motion_nothing_is_chosen(model: RobotModel, truth: Array) -> None:
-    (training,) = factors_of(model, runs_of(model, truth, 1, 1))
+def test_without_held_out_motion_nothing_is_chosen() -> None:
+    (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
     with pytest.raises(IdentificationError, match="no held-out motion"):
-        choose_essential(model, training, [])
+        choose_essential(MODEL, training, [])
     with pytest.raises(IdentificationError, match="not one usable held-out sample"):
-        choose_essential(model, training, [PhaseFactor.zero(model)])
+        choose_essential(MODEL, training, [PhaseFactor.zero(MODEL)])

@@ -19,8 +19,11 @@ from identification.signals.samples import (
     prepare,
     smooth,
 )
+from tests.identification.two_link import MODEL, truth
 
 Array = NDArray[np.float64]
+
+TRUTH = truth()
 
 RESOLUTION = 2e-6  # rad, of the encoders
 TRUE_FRICTION = np.array([4.0, 2.0, 1.5, 0.8])
@@ -53,25 +56,23 @@ def a_recording(
 QUANTISATION = np.full(2, RESOLUTION**2 / 12.0)
 
 
-def test_smoothed_motion_is_the_true_motion_where_rows_count(
-    model: RobotModel, truth: Array
-) -> None:
-    recording = a_recording(model, truth)
-    samples = prepare(recording, model, noise_variance=QUANTISATION)
+def test_smoothed_motion_is_the_true_motion_where_rows_count() -> None:
+    recording = a_recording(MODEL, TRUTH)
+    samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
     for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
         error = (smoothed - exact)[samples.usable.all(axis=1)]
         assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
 
 
-def test_the_torque_is_left_as_measured(model: RobotModel, truth: Array) -> None:
-    recording = a_recording(model, truth, noise=0.5)
-    assert prepare(recording, model).torque is recording.torque
+def test_the_torque_is_left_as_measured() -> None:
+    recording = a_recording(MODEL, TRUTH, noise=0.5)
+    assert prepare(recording, MODEL).torque is recording.torque
 
 
-def test_rows_at_standstill_and_near_the_ends_do_not_count(model: RobotModel, truth: Array) -> None:
-    recording = a_recording(model, truth)
-    samples = prepare(recording, model, noise_variance=QUANTISATION)
-    standing = np.abs(samples.motion.velocity) <= model.friction.standstill
+def test_rows_at_standstill_and_near_the_ends_do_not_count() -> None:
+    recording = a_recording(MODEL, TRUTH)
+    samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
+    standing = np.abs(samples.motion.velocity) <= MODEL.friction.standstill
     assert standing.any()
     assert not samples.usable[standing].any()
     assert not samples.usable[:10].any()
@@ -81,11 +82,9 @@ def test_rows_at_standstill_and_near_the_ends_do_not_count(model: RobotModel, tr
     assert samples.usable.sum() + turning > 0.9 * samples.usable.size
 
 
-def test_rows_just_before_and_after_a_reversal_do_not_count_for_the_joint_that_turns(
-    model: RobotModel, truth: Array
-) -> None:
-    recording = a_recording(model, truth)
-    samples = prepare(recording, model, noise_variance=QUANTISATION)
+def test_rows_just_before_and_after_a_reversal_do_not_count_for_the_joint_that_turns() -> None:
+    recording = a_recording(MODEL, TRUTH)
+    samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
     exact = motion(recording.time)[1]
     turns = np.flatnonzero(exact[1:, 0] * exact[:-1, 0] < 0.0)
     reach = 0.5 / samples.position_bandwidth[0]
@@ -96,8 +95,8 @@ def test_rows_just_before_and_after_a_reversal_do_not_count_for_the_joint_that_t
         assert samples.usable[row, 1]
 
 
-def test_no_derivative_is_taken_across_a_gap(model: RobotModel, truth: Array) -> None:
-    whole = a_recording(model, truth)
+def test_no_derivative_is_taken_across_a_gap() -> None:
+    whole = a_recording(MODEL, TRUTH)
     keep = np.r_[0:2000, 2300:6000]
     assert whole.torque is not None
     gap = np.zeros(len(keep), dtype=bool)
@@ -110,38 +109,36 @@ def test_no_derivative_is_taken_across_a_gap(model: RobotModel, truth: Array) ->
         torque=whole.torque[keep],
         gap_before=gap,
     )
-    samples = prepare(torn, model, noise_variance=QUANTISATION)
+    samples = prepare(torn, MODEL, noise_variance=QUANTISATION)
     exact = [part[keep] for part in motion(whole.time)]
     rows = samples.usable.all(axis=1)
     assert not samples.usable[1995:2005].any()
     assert np.abs(samples.motion.velocity - exact[1])[rows].max() < 0.02
-    unflagged = prepare(replace(torn, gap_before=None), model, noise_variance=QUANTISATION)
+    unflagged = prepare(replace(torn, gap_before=None), MODEL, noise_variance=QUANTISATION)
     assert np.abs(unflagged.motion.velocity - exact[1])[1995:2005].max() > 1.0
 
 
-def test_a_segment_too_short_to_smooth_is_left_out(model: RobotModel, truth: Array) -> None:
-    recording = a_recording(model, truth)
+def test_a_segment_too_short_to_smooth_is_left_out() -> None:
+    recording = a_recording(MODEL, TRUTH)
     gap = np.zeros(6000, dtype=bool)
     gap[[3000, 3015]] = True
-    samples = prepare(replace(recording, gap_before=gap), model, noise_variance=QUANTISATION)
+    samples = prepare(replace(recording, gap_before=gap), MODEL, noise_variance=QUANTISATION)
     assert not samples.usable[3000:3015].any()
     assert np.isfinite(samples.motion.acceleration).all()
 
 
 @pytest.mark.parametrize("delay", [0.004, -0.0025])
-def test_a_known_delay_of_the_torque_is_taken_out(
-    model: RobotModel, truth: Array, delay: float
-) -> None:
-    recording = a_recording(model, truth, delay=delay)
+def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
+    recording = a_recording(MODEL, TRUTH, delay=delay)
 
     def worst(assumed: float) -> float:
         samples = prepare(
             recording,
-            model,
+            MODEL,
             noise_variance=QUANTISATION,
             options=Preprocessing(torque_delay=assumed),
         )
-        error = samples.torque - samples.predicted_torque(model, truth)
+        error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
         moving = np.abs(samples.motion.velocity) > 0.1  # clear of the step at a reversal
         return float(np.abs(error[samples.usable & moving]).max())
 
@@ -149,10 +146,8 @@ def test_a_known_delay_of_the_torque_is_taken_out(
     assert worst(0.0) > 5 * worst(delay)
 
 
-def test_smooth_gives_the_motion_in_the_rows_of_the_recording(
-    model: RobotModel, truth: Array
-) -> None:
-    recording = a_recording(model, truth)
+def test_smooth_gives_the_motion_in_the_rows_of_the_recording() -> None:
+    recording = a_recording(MODEL, TRUTH)
     smoothed, _ = smooth(recording, QUANTISATION)
     assert smoothed.position.shape == recording.position.shape
     np.testing.assert_array_equal(smoothed.time, recording.time)
@@ -199,30 +194,28 @@ def test_a_reading_that_never_changes_has_no_variance_of_its_own() -> None:
         standstill_variance(np.arange(19) * 1e-3, np.zeros((19, 2)))
 
 
-def test_a_low_pass_in_the_torque_channel_cancels_when_the_regressor_goes_through_it_too(
-    model: RobotModel, truth: Array
-) -> None:
-    recording = a_recording(model, truth)
+def test_a_low_pass_in_the_torque_channel_cancels_when_the_regressor_goes_through_it_too() -> None:
+    recording = a_recording(MODEL, TRUTH)
     assert recording.torque is not None
     # Recorded through a low-pass that is not the smoother itself: Butterworth, both ways.
     logged = sosfiltfilt(butter(3, 4.0, fs=1000.0, output="sos"), recording.torque, axis=0)
 
     def misfit(options: Preprocessing) -> float:
         samples = prepare(
-            replace(recording, torque=logged), model, noise_variance=QUANTISATION, options=options
+            replace(recording, torque=logged), MODEL, noise_variance=QUANTISATION, options=options
         )
-        error = samples.torque - samples.predicted_torque(model, truth)
+        error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
         return float(np.sqrt(np.mean(error[1000:-1000] ** 2)))
 
     assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
 
 
-def test_the_papers_way_smooths_torque_and_regressor_alike(model: RobotModel, truth: Array) -> None:
-    recording = a_recording(model, truth, noise=0.5)
+def test_the_papers_way_smooths_torque_and_regressor_alike() -> None:
+    recording = a_recording(MODEL, TRUTH, noise=0.5)
     options = Preprocessing(smooth_torque=True)
     samples = prepare(
         recording,
-        model,
+        MODEL,
         noise_variance=QUANTISATION,
         torque_variance=np.full(2, 0.25),
         options=options,
@@ -232,18 +225,16 @@ def test_the_papers_way_smooths_torque_and_regressor_alike(model: RobotModel, tr
     np.testing.assert_allclose(np.mean(removed**2, axis=0), 0.25, rtol=0.1)
     # What is left of the noise in the fit's residual is what the smoother lets through; the
     # linear relation itself has not suffered.
-    error = (samples.torque - samples.predicted_torque(model, truth))[samples.usable]
+    error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
     assert np.sqrt(np.mean(error**2)) < 0.2
 
 
-def test_factors_of_filtered_samples_hold_the_filtered_rows(
-    model: RobotModel, truth: Array
-) -> None:
+def test_factors_of_filtered_samples_hold_the_filtered_rows() -> None:
     samples = prepare(
-        a_recording(model, truth), model, options=Preprocessing(torque_bandwidth=20.0)
+        a_recording(MODEL, TRUTH), MODEL, options=Preprocessing(torque_bandwidth=20.0)
     )
-    dense = samples.regressor(model).dense(model.n_parameters)
-    factor = Factor.of(model, samples)
+    dense = samples.regressor(MODEL).dense(MODEL.n_parameters)
+    factor = Factor.of(MODEL, samples)
     for joint in range(2):
         rows = samples.usable[:, joint]
         table = np.column_stack([dense[rows, joint], samples.torque[rows, joint]])
@@ -251,24 +242,22 @@ def test_factors_of_filtered_samples_hold_the_filtered_rows(
         assert factor.samples[joint] == rows.sum()
 
 
-def test_a_recording_without_torque_is_refused(model: RobotModel, truth: Array) -> None:
+def test_a_recording_without_torque_is_refused() -> None:
     with pytest.raises(RecordingError, match="no joint torque"):
-        prepare(replace(a_recording(model, truth), torque=None), model)
+        prepare(replace(a_recording(MODEL, TRUTH), torque=None), MODEL)
 
 
-def test_a_recording_that_fails_its_checks_is_refused(model: RobotModel, truth: Array) -> None:
-    wrong = replace(a_recording(model, truth), joint_names=("elbow", "shoulder"))
+def test_a_recording_that_fails_its_checks_is_refused() -> None:
+    wrong = replace(a_recording(MODEL, TRUTH), joint_names=("elbow", "shoulder"))
     with pytest.raises(RecordingError, match="order"):
-        prepare(wrong, model)
+        prepare(wrong, MODEL)
 
 
-def test_torque_and_regressor_can_be_low_passed_alike_at_a_given_bandwidth(
-    model: RobotModel, truth: Array
-) -> None:
-    recording = a_recording(model, truth, noise=0.5)
+def test_torque_and_regressor_can_be_low_passed_alike_at_a_given_bandwidth() -> None:
+    recording = a_recording(MODEL, TRUTH, noise=0.5)
     options = Preprocessing(smooth_torque=True, torque_bandwidth=20.0)
-    samples = prepare(recording, model, noise_variance=QUANTISATION, options=options)
-    error = (samples.torque - samples.predicted_torque(model, truth))[samples.usable]
+    samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
+    error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
     # White noise of 0.5 in 20 Hz of 500.
     assert np.std(error) == pytest.approx(0.5 * np.sqrt(20.0 / 500.0), rel=0.25)
 
