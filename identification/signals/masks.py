@@ -99,12 +99,10 @@ def mask_rows(
     motion: Motion,
     bandwidth: Array,
     *,
-    torque_limit: Array | None = None,
     current_limit: Array | None = None,
     torque_bandwidth: Array | None = None,
     delay: float = 0.0,
     left_out: LeftOut = "slow",
-    reversal_periods: float = REVERSAL_PERIODS,
 ) -> RowMask:
     """Reasons against each row of a recording.
 
@@ -113,32 +111,26 @@ def mask_rows(
         model: says below which speed a joint stands.
         motion: smoothed, in the rows of the recording.
         bandwidth: of that smoothing per joint (n,) [Hz].
-        torque_limit: largest torque a joint is given (n,) [N·m or N].
         current_limit: largest current a motor is given (n,) [A].
         torque_bandwidth: of a low-pass that torque and regressor go through (n,) [Hz].
         delay: the motion was read this much earlier than the recording's rows [s].
         left_out: "rests": rows of a joint that is slower than standstill for longer than
             `LONGEST_HALT`; "slow": all rows slower than that, and those near a velocity reversal;
             "none": neither.
-        reversal_periods: with "slow", periods of the smoothing's bandwidth on either side of a
-            reversal.
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)
     saturated = np.zeros(shape, dtype=np.bool_)
-    for values, limit in (
-        (recording.torque, torque_limit),
-        (recording.motor_current, current_limit),
-    ):
+    for values in (recording.torque, recording.motor_current):
         if values is not None:
             saturated |= flat_topped(values, ~still)
-            if limit is not None:
-                saturated |= at_limit(values, limit)
+    if current_limit is not None and recording.motor_current is not None:
+        saturated |= np.abs(recording.motor_current) >= AT_LIMIT * current_limit
     slowest = float(bandwidth[np.ptp(recording.position, axis=0) > 0.0].min(initial=np.inf))
     torn = torn_rows(recording, min(LONGEST_END, END_PERIODS / slowest), delay)
     if torque_bandwidth is not None:
         torn |= torn_rows(recording, min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min())))
-    reversal = near_any_reversal(model, motion, reversal_periods / bandwidth)
+    reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {TORN: np.broadcast_to(torn[:, None], shape)}
     if left_out == "rests":
         reasons[REST] = long_rests(motion.time, still)
@@ -158,12 +150,7 @@ def long_rests(time: Array, still: Rows) -> Rows:
     return resting
 
 
-def at_limit(values: Array, limit: Array) -> Rows:
-    """Rows (m, n) in which a channel is at its limit (n,), either way."""
-    return np.asarray(np.abs(values) >= AT_LIMIT * np.abs(limit))
-
-
-def flat_topped(values: Array, moving: Rows | None = None) -> Rows:
+def flat_topped(values: Array, moving: Rows) -> Rows:
     """Rows (m, n) that look clipped: a channel stays at its own extreme to the last bit.
 
     A run of `SHORTEST_TOP` equal values or more, at the largest or smallest value of the channel,
@@ -172,7 +159,7 @@ def flat_topped(values: Array, moving: Rows | None = None) -> Rows:
     Args:
         values: (m, n), of any unit.
         moving: rows (m, n) that may be a clipped top; at standstill a channel without noise stays
-            the same for better reasons. All by default.
+            the same for better reasons.
     """
     clipped = np.zeros(values.shape, dtype=np.bool_)
     for j, channel in enumerate(values.T):
@@ -184,7 +171,7 @@ def flat_topped(values: Array, moving: Rows | None = None) -> Rows:
             for start, stop in _runs(channel == extreme):
                 if stop - start >= SHORTEST_TOP and _departs(channel, start, stop, resolution):
                     clipped[start:stop, j] = True
-    return clipped if moving is None else clipped & moving
+    return clipped & moving
 
 
 def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:

@@ -12,7 +12,6 @@ from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.signals.masks import (
-    REVERSAL_PERIODS,
     SHORTEST_STRETCH,
     LeftOut,
     RowMask,
@@ -65,8 +64,6 @@ class Preprocessing:
         torque_shape: how that low-pass falls off; `smooth_torque` is always by the spline's.
         torque_delay: time by which the recorded torque lags the recorded position [s], beside
             the lag of a causal low-pass.
-        reversal_periods: of the smoothing's bandwidth that are left out on either side of a
-            reversal, where `left_out` is "slow".
     """
 
     rigid_bandwidth: float = RIGID_BANDWIDTH
@@ -76,7 +73,6 @@ class Preprocessing:
     torque_bandwidth: float | None = None
     torque_shape: LowPassShape = SMOOTHER
     torque_delay: float = 0.0
-    reversal_periods: float = REVERSAL_PERIODS
 
     def __post_init__(self) -> None:
         for name in ("rigid_bandwidth", "torque_bandwidth"):
@@ -239,7 +235,6 @@ def prepare(
     torque_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),
     origin: float | None = None,
-    torque_limit: Array | None = None,
     current_limit: Array | None = None,
 ) -> Samples:
     """Samples of a recording for a model; of its torque, that of a known payload is subtracted.
@@ -252,8 +247,8 @@ def prepare(
         options: what to do with the torque.
         origin: time at which the planned motion begins [s]; by default where the command begins
             to move.
-        torque_limit: largest torque a joint is given (n,) [N·m or N]; rows at it do not count.
-        current_limit: largest current a motor is given (n,) [A]; likewise.
+        current_limit: largest current a motor is given (n,) [A]; rows at it do not
+            count.
 
     Raises:
         RecordingError: the recording does not pass its checks, or has no torque.
@@ -276,12 +271,10 @@ def prepare(
         model,
         motion,
         bandwidth,
-        torque_limit=torque_limit,
         current_limit=current_limit,
         torque_bandwidth=torque_bandwidth,
         delay=options.torque_delay,
         left_out=options.left_out or ("rests" if presliding else "slow"),
-        reversal_periods=options.reversal_periods,
     )
     samples = Samples(
         motion=motion,

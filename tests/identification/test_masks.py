@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from identification.signals.masks import (
     SATURATED,
     STANDSTILL,
     TORN,
-    at_limit,
     flat_topped,
     mask_rows,
 )
@@ -29,6 +29,7 @@ from identification.signals.samples import Preprocessing, prepare
 Array = NDArray[np.float64]
 URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 TIME = np.arange(4000) * 1e-3
+EVERYWHERE = np.ones((1, 1), dtype=np.bool_)
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +57,11 @@ def test_a_clipped_torque_is_found_where_it_was_clipped(model: RobotModel) -> No
     assert whole.torque is not None
     assert clipped.torque is not None
     true = np.abs(whole.torque) > 15.0
-    found = flat_topped(clipped.torque)
+    found = flat_topped(clipped.torque, EVERYWHERE)
     assert not np.any(found & ~true)
     # Noise lets the torque out of the limit for a sample now and then; short runs are let pass.
     assert np.count_nonzero(found) > 0.9 * np.count_nonzero(true)
-    assert not flat_topped(whole.torque).any()
+    assert not flat_topped(whole.torque, EVERYWHERE).any()
 
 
 @given(
@@ -72,20 +73,14 @@ def test_a_smooth_peak_read_with_a_coarse_resolution_is_not_clipped(
     resolution: float, rate: float, phase: float
 ) -> None:
     smooth = np.round(20.0 * np.sin(rate * TIME + phase) / resolution) * resolution
-    assert not flat_topped(smooth[:, None]).any()
+    assert not flat_topped(smooth[:, None], EVERYWHERE).any()
 
 
 def test_a_channel_that_stays_the_same_at_rest_is_not_clipped() -> None:
     channel = np.concatenate([np.full(500, 12.0), 12.0 * np.cos(TIME[:2000] * 4.0)])[:, None]
     moving = np.arange(len(channel))[:, None] > 500
     assert not flat_topped(channel, moving).any()
-    assert not flat_topped(np.full((100, 1), 3.0)).any()
-
-
-def test_at_a_limit_either_way(model: RobotModel) -> None:
-    values = np.array([[9.96, 1.0], [-10.0, 2.0], [9.9, -2.1]])
-    expected = [[True, False], [True, True], [False, True]]
-    np.testing.assert_array_equal(at_limit(values, np.array([10.0, 2.0])), expected)
+    assert not flat_topped(np.full((100, 1), 3.0), EVERYWHERE).any()
 
 
 def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) -> None:
@@ -164,13 +159,12 @@ def test_rows_beside_a_gap_and_short_stretches_are_torn(model: RobotModel) -> No
     assert not rows[2100:3900].any()
 
 
-def test_limits_of_torque_and_current_count(model: RobotModel) -> None:
+def test_the_limit_of_the_current_counts(model: RobotModel) -> None:
     motion, recording = motion_and_recording(model)
-    mask = mask_rows(
-        recording, model, motion, np.full(2, 40.0), torque_limit=np.array([18.0, 100.0])
-    )
-    assert recording.torque is not None
-    np.testing.assert_array_equal(
-        mask.reasons[SATURATED][:, 0], np.abs(recording.torque[:, 0]) >= 0.995 * 18.0
-    )
-    assert not mask.reasons[SATURATED][:, 1].any()
+    driven = replace(recording, motor_current=recording.torque, torque=None)
+    limit = np.array([18.0, 100.0])
+    mask = mask_rows(driven, model, motion, np.full(2, 40.0), current_limit=limit)
+    assert driven.motor_current is not None
+    saturated = mask.reasons[SATURATED]
+    np.testing.assert_array_equal(saturated[:, 0], np.abs(driven.motor_current[:, 0]) >= 17.91)
+    assert not saturated[:, 1].any()
