@@ -3,12 +3,10 @@
 from identification.excitation.collision.bodies import Box, Wall, Workspace
 from identification.excitation.collision.checker import CollisionChecker, Contact
 from identification.excitation.constraints import (
-    KINDS,
     SAMPLE_PERIOD,
     Constraints,
     CurrentModel,
     MotionCheck,
-    Violation,
     check_motion,
     midpoints,
     sampled,
@@ -29,7 +27,6 @@ from identification.excitation.errors import (
     DesignError,
     JournalError,
     MissingMeshError,
-    NoFeasibleMotionError,
     PostureError,
     WorkspaceError,
 )
@@ -52,6 +49,7 @@ from identification.excitation.searches.run import (
 )
 from identification.excitation.searches.scores import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
+from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
 
 __all__ = [
     # criteria

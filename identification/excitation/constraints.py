@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from identification.excitation.collision.checker import CollisionChecker, Contact
 from identification.excitation.joint_limits import limit_violations, rest_violations
-from identification.excitation.violation import KINDS, Kind, Violation, excess_by_kind
+from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from planner import FourierSeries, JointLimits, PiecewiseCubic, Trajectory
@@ -112,28 +112,12 @@ def _beyond(
 ) -> list[Violation]:
     found = []
     size = np.abs(values)
-    worst = np.argmax(size, axis=0)
-    largest = size[worst, np.arange(len(worst))]
-    for j in np.flatnonzero(~(largest <= bounds)).tolist():  # NaN is beyond every bound
-        k = int(worst[j])
-        posture = tuple(motion.position[k].tolist())
-        time = float(motion.time[k])
-        found.append(
-            Violation(kind, subjects[j], float(largest[j]), float(bounds[j]), time, posture)
-        )
+    for j, k in enumerate(np.argmax(size, axis=0)):
+        if not size[k, j] <= bounds[j]:  # NaN is beyond every bound
+            posture, time = tuple(motion.position[k].tolist()), float(motion.time[k])
+            most = float(size[k, j]), float(bounds[j])
+            found.append(Violation(kind, subjects[j], *most, time, posture))
     return found
-
-
-__all__ = [
-    "KINDS",
-    "Constraints",
-    "CurrentModel",
-    "MotionCheck",
-    "Violation",
-    "check_motion",
-    "clearance",
-    "excess_by_kind",
-]
 
 
 @dataclass(frozen=True)
@@ -190,7 +174,10 @@ class Constraints:
         found = rest_violations(trajectory, self.limits) if self.at_rest else []
         beyond = limit_violations(trajectory, self.limits, motion)
         found += beyond
-        found += self._wrong_duration(trajectory.duration)
+        duration = trajectory.duration
+        bound = min(max(duration, self.min_duration), self.max_duration)
+        if bound != duration:
+            found.append(Violation("duration", "the motion", duration, bound, None))
         if beyond and not all(np.all(np.isfinite(column)) for column in motion[:4]):
             return tuple(found)
         if self.checker is not None:
@@ -200,12 +187,6 @@ class Constraints:
         if self.currents is not None:
             found += self.currents.check(motion)
         return tuple(found)
-
-    def _wrong_duration(self, duration: float) -> list[Violation]:
-        bound = min(max(duration, self.min_duration), self.max_duration)
-        if bound == duration:
-            return []
-        return [Violation("duration", "the motion", duration, bound, None)]
 
 
 def check_motion(

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.constraints import (
     CurrentModel,
-    Violation,
     check_motion,
     clearance,
 )
-from identification.excitation.errors import NoFeasibleMotionError
 from identification.excitation.excitation import DrawnMotion
 from identification.excitation.genomes import straight_way
+from identification.excitation.violation import NoFeasibleMotionError, Violation
 from planner import (
     JointLimits,
     PlannerCrashed,

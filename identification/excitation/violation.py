@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.errors import IdentificationError
+
 Array = NDArray[np.float64]
 Kind = Literal["planning", "joint limit", "duration", "collision", "torque", "current"]
 
-KINDS: Final[tuple[Kind, ...]] = (
-    "planning",
-    "joint limit",
-    "duration",
-    "collision",
-    "torque",
-    "current",
-)
-"""Kinds of constraints; "planning" stands for a motion that there is not."""
-
-_UNITS: dict[Kind, str] = {
+_UNITS: Final[dict[Kind, str]] = {
     "planning": "",
     "joint limit": "",
     "duration": " s",
@@ -30,6 +22,8 @@ _UNITS: dict[Kind, str] = {
     "torque": " N·m",
     "current": " A",
 }
+KINDS: Final[tuple[Kind, ...]] = tuple(_UNITS)
+"""Kinds of constraints; "planning" stands for a motion that there is not."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +76,11 @@ class Violation:
         unit = _UNITS[self.kind] if unit is None else unit
         text = f"{self.kind} of {self.subject}"
         if self.kind != "planning":  # where there is no motion, there are no numbers either
-            text += f": {self.value:.4g}{unit}, {self._wanted(unit)}"
-        if self.time is not None:
-            text += f", at {self.time:.3f} s"
-        if joints:
-            text += f", joints at {joints}"
+            side = "least" if self.value < self.bound else "most"
+            text += f": {self.value:.4g}{unit}, at {side} {self.bound:.4g}{unit} is wanted"
+        text += "" if self.time is None else f", at {self.time:.3f} s"
+        text += f", joints at {joints}" if joints else ""
         return f"{text}; {self.remedy}" if self.remedy else text
-
-    def _wanted(self, unit: str) -> str:
-        side = "least" if self.value < self.bound else "most"
-        return f"at {side} {self.bound:.4g}{unit} is wanted"
 
 
 def excess_by_kind(violations: Iterable[Violation]) -> Array:
@@ -101,3 +90,55 @@ def excess_by_kind(violations: Iterable[Violation]) -> Array:
         kind = KINDS.index(violation.kind)
         excess[kind] = max(excess[kind], violation.excess)
     return excess
+
+
+class NoFeasibleMotionError(IdentificationError):
+    """Every motion that was tried breaks a constraint.
+
+    Attributes:
+        rejected: how many break it, by kind of constraint; a motion may count for several.
+        nearest: of each kind the violation that came closest to being none.
+        closest: all violations of the motion that came closest to being feasible, by their sum.
+        tried: how many motions there were.
+        unexciting: how many satisfied every constraint, but left a parameter without excitation.
+        stopped: whether the search was stopped before its end.
+    """
+
+    def __init__(
+        self,
+        rejected: Mapping[str, int],
+        nearest: Mapping[str, Violation],
+        *,
+        closest: Sequence[Violation] = (),
+        tried: int | None = None,
+        unexciting: int = 0,
+        stopped: bool = False,
+    ) -> None:
+        self.rejected = dict(rejected)
+        self.nearest = dict(nearest)
+        self.closest = tuple(closest)
+        self.tried = sum(self.rejected.values()) if tried is None else tried
+        self.unexciting = unexciting
+        self.stopped = stopped
+        super().__init__(self.sentence())
+
+    def sentence(self, text_of: Callable[[Violation], str] = str) -> str:
+        """In words; `text_of` puts a violation into the words and units of the reader."""
+        reasons = [
+            f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
+            for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
+        ]
+        worst: dict[str, Violation] = {}
+        for violation in sorted(self.closest, key=lambda violation: -violation.excess):
+            worst.setdefault(violation.kind, violation)
+        if len(self.closest) > 1:
+            breaks = " and ".join(map(text_of, worst.values()))
+            reasons.append(f"the motion that comes closest breaks {breaks}")
+        if self.unexciting:
+            reasons.append(
+                f"{self.unexciting} keep every constraint but leave a parameter without excitation"
+            )
+        if self.stopped:
+            reasons.append("the search was stopped before its end")
+        which = f"none of {self.tried} motions is feasible" if self.tried else "no motion was tried"
+        return f"{which}: {'; '.join(reasons)}"

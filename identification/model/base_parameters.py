@@ -17,10 +17,9 @@ TOLERANCE = 1e-5
 
 _ROUNDING = 1e-13
 # A gap as wide leaves room for a threshold; a base column's share below the second depends on
-# the geometry's last digits; dropped shares below the third are rounding alone.
+# the geometry's last digits.
 _CLEAR = 100.0
 _WEAK = 1e-3
-_EXACT = 1e-9
 # Factors below this (a lever of a nanometre) are in the grouping, but not in the words for it.
 _UNSPEAKABLE = 1e-9
 
@@ -70,14 +69,13 @@ class BaseParameters:
         Shares are of the longest column of the same unit, after what those before it
         explain; a parameter is dropped below :data:`TOLERANCE`.
         """
-        absent = len(self.unobservable)
+        s, absent = len(self.standard_names), len(self.unobservable)
         text = (
-            f"{self.rank} of {len(self.standard_names)} standard parameters are independent,"
-            f" {len(self.standard_names) - self.rank - absent} are grouped into them, {absent} act"
-            " on no torque."
+            f"{self.rank} of {s} standard parameters are independent, {s - self.rank - absent} are"
+            f" grouped into them, {absent} act on no torque."
         )
-        if self.rank == len(self.standard_names):
-            return f"{text} Nothing had to be decided."
+        if self.rank == s:
+            return text
         weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         text += (
             f" The weakest of them, {weakest}, leaves {self.smallest_pivot:.1e} of its column"
@@ -86,30 +84,25 @@ class BaseParameters:
         )
         if self.gap < _CLEAR or self.smallest_pivot < _WEAK:
             return (
-                f"{text} That is close: small lengths or angles of the robot description, meant as"
-                f" zero or not, decide whether {weakest} is a parameter of its own. Check them; a"
-                " parameter that hardly acts is named where data do not determine it."
+                f"{text} That is close: small lengths or angles of the robot description decide"
+                f" whether {weakest} is a parameter of its own."
             )
-        text += f" A gap of {np.log10(self.gap):.0f} orders of magnitude: the decision is clear."
-        if self.largest_dropped < _EXACT:
-            return text
-        return f"{text} Figures of the robot description are rounded (1.5708 for pi/2)."
+        return (
+            f"{text} A gap of {np.log10(self.gap):.0f} orders of magnitude: the decision is clear."
+        )
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group in words: ``I1yy + I1m + 0.09 m2 + ...``."""
-        return tuple(self._expression(row, int(k), digits) for row, k in enumerate(self.pivots))
-
-    def _expression(self, row: int, pivot: int, digits: int) -> str:
-        text = self.standard_names[pivot]
-        for column in np.flatnonzero(np.abs(self.grouping[row]) > _UNSPEAKABLE):
-            if column == pivot:
-                continue
-            value = self.grouping[row, column]
-            factor = f"{abs(value):.{digits}g}"
-            sign = "+" if value > 0.0 else "-"
-            name = self.standard_names[column]
-            text += f" {sign} {name}" if factor == "1" else f" {sign} {factor} {name}"
-        return text
+        found = []
+        for row, pivot in zip(self.grouping, self.pivots, strict=True):
+            text = self.standard_names[pivot]
+            for column in np.flatnonzero(np.abs(row) > _UNSPEAKABLE):
+                if column != pivot:
+                    factor, name = f"{abs(row[column]):.{digits}g}", self.standard_names[column]
+                    sign = "+" if row[column] > 0.0 else "-"
+                    text += f" {sign} {name}" if factor == "1" else f" {sign} {factor} {name}"
+            found.append(text)
+        return tuple(found)
 
 
 def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) -> BaseParameters:

@@ -76,16 +76,6 @@ class Element(ABC):
         """Names of the c identified parameters, without the number of the joint."""
         return tuple(one.symbol for one in self.coefficients if one.identified)
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Their units (c,)."""
-        return tuple(one.unit for one in self.coefficients if one.identified)
-
-    @property
-    def nominal(self) -> tuple[float, ...]:
-        """Their values (c,) as far as they are given, else zero."""
-        return tuple(one.value or 0.0 for one in self.coefficients if one.identified)
-
     def columns(self, q: Array) -> Array:
         """Return the torque per unit of each identified parameter, at angles (m,): (m, c)."""
         return self.shapes(q)[:, [one.identified for one in self.coefficients]]
@@ -121,16 +111,6 @@ class Anchors:
                 f"both anchors are {self.base:g} m from the axis: they would meet at one angle;"
                 " give the measured distances"
             )
-
-    @property
-    def shortest(self) -> float:
-        """Smallest distance between the anchors over a whole turn [m]."""
-        return abs(self.base - self.link)
-
-    @property
-    def longest(self) -> float:
-        """Largest distance between the anchors over a whole turn [m]."""
-        return self.base + self.link
 
     def length(self, q: Array) -> Array:
         """Return the distance l between the anchors [m] at positions (m,) [rad]."""
@@ -252,7 +232,8 @@ class GasCylinder(Element):
         _require_positive("area", "m²", self.area)
         _require_positive("pressure", "Pa", self.pressure)
         _require_positive("volume", "m³", self.volume)
-        end = self.anchors.longest if self.pulls else self.anchors.shortest
+        base, link = self.anchors.base, self.anchors.link
+        end = base + link if self.pulls else abs(base - link)
         left = float(self._volume_left(np.array(end)))
         if not left > 0.0:
             raise ModelError(
@@ -332,14 +313,11 @@ class PlacedElement(NamedTuple):
 
     def columns(self, q: Array) -> Array:
         """Return the columns (m, c) at joint positions (m, n)."""
-        return self.element.columns(self._angle(q))
+        return self.element.columns(np.asarray(q @ np.array(self.turns)))
 
     def known(self, q: Array) -> Array:
         """Return the known torque [N·m] (m,) at joint positions (m, n)."""
-        return self.element.known(self._angle(q))
-
-    def _angle(self, q: Array) -> Array:
-        return np.asarray(q @ np.array(self.turns))
+        return self.element.known(np.asarray(q @ np.array(self.turns)))
 
 
 @dataclass(frozen=True)
@@ -361,23 +339,23 @@ class JointElements:
         Raises:
             ModelError: there is no such joint, or it slides.
         """
+        placed, first = [], 0
         for element in elements:
             if element.joint not in joint_names:
                 raise ModelError(
                     f"there is no joint {element.joint!r} for an element to act on; there are"
                     f" {', '.join(joint_names)}"
                 )
-            if not revolute[joint_names.index(element.joint)]:
+            joint = joint_names.index(element.joint)
+            if not revolute[joint]:
                 raise ModelError(
                     f"joint {element.joint!r} slides; springs and balancers are for joints that"
                     " turn",
                     joint=element.joint,
                 )
-        placed, first = [], 0
-        for element in elements:
             part = slice(first, first + len(element.symbols))
             turns = tuple(element.turns.get(name, 0.0) for name in joint_names)
-            placed.append(PlacedElement(element, joint_names.index(element.joint), turns, part))
+            placed.append(PlacedElement(element, joint, turns, part))
             first = part.stop
         return cls(tuple(placed))
 
@@ -404,14 +382,18 @@ class JointElements:
         return tuple(names)
 
     @property
+    def _coefficients(self) -> list[Coefficient]:
+        return [c for one in self.elements for c in one.coefficients if c.identified]
+
+    @property
     def units(self) -> tuple[str, ...]:
         """Units of the e parameters."""
-        return tuple(unit for element in self.elements for unit in element.units)
+        return tuple(one.unit for one in self._coefficients)
 
     @property
     def nominal(self) -> Array:
         """Values of the e parameters as far as they are given, else zero."""
-        return np.array([value for one in self.elements for value in one.nominal], dtype=np.float64)
+        return np.array([one.value or 0.0 for one in self._coefficients], dtype=np.float64)
 
     def torque(self, values: Array, q: Array) -> Array:
         """Return the torque (m, n) [N·m] for e parameter values, without what is known."""

@@ -126,11 +126,6 @@ def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
     assert "10 act on no torque" in text
     assert "1e-05" in text
     assert "the decision is clear" in text
-    rounded = urdf_text().replace("1.5707963267948966", "1.5708")
-    assert (
-        "Figures of the robot description are rounded"
-        in RobotModel.from_urdf(rounded).base.explanation()
-    )
 
 
 def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:

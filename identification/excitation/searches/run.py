@@ -18,12 +18,12 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.excitation.criteria import SENSE, Criteria, fitness_eq7
-from identification.excitation.errors import DesignError, NoFeasibleMotionError
+from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import CHUNK, Population, SearchSettings
 from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
-from identification.excitation.violation import KINDS, Violation
+from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
 
 Array = NDArray[np.float64]
 Phase = Literal["sample", "search", "polish"]
