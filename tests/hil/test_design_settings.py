@@ -24,17 +24,13 @@ def cell() -> Cell:
     return Cell.load(CELL_PATH)
 
 
-def test_method_a_has_the_papers_figures():
-    a = preset("a")
+def test_methods_have_the_papers_figures():
+    a, b = preset("a"), preset("b")
     assert (a.search.population, a.search.generations) == (100, 120)
     assert (a.search.mutation, a.search.crossover, a.search.polish) == (0.01, 0.7, 0)
     assert a.sines is not None and a.sines.harmonics == 3
     assert a.sines.fastest == [0.94, 2.38, 0.53, 0.44, 0.89, 0.44]
     assert a.sines.slowest == [0.314]
-
-
-def test_method_b_has_the_papers_figures():
-    b = preset("b")
     assert (b.search.population, b.search.generations) == (150, 120)
     assert (b.search.mutation, b.search.crossover, b.search.polish) == (0.01, 0.9, 0)
     assert b.search.weights == (0.7, 0.3)
@@ -42,21 +38,19 @@ def test_method_b_has_the_papers_figures():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_shown_is_what_is_used(method, tmp_path):
-    path = tmp_path / "my.toml"
+def test_presets_are_files_with_all_constraints_on(method, tmp_path):
+    path, settings = tmp_path / "my.toml", preset(method)
     path.write_text(preset_text(method))
-    assert load_settings(path) == preset(method)
-    assert preset(method).method == method
-    assert search_settings(preset(method)).method == method
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_real_cell_gets_all_its_constraints_unless_asked_otherwise(method):
-    kept = preset(method).constraints
-    assert kept.closed and kept.collision and kept.current
-    bare = preset(method).kinematic().constraints
+    assert load_settings(path) == settings
+    assert settings.method == search_settings(settings).method == method
+    given = settings.constraints
+    assert given.closed and given.collision and given.current
+    bare = settings.kinematic().constraints
     assert not (bare.closed or bare.collision or bare.current)
-    assert bare.max_duration == kept.max_duration == 20.0
+    assert bare.max_duration == given.max_duration == 20.0
+    changed = settings.replaced(seed=7, search={"mutation": 1 / 3})
+    path.write_text(to_text(changed.to_dict(), {"search": "how"}))
+    assert load_settings(path) == changed
 
 
 def test_a_file_may_leave_out_what_its_method_says_already():
@@ -140,14 +134,6 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         load_settings(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_settings_written_down_read_back_the_same(method, tmp_path):
-    settings = preset(method).replaced(seed=7, search={"mutation": 1 / 3})
-    path = tmp_path / "settings.toml"
-    path.write_text(to_text(settings.to_dict(), {"search": "how"}))
-    assert load_settings(path) == settings
-
-
 def test_via_points_lead_home_unless_the_path_is_open(cell):
     closed = problem_of(cell, preset("b")).genome
     assert isinstance(closed, ViaPointGenome) and closed.home is not None
@@ -158,21 +144,14 @@ def test_via_points_lead_home_unless_the_path_is_open(cell):
     assert open_path.genome.n_genes == (6 + 1) * 6  # K via points and a speed, for each joint
 
 
-def test_the_papers_frequencies_are_those_of_the_genome(cell):
-    genome = problem_of(cell, preset("a").kinematic()).genome
-    assert isinstance(genome, SineGenome)
-    slowest, fastest = genome.frequency_range
+def test_frequencies_are_the_papers_or_from_the_limits(cell):
+    settings, limits = preset("a").kinematic(), cell.joint_limits
+    slowest, fastest = problem_of(cell, settings).genome.frequency_range
     np.testing.assert_array_equal(slowest, np.full(6, 0.314))
     np.testing.assert_array_equal(fastest, [0.94, 2.38, 0.53, 0.44, 0.89, 0.44])
-
-
-def test_frequencies_from_the_limits_are_the_appendixs(cell):
-    settings = preset("a").kinematic().replaced(sines={"fastest": "from limits"})
-    genome = problem_of(cell, settings).genome
-    assert isinstance(genome, SineGenome)
-    limits = cell.joint_limits
+    of_limits = problem_of(cell, settings.replaced(sines={"fastest": "from limits"})).genome
     room = (limits.upper - limits.lower) / 2.0
-    np.testing.assert_allclose(genome.frequency_range[1], np.sqrt(limits.acceleration / room))
+    np.testing.assert_allclose(of_limits.frequency_range[1], np.sqrt(limits.acceleration / room))
 
 
 def test_an_offset_is_read_in_the_frame_of_the_limits(cell):
@@ -237,17 +216,14 @@ def test_a_cell_without_drives_can_be_designed_for_as_far_as_its_joints_go():
         problem_of(without, preset("b"))
 
 
+def known_of(names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> Knowledge:
+    p = len(names)
+    return Knowledge(names, values, std, np.ones(6), np.eye(p), samples=100, repetitions=30)
+
+
 def test_what_is_known_too_badly_is_left_out(cell):
-    p = cell.model.n_parameters
-    known = Knowledge(
-        names=cell.model.parameter_names,
-        values=np.full(p, -2.0),
-        std=np.linspace(0.01, 3.0, p),
-        joint_weights=np.ones(6),
-        gram=np.eye(p),
-        samples=100,
-        repetitions=30,
-    )
+    names, p = cell.model.parameter_names, cell.model.n_parameters
+    known = known_of(names, np.full(p, -2.0), np.linspace(0.01, 3.0, p))
     settings = preset("b").kinematic().replaced(objective={"max_relative_std": 30.0})
     objective = problem_of(cell, settings, known).objective
     np.testing.assert_array_equal(objective.parameters, np.flatnonzero(known.std <= 0.6))
@@ -257,19 +233,8 @@ def test_what_is_known_too_badly_is_left_out(cell):
     too_good = settings.replaced(objective={"max_relative_std": 0.1})
     with pytest.raises(SettingsError, match="leaves 0 parameters"):
         problem_of(cell, too_good, known)
-
-
-def test_a_value_of_zero_is_never_known_well():
-    known = Knowledge(
-        names=("a", "b"),
-        values=np.array([0.0, 1.0]),
-        std=np.array([0.1, math.inf]),
-        joint_weights=np.ones(1),
-        gram=np.eye(2),
-        samples=1,
-        repetitions=1,
-    )
-    assert np.all(np.isinf(known.relative_std))
+    nothing = known_of(("a", "b"), np.array([0.0, 1.0]), np.array([0.1, math.inf]))
+    assert np.all(np.isinf(nothing.relative_std))
 
 
 @given(
@@ -335,15 +300,7 @@ class TestPayload:
         assert names == ["Iyy", "mcx", "mcz", "m"]
 
     def test_earlier_archives_add_nothing(self, cell):
-        p = cell.model.n_parameters
-        known = Knowledge(
-            names=cell.model.parameter_names,
-            values=np.ones(p),
-            std=np.ones(p),
-            joint_weights=np.ones(6),
-            gram=np.eye(p),
-            samples=1,
-            repetitions=1,
-        )
+        names = cell.model.parameter_names
+        known = known_of(names, np.ones(len(names)), np.ones(len(names)))
         with pytest.raises(SettingsError, match=r"known.*leave out --earlier"):
             problem_of(cell, preset("front").for_payload(), known)

@@ -78,31 +78,19 @@ def bits(motion: PiecewiseCubic | FourierSeries) -> bytes:
 # Both kinds
 
 
-def test_a_motion_of_the_papers_size_has_so_many_genes():
-    assert OPEN.n_genes == 6 * 6 + 6  # K = 6 via points and a speed for each joint
-    assert CLOSED.n_genes == 4 * 6 + 6  # home is no gene
-    assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
-
-
 @GENOMES
-def test_company_changes_no_bit_of_a_motion(genome):
+def test_neither_company_nor_process_changes_a_bit(genome):
     genes = some_genes(genome, 5)
-    together = genome.motions(genes)
-    for index in range(5):
-        (alone,) = genome.motions(genes[[index]])
-        assert bits(alone) == bits(together[index])
-
-
-def test_a_motion_is_the_same_in_another_process():
+    together = [bits(motion) for motion in genome.motions(genes)]
+    assert [bits(genome.motions(genes[[k]])[0]) for k in range(5)] == together
     with WorkerProcess(timeout=60.0) as child:
-        for genome in (OPEN, CLOSED, BARE, RAMPED):
-            genes = some_genes(genome, 2)
-            theirs = child.call(genome.motions, genes)
-            assert [bits(m) for m in theirs] == [bits(m) for m in genome.motions(genes)]
+        assert [bits(motion) for motion in child.call(genome.motions, genes)] == together
 
 
 @GENOMES
 def test_a_first_population_is_uniform_and_its_seed_decides_it(genome):
+    assert (OPEN.n_genes, CLOSED.n_genes) == (6 * 6 + 6, 4 * 6 + 6)  # points and speeds; no home
+    assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
     genes = genome.sample(np.random.default_rng(7), 50)
     assert genes.shape == (50, genome.n_genes)
     assert kstest(genes.ravel(), "uniform").pvalue > 0.001
@@ -126,7 +114,7 @@ def test_a_genome_does_not_change_with_the_array_it_was_made_of():
 
 
 @pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_genes_at_their_ends_reach_the_ends_of_range_and_speed(genome):
+def test_genes_reach_the_ends_of_range_and_speed(genome):
     lower, upper = LIMITS.lower, LIMITS.upper
     spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
     own = slice(None) if genome.home is None else slice(1, -1)
@@ -167,7 +155,7 @@ def test_motions_are_the_planners_and_keep_its_limits(genome):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_with_a_home_the_path_is_closed_and_without_it_leads_from_first_to_last():
+def test_a_path_leads_home_or_from_first_to_last():
     for genome, ends in ((CLOSED, (HOME, HOME)), (OPEN, None)):
         genes = some_genes(genome, 1)
         points, _ = genome.decode(genes)
@@ -178,7 +166,7 @@ def test_with_a_home_the_path_is_closed_and_without_it_leads_from_first_to_last(
         np.testing.assert_allclose(qd, 0.0, atol=1e-9)
 
 
-def test_a_motion_that_cannot_be_planned_is_told_in_its_place(monkeypatch):
+def test_an_error_of_planning_has_its_motions_place(monkeypatch):
     # No legal genes are known to fail; so the second's via points leave the range on the way.
     genes = some_genes(OPEN, 3)
     points, speed = OPEN.decode(genes)
@@ -189,7 +177,7 @@ def test_a_motion_that_cannot_be_planned_is_told_in_its_place(monkeypatch):
 
 
 @pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_the_record_of_via_points_plans_to_its_motion_bit_for_bit(genome):
+def test_recorded_via_points_plan_to_the_motion(genome):
     genes = some_genes(genome, 1)
     (motion,) = genome.motions(genes)
     record = Excitation(criteria=CRITERIA, **RECORD, trajectory=motion, **genome.recorded(genes[0]))
@@ -216,7 +204,7 @@ def feasible(genome, genes, checker) -> float:
 
 
 @pytest.mark.parametrize("home", [HOME, None], ids=["closed", "open"])
-def test_the_ways_of_a_first_population_among_obstacles_are_free(checker, home):
+def test_paths_of_a_first_population_are_free(checker, home):
     genome = ViaPointGenome(LIMITS, n_via=5, home=home, checker=checker)
     points, _ = genome.decode(genome.sample(np.random.default_rng(2), 12))
     for path in points:
@@ -225,7 +213,7 @@ def test_the_ways_of_a_first_population_among_obstacles_are_free(checker, home):
             assert checker.clear(np.linspace(start, end, steps + 1)).all()
 
 
-def test_a_first_population_among_obstacles_is_mostly_feasible(checker):
+def test_a_population_among_obstacles_is_mostly_feasible(checker):
     free = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
     blind = ViaPointGenome(LIMITS, n_via=6, home=HOME)
     random = np.random.default_rng
@@ -244,7 +232,7 @@ def test_it_is_as_wide_as_the_obstacles_allow_and_its_seed_decides_it(checker):
     assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
 
 
-def test_where_nothing_is_free_there_is_a_first_population_all_the_same(checker):
+def test_a_population_is_drawn_where_nothing_is_free(checker):
     everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
     buried = CollisionChecker(urdf_text(), everywhere)
     genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=buried)
@@ -268,6 +256,8 @@ def test_genes_at_their_ends_reach_the_papers_bounds():
     np.testing.assert_allclose(amplitude[0], np.tile(half[:, None] / 3.0, 3), rtol=1e-15)
     largest = np.sqrt(LIMITS.acceleration / half)
     np.testing.assert_allclose(frequency[0], np.tile(largest[:, None], 3), rtol=1e-15)
+    np.testing.assert_allclose(BARE.frequency_range[0], 0.314, atol=5e-4)  # Table 1, for 20 s
+    assert not np.any(RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))[0].amplitude)
 
 
 @pytest.mark.parametrize("genome", [BARE, RAMPED])
@@ -310,20 +300,6 @@ def test_with_a_ramp_it_starts_and_ends_at_rest_in_its_offset():
     np.testing.assert_array_equal(q, [HOME, HOME])
     assert not np.any(qd) and not np.any(qdd)
     assert np.ptp(motion.sample(np.linspace(0.0, 15.0, 500))[0], axis=0).min() > 0.05
-
-
-def test_the_slowest_sine_makes_one_period_which_is_the_papers_figure_for_20_s():
-    slowest, _ = BARE.frequency_range
-    np.testing.assert_allclose(slowest, 0.314, atol=5e-4)  # Table 1
-
-
-def test_genes_of_one_half_are_a_standstill():
-    (motion,) = RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))
-    assert not np.any(motion.amplitude)
-
-
-def test_sines_were_planned_from_nothing_else():
-    assert RAMPED.recorded(some_genes(RAMPED, 1)[0]) == {}
 
 
 @pytest.mark.parametrize(

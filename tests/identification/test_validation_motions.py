@@ -74,6 +74,10 @@ def test_they_are_feasible_wide_and_all_different(drawn, limits, checker, make_c
     assert len(motions) == 6
     for motion in motions:
         assert check_motion(motion, limits, checker=checker, currents=make_currents(1)).ok
+    for one in drawn[:2]:  # moves plan to the motion bit for bit
+        again = plan_moves(one.via_points[0], one.moves, limits)
+        assert again.trajectory.to_dict() == one.trajectory.to_dict()
+    for motion in motions:
         ends, rates, _ = motion.sample(np.array([0.0, motion.duration]))
         np.testing.assert_allclose(ends, [HOME, HOME], atol=1e-12)
         np.testing.assert_allclose(rates, 0.0, atol=1e-9)
@@ -94,17 +98,7 @@ def test_a_seed_gives_the_same_ones_however_many_are_asked_for(
     assert not np.array_equal(other[0].via_points, drawn[0].via_points)
 
 
-def test_what_was_drawn_plans_to_the_motion_bit_for_bit(limits, checker, make_currents):
-    (motion,) = random_validation_motions(
-        limits, home=HOME, seed=3, count=1, fly=0.3, checker=checker, currents=make_currents(1)
-    )
-    assert motion.fly == 0.3
-    np.testing.assert_array_equal(motion.via_points[[0, -1]], [HOME, HOME])
-    again = plan_moves(motion.via_points[0], motion.moves, limits)
-    assert again.trajectory.to_dict() == motion.trajectory.to_dict()
-
-
-def test_archives_can_be_repeated_the_motions_of_a_seed_never_change(limits):
+def test_the_motions_of_a_seed_never_change(limits):
     # Taken when campaigns were first recorded; plans of old archives name these seeds.
     drawn = random_validation_motions(limits, home=HOME, seed=7, count=2)
     text = json.dumps([[m.via_points.tolist(), m.speed.tolist()] for m in drawn])
@@ -140,9 +134,7 @@ def test_a_motion_whose_planning_kills_its_process_is_passed_over(limits, monkey
     np.testing.assert_array_equal(same.via_points, second.via_points)
 
 
-def test_when_nothing_is_feasible_the_error_says_what_forbids_it_where_and_by_how_much(
-    limits, make_currents
-):
+def test_the_error_says_what_forbids_every_motion(limits, make_currents, monkeypatch):
     with pytest.raises(NoFeasibleMotionError) as refusal:
         random_validation_motions(limits, home=HOME, seed=3, count=1, currents=make_currents(0.01))
     error = refusal.value
@@ -151,6 +143,11 @@ def test_when_nothing_is_feasible_the_error_says_what_forbids_it_where_and_by_ho
     assert mildest.subject.startswith("motor of joint_")
     assert mildest.value > mildest.bound
     assert str(mildest) in str(error)
+    monkeypatch.setattr("identification.excitation.validation_motions._LONGEST", 2.0)
+    with pytest.raises(NoFeasibleMotionError) as refusal:
+        random_validation_motions(limits, home=HOME, seed=1, count=1)
+    assert refusal.value.rejected == {"duration": 100}
+    assert refusal.value.nearest["duration"].bound == 2.0
 
 
 def test_a_home_posture_in_collision_is_refused_by_the_pair(limits):
@@ -160,9 +157,7 @@ def test_a_home_posture_in_collision_is_refused_by_the_pair(limits):
     assert refusal.value.nearest["collision"].value < 0.0
 
 
-def test_a_cell_that_is_full_where_the_arm_should_go_is_refused_by_the_obstacle(
-    model, limits, monkeypatch
-):
+def test_a_full_cell_is_refused_by_the_obstacle(model, limits, monkeypatch):
     tries = "identification.excitation.validation_motions._TRIES_PER_MOTION"
     monkeypatch.setattr(tries, 3)  # each looks at fifty ways
     monkeypatch.setattr("identification.excitation.validation_motions._RANGE_SHARE", 0.02)
@@ -178,11 +173,3 @@ def test_a_cell_that_is_full_where_the_arm_should_go_is_refused_by_the_obstacle(
     assert error.nearest["collision"].subject.endswith("and box 0")
     assert len(error.nearest["collision"].posture) == 6
     assert error.nearest["collision"].value < 0.05
-
-
-def test_a_motion_that_takes_too_long_is_refused(limits, monkeypatch):
-    monkeypatch.setattr("identification.excitation.validation_motions._LONGEST", 2.0)
-    with pytest.raises(NoFeasibleMotionError) as refusal:
-        random_validation_motions(limits, home=HOME, seed=1, count=1)
-    assert refusal.value.rejected == {"duration": 100}
-    assert refusal.value.nearest["duration"].bound == 2.0
