@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from identification.excitation import Excitation
 from identification.excitation.criteria import Criteria
-from identification.excitation.excitation import trajectory_from_dict
-from planner import FourierSeries, JointLimits, PiecewiseCubic, plan, plan_moves
+from planner import FourierSeries, JointLimits, plan, plan_moves
 
 LIMITS = JointLimits(
     lower=np.array([-2.0, -1.0, -3.0]),
@@ -57,11 +56,11 @@ def through_json(excitation: Excitation) -> Excitation:
 
 
 @given(
-    make=st.sampled_from([planned, sines]),
+    make=st.sampled_from([planned, lambda seed: planned(seed, 0.0), sines]),
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=30, deadline=None)
-def test_an_excitation_survives_being_written_down_to_the_last_bit(make, seed):
+def test_every_bit_of_an_excitation_comes_back(make, seed):
     excitation = make(seed)
     restored = through_json(excitation)
     assert restored.to_dict() == excitation.to_dict()
@@ -78,14 +77,9 @@ def test_an_excitation_survives_being_written_down_to_the_last_bit(make, seed):
         restored.trajectory.sample(times), excitation.trajectory.sample(times), strict=True
     ):
         np.testing.assert_array_equal(ours, theirs)
-
-
-@pytest.mark.parametrize("fly", [0.0, 0.3, 1.0])
-def test_its_moves_plan_to_its_motion_bit_for_bit_even_after_being_written_down(fly):
-    excitation = through_json(planned(3, fly))
-    assert excitation.fly == fly
-    again = plan_moves(excitation.via_points[0], excitation.moves, LIMITS)
-    assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
+    if restored.via_points is not None:  # its moves plan to the motion bit for bit
+        again = plan_moves(restored.via_points[0], restored.moves, LIMITS)
+        assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
 
 
 def test_sines_have_no_moves_and_say_nothing_of_via_points():
@@ -95,7 +89,7 @@ def test_sines_have_no_moves_and_say_nothing_of_via_points():
     assert not {"via_points", "speed", "fly"} & excitation.to_dict().keys()
 
 
-def test_what_was_written_down_before_there_were_methods_still_loads():
+def test_records_from_before_methods_still_load():
     excitation = planned(5)
     old = excitation.to_dict()
     del old["method"]
@@ -106,13 +100,6 @@ def test_what_was_written_down_before_there_were_methods_still_loads():
     assert (restored.criteria.condition, restored.criteria.scaled_condition) == (None, None)
     assert restored.criteria.log10_det == excitation.criteria.log10_det
     np.testing.assert_array_equal(restored.via_points, excitation.via_points)
-
-
-def test_a_motion_of_either_kind_is_restored_by_its_type():
-    for excitation, kind in ((planned(1), PiecewiseCubic), (sines(1), FourierSeries)):
-        assert isinstance(trajectory_from_dict(excitation.trajectory.to_dict()), kind)
-    with pytest.raises(ValueError, match="type"):
-        trajectory_from_dict({"type": "spline"})
 
 
 @pytest.mark.parametrize(
@@ -127,6 +114,7 @@ def test_a_motion_of_either_kind_is_restored_by_its_type():
         {"seed": 10**400},
         {"method": "\ud800"},
         {"trajectory": []},
+        {"trajectory": {"type": "spline"}},
         {"trajectory": sines(1).trajectory.to_dict() | {"length": 10**400}},
         {"trajectory": sines(1).trajectory.to_dict() | {"amplitude": [[10**400], [1]]}},
         {"criteria": {}},
@@ -140,16 +128,9 @@ def test_data_that_are_no_excitation_are_refused(damage):
         Excitation.from_dict({**sines(1).to_dict(), **damage})
 
 
-@pytest.mark.parametrize("missing", ["trajectory", "criteria", "seed", "tried", "rejected"])
+@pytest.mark.parametrize("missing", ["trajectory", "criteria", "seed", "rejected", "via_points"])
 def test_data_that_lack_something_are_refused(missing):
-    data = sines(1).to_dict()
+    data = planned(1).to_dict()
     del data[missing]
     with pytest.raises(ValueError, match=f"not an excitation.*{missing}"):
-        Excitation.from_dict(data)
-
-
-def test_a_planned_motion_without_its_via_points_is_refused():
-    data = planned(1).to_dict()
-    del data["via_points"]
-    with pytest.raises(ValueError, match="via_points"):
         Excitation.from_dict(data)

@@ -107,32 +107,24 @@ def a_link(moments: tuple[float, float, float], mass: float = 2.0) -> Array:
     return inertial_parameters(Body(mass, np.array([0.1, 0.0, 0.2]), np.diag(moments)))
 
 
-def test_a_possible_body_is_left_alone() -> None:
-    links = np.array([a_link((0.02, 0.02, 0.03)), a_link((0.1, 0.1, 0.02))])
+SOUND, FLAT, POINT = (0.1, 0.1, 0.02), (0.001, 0.002, 0.02), (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("moments", "words"), [(SOUND, AS_GIVEN), (FLAT, MADE_POSSIBLE), (POINT, MADE_POSSIBLE)]
+)
+def test_as_much_of_a_link_is_used_as_is_possible(
+    moments: tuple[float, float, float], words: str
+) -> None:
+    """All of a possible one, mass and centre of another, those of the others without mass."""
+    links = np.array([a_link(moments), a_link(SOUND), np.zeros(10)])
     found = reference_bodies(links, STEPS)
-    np.testing.assert_allclose(found.inertial, links, atol=1e-14)
-    assert found.words == (AS_GIVEN, AS_GIVEN)
-
-
-def test_an_impossible_one_keeps_its_mass_and_centre() -> None:
-    links = np.array([a_link((0.001, 0.002, 0.02)), a_link((0.1, 0.1, 0.02))])
-    found = reference_bodies(links, STEPS)
-    assert found.words == (MADE_POSSIBLE, AS_GIVEN)
-    np.testing.assert_allclose(found.inertial[0, 6:], links[0, 6:])
-    assert margin(found.inertial[0]) > 0.0
-
-
-def test_a_point_becomes_a_body() -> None:
-    found = reference_bodies(np.array([a_link((0.0, 0.0, 0.0)), a_link((0.1, 0.1, 0.02))]), STEPS)
-    assert found.words[0] == MADE_POSSIBLE
-    assert margin(found.inertial[0]) > 1e-6
-
-
-def test_a_link_without_mass_weighs_what_the_others_do() -> None:
-    links = np.array([a_link((0.1, 0.1, 0.02), mass=3.0), np.zeros(10)])
-    found = reference_bodies(links, STEPS)
-    assert found.words == (AS_GIVEN, ASSUMED)
-    assert found.inertial[1, 9] == 3.0
+    assert found.words == (words, AS_GIVEN, ASSUMED)
+    possible = slice(None) if words == AS_GIVEN else slice(6, None)
+    np.testing.assert_allclose(found.inertial[0, possible], links[0, possible], atol=1e-14)
+    np.testing.assert_allclose(found.inertial[1], links[1], atol=1e-14)
+    assert np.all(margin(found.inertial) > 1e-6)
+    assert found.inertial[2, 9] == 2.0
 
 
 @given(st.integers(0, 2**32 - 1))

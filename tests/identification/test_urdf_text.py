@@ -118,10 +118,12 @@ def test_it_is_refused_in_a_sentence_and_at_once(case: str) -> None:
 
 @pytest.mark.parametrize(
     "number",
-    ["6 ", "nan", "inf", "1e999", "0x6", "6,0", "1_0", "", "\u0663", "6&#10;", "9" * 400],
+    ["-6", "6 ", "nan", "inf", "1e999", "0x6", "6,0", "1_0", "", "\u0663", "6&#10;", "9" * 400],
 )
 def test_an_inertia_that_the_reader_would_leave_out_is_refused(number: str) -> None:
-    with pytest.raises(ModelError, match=r"link 'upper' has value=.* in the <mass>"):
+    with pytest.raises(
+        ModelError, match=r"'upper' has (value=.* in the <mass>|a mass of -6 kg)"
+    ):
         RobotModel.from_urdf(arm('value="6"', f'value="{number}"'))
 
 
@@ -146,11 +148,6 @@ def test_an_inertia_of_which_a_part_is_missing_is_refused(left_out: str) -> None
     with pytest.raises(ModelError) as caught:
         RobotModel.from_urdf(text)
     assert f"link 'upper' has {LOST[left_out]}" in str(caught.value)
-
-
-def test_a_negative_mass_is_refused() -> None:
-    with pytest.raises(ModelError, match="link 'upper' has a mass of -6 kg; write 0 or more"):
-        RobotModel.from_urdf(arm('value="6"', 'value="-6"'))
 
 
 @pytest.mark.parametrize("left_out", [INERTIAL, '<origin xyz="0.2 0 0"/>', ' xyz="0.2 0 0"'])
@@ -230,29 +227,20 @@ AWAY = r"more than 1e\+06 m away from what carries it"
 FAR = '<origin xyz="1e300 0 0"/>'
 
 
-def test_a_shape_farther_away_than_any_robot_reaches_is_refused() -> None:
-    sound = arm(SHAPE, SHAPE)
-    far = sound.replace("<collision>", "<collision>" + FAR, 1)
-    checker(sound)
-    with pytest.raises(CollisionModelError, match=AWAY):
-        checker(far)
-
-
 @pytest.mark.parametrize("kind", ["revolute", "fixed"])
-def test_a_joint_farther_away_than_any_robot_reaches_is_refused(kind: str) -> None:
+def test_what_is_farther_away_than_a_robot_is_refused(kind: str) -> None:
     sound = chain(1, kind)
     joint = '<joint name="j_l0" type="' + kind + '">'
     assert joint in sound
-    chain_from_urdf(sound)
+    checker(sound)
     with pytest.raises(ModelError, match=f"'j_l0' .* {AWAY}"):
         chain_from_urdf(sound.replace(joint, joint + FAR))
-
-
-def test_a_joint_is_locked_no_farther_away_than_any_robot_reaches() -> None:
-    sound = chain(1, "prismatic")
-    chain_from_urdf(sound, {"j_l0": 1.0})
+    with pytest.raises(CollisionModelError, match=AWAY):
+        checker(sound.replace("<collision>", "<collision>" + FAR, 1))
+    slide = chain(1, "prismatic")
+    chain_from_urdf(slide, {"j_l0": 1.0})
     with pytest.raises(ModelError, match=AWAY):
-        chain_from_urdf(sound, {"j_l0": 1e200})
+        chain_from_urdf(slide, {"j_l0": 1e200})
 
 
 PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collision>'
@@ -324,23 +312,19 @@ def test_what_is_no_xml_is_refused(text: str) -> None:
         urdf_tree(text)
 
 
-def test_in_a_namespace_a_shape_that_was_left_out_is_noticed() -> None:
-    CollisionChecker(drakes(ARM), Workspace(floor=-1.0))
+def test_faults_are_found_in_a_namespace_too() -> None:
+    checker(drakes(ARM))
     second = arm("</robot>", f'<link name="l"/>{HINGE.format("j", "revolute", "upper", "l")}')
     second = second.replace('<link name="l"/>', f'<link name="l">{SHAPE}</link>') + "</robot>"
     with pytest.raises(CollisionModelError, match="of link 'upper' 0 could be read"):
-        CollisionChecker(drakes(second.replace("<box ", "<capsule ", 1)), Workspace(floor=-1.0))
-
-
-def test_in_a_namespace_a_closed_chain_is_refused() -> None:
+        checker(drakes(second.replace("<box ", "<capsule ", 1)))
     closed = arm("</robot>", HINGE.format("again", "revolute", "base", "upper") + "</robot>")
-    with pytest.raises(ModelError, match="child of 2 joints: a closed chain"):
-        RobotModel.from_urdf(drakes(closed))
-
-
-def test_in_a_namespace_a_fault_is_still_told() -> None:
-    with pytest.raises(ModelError, match="'shoulder' is of type 'revolut'"):
-        RobotModel.from_urdf(drakes(arm('"revolute"', '"revolut"')))
+    for text, why in (
+        (closed, "child of 2 joints: a closed chain"),
+        (arm('"revolute"', '"revolut"'), "'shoulder' is of type 'revolut'"),
+    ):
+        with pytest.raises(ModelError, match=why):
+            RobotModel.from_urdf(drakes(text))
 
 
 LINKS = '<link name="a"/><link name="b"/>'
