@@ -77,36 +77,42 @@ def random_validation_motions(
     Raises:
         NoFeasibleMotionError: a hundred tries in a row did not give one feasible motion.
     """
+    rejected, nearest = Counter[str](), dict[str, Violation]()
 
-    def contact(q: Array) -> Violation | None:
-        return None if checker is None else clearance(checker, q)
+    def reject(violations: Sequence[Violation]) -> None:
+        """Count a motion once per kind of constraint it breaks, and note the mildest of each."""
+        for kind in dict.fromkeys(violation.kind for violation in violations):
+            rejected[kind] += 1
+            worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
+            nearest[kind] = min(nearest.get(kind, worst), worst, key=lambda v: v.excess)
 
-    rejected = _Rejected()
-    if (found := contact(home[None])) is not None:
-        rejected.add([replace(found, subject=f"{found.subject} at home")])
-        raise NoFeasibleMotionError(rejected.counts, rejected.nearest)
+    found = None if checker is None else clearance(checker, home[None])
+    if found is not None:
+        reject([replace(found, subject=f"{found.subject} at home")])
+        raise NoFeasibleMotionError(rejected, nearest)
     half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
     middle = (limits.upper + limits.lower) / 2.0
 
     def next_point(random: np.random.Generator, before: Array, *, last: bool) -> Array | Violation:
-        """Draw until the way is free; return what was in the way when patience ends."""
+        """Draw until the path is free; return what was in it when patience ends."""
         draws = 0
         while True:
             point = random.uniform(middle - half, middle + half)
-            way = straight_way(before, point)
+            path = straight_way(before, point)
             if last:
-                way = np.concatenate((way, straight_way(point, home)))
-            if checker is None or checker.clear(way).all():
+                path = np.concatenate((path, straight_way(point, home)))
+            if checker is None or checker.clear(path).all():
                 return point
             draws += 1
-            if draws >= _DRAWS_PER_POINT and (blocked := contact(way)) is not None:
+            blocked = clearance(checker, path) if draws >= _DRAWS_PER_POINT else None
+            if blocked is not None:
                 return blocked
 
     def draw(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
         """Return a feasible motion, or why there is none.
 
-        Points are drawn one after the other, each within free straight reach of the one before;
-        the last one must see home. Corners are rounded later: the whole motion is checked then.
+        Points are drawn one after the other, each within free straight reach of the one before,
+        the last one of home. Corners are rounded later: the whole motion is checked then.
         """
         speed = random.uniform(*_SPEED, limits.n_joints)
         points = [home]
@@ -133,23 +139,7 @@ def random_validation_motions(
             if isinstance(motion, DrawnMotion):
                 motions.append(motion)
                 break
-            rejected.add(motion)
+            reject(motion)
         else:
-            raise NoFeasibleMotionError(rejected.counts, rejected.nearest)
+            raise NoFeasibleMotionError(rejected, nearest)
     return tuple(motions)
-
-
-class _Rejected:
-    """How many motions each kind of constraint forbids, and the mildest case of each."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self.nearest: dict[str, Violation] = {}
-
-    def add(self, violations: Sequence[Violation]) -> None:
-        """Count a motion once per kind of constraint it breaks."""
-        for kind in dict.fromkeys(violation.kind for violation in violations):
-            self.counts[kind] += 1
-            worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
-            if kind not in self.nearest or worst.excess < self.nearest[kind].excess:
-                self.nearest[kind] = worst

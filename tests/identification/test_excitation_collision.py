@@ -422,11 +422,11 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
 
 def test_what_is_built_in_is_named_shape_by_shape():
     wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
-    (pair,) = wrist.built_in
+    (pair,) = wrist._scene.built_in
     assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
     assert pair.nearest <= pair.farthest < 0.0
     assert "link_0_0 and link_2_0" in str(wrist.exceptions)
-    assert checkers(0.05).built_in == ()
+    assert checkers(0.05)._scene.built_in == ()
     assert checkers(0.05).exceptions is None
 
 
@@ -468,7 +468,7 @@ def test_obstacles_in_the_wrong_place_leave_no_moving_link_unchecked(arm, worksp
     with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
     assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
     # The first link turns in it: no motion can mend that, so it is told and not checked.
-    assert {pair.first[:6] for pair in checker.built_in} == {"link_1"}
+    assert {pair.first[:6] for pair in checker._scene.built_in} == {"link_1"}
     home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
     contact = checker.deepest_contact(home)
     assert contact is not None and contact.first == "link_2"
@@ -481,7 +481,7 @@ def test_a_first_link_that_swings_towards_the_floor_is_checked():
     for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
         checker = CollisionChecker(urdf, Workspace(floor=floor))
         assert checker.pairs == (("arm", "floor"),)
-        assert checker.built_in == ()
+        assert checker._scene.built_in == ()
 
 
 def test_limits_of_another_arm_are_refused():

@@ -121,9 +121,7 @@ def test_it_is_refused_in_a_sentence_and_at_once(case: str) -> None:
     ["-6", "6 ", "nan", "inf", "1e999", "0x6", "6,0", "1_0", "", "\u0663", "6&#10;", "9" * 400],
 )
 def test_an_inertia_that_the_reader_would_leave_out_is_refused(number: str) -> None:
-    with pytest.raises(
-        ModelError, match=r"'upper' has (value=.* in the <mass>|a mass of -6 kg)"
-    ):
+    with pytest.raises(ModelError, match=r"'upper' has (value=.* in the <mass>|a mass of -6 kg)"):
         RobotModel.from_urdf(arm('value="6"', f'value="{number}"'))
 
 

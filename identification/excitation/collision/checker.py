@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.hulls import Indices
-from identification.excitation.collision.scene import BuiltIn, Path, Scene, exceptions
+from identification.excitation.collision.scene import Path, Scene, exceptions
 from identification.excitation.joint_limits import rate_bounds
 from identification.model.motion import Motion
 from planner import FourierSeries, JointLimits, PiecewiseCubic
@@ -73,7 +73,7 @@ class CollisionChecker:
     it stands among. Two shapes of the arm, two joints apart at most, that are too close in every
     one of 200 random postures, and closer than 5 cm, are assumed to be built that way (a wrist) and
     left out too, as is a shape of the first link that is as close to an obstacle in all of them
-    (a foot that turns in the floor). `built_in` lists both. One of the two links next to the
+    (a foot that turns in the floor). One of the two links next to the
     mounting that never keeps the margin of a floor or wall, but does not always touch it, keeps
     the largest distance that it can have; `exceptions` says of both. Every other pair is checked,
     even if it always touches.
@@ -94,7 +94,6 @@ class CollisionChecker:
         self,
         urdf: str,
         workspace: Workspace,
-        *,
         limits: JointLimits | None = None,
         mesh_folders: Sequence[str] = (),
     ) -> None:
@@ -103,18 +102,13 @@ class CollisionChecker:
         self._scene = Scene(urdf, workspace, mesh_folders, limits)
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, self._arguments
+        return CollisionChecker, self._arguments
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of what is checked against what, without repetitions."""
         numbers = range(len(self._scene.separation.first))
         return tuple(dict.fromkeys(map(self._scene.names, numbers)))
-
-    @property
-    def built_in(self) -> tuple[BuiltIn, ...]:
-        """Shapes that are not checked against each other, always too close as the arm is built."""
-        return self._scene.built_in
 
     @property
     def exceptions(self) -> str | None:
@@ -249,12 +243,6 @@ class Near(NamedTuple):
     lower: Array
     normal: Array
     bulge: Array
-
-
-def _rebuilt(
-    urdf: str, workspace: Workspace, limits: JointLimits | None, mesh_folders: tuple[str, ...]
-) -> CollisionChecker:
-    return CollisionChecker(urdf, workspace, limits=limits, mesh_folders=mesh_folders)
 
 
 def _contact(scene: Scene, touch: Touch, q: Array, time: Array | None) -> Contact:
