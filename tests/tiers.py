@@ -46,7 +46,6 @@ LONG: Final = (
     "hil/test_compare.py",
     "hil/test_demo_link.py",
     "hil/test_design_command.py",
-    "hil/test_design_compare.py",
     "hil/test_design_earlier.py",
     "hil/test_design_picture.py",
     "hil/test_design_result.py",

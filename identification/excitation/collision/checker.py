@@ -73,10 +73,10 @@ class CollisionChecker:
     it stands among. Two shapes of the arm, two joints apart at most, that are too close in every
     one of 200 random postures, and closer than 5 cm, are assumed to be built that way (a wrist) and
     left out too, as is a shape of the first link that is as close to an obstacle in all of them
-    (a foot that turns in the floor). One of the two links next to the
-    mounting that never keeps the margin of a floor or wall, but does not always touch it, keeps
-    the largest distance that it can have; `exceptions` says of both. Every other pair is checked,
-    even if it always touches.
+    (a foot that turns in the floor). One of the two links next to the mounting that never has the
+    margin of a floor or wall, but does not always touch it, gets the largest distance that it can
+    have in its place; `exceptions` names all of these. Every other pair is checked, even if it
+    always touches.
 
     Args:
         urdf: text of the robot description; meshes are replaced by their convex hulls.
