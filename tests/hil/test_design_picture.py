@@ -181,6 +181,8 @@ class TestArm:
             np.testing.assert_allclose(corners[0], expected, atol=1e-12)
 
     def test_an_arm_without_shapes_becomes_bars_from_joint_to_joint(self):
+        lost = Arm.from_urdf(SHAPES.format('<mesh filename="package://nowhere/link.stl"/>'))
+        assert not lost.has_shapes
         arm = Arm.from_urdf(TWO_LINK.read_text())
         assert not arm.has_shapes
         np.testing.assert_allclose(
@@ -188,10 +190,6 @@ class TestArm:
             [[[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0], [0.01, 0.0, 1.2]]],
             atol=1e-12,
         )
-
-    def test_a_mesh_that_is_not_there_leaves_bars(self):
-        arm = Arm.from_urdf(SHAPES.format('<mesh filename="package://nowhere/link.stl"/>'))
-        assert not arm.has_shapes
 
 
 class TestPostures:
@@ -214,6 +212,8 @@ class TestPostures:
             low, high = strip.extents[axis]
             assert all(low < c[..., axis].min() and c[..., axis].max() < high for c in fine)
         assert strip.extents[2][0] < ns16.workspace.floor
+        assert SIDE.across == TOP.across
+        assert {SIDE.depth, TOP.depth} == {1, 2}
 
     def test_an_obstacle_nearby_is_shown_and_a_far_one_does_not_shrink_the_arm(self, two_link):
         arm, motion = Arm.from_urdf(two_link.urdf), wandering(two_link)
@@ -222,10 +222,6 @@ class TestPostures:
         far_away = TWO_LINK_CELL.replace("0.7, -0.3", "7.7, -0.3").replace("0.9, 0.3", "8.9, 0.3")
         far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
         assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
-
-    def test_both_views_share_what_is_across(self):
-        assert SIDE.across == TOP.across
-        assert {SIDE.depth, TOP.depth} == {1, 2}
 
 
 class TestCorrelations:
@@ -273,11 +269,15 @@ class TestFront:
         points = [line for line in axes.lines if line.get_label().startswith("front")]
         assert [len(line.get_xdata()) for line in points] == ([count] if count > 1 else [])
 
-    def test_the_chosen_motion_and_what_it_is_compared_with_carry_their_figures(self, two_link):
-        figure = self.draw(two_link, 3, 1, A=(104.0, 90.5), B=(101.2, 80.9))
+    def test_motions_on_the_page_carry_their_figures(self, two_link):
+        front = Points(np.array([100.0, 105.7]), np.array([70.0, 80.0]))
+        others = {"A": (104.0, 90.5), "B": (101.2, 80.9)}
+        figure, _ = self.page(two_link, front, chosen=1, references=others, kinematic=("B",))
         said = texts(figure)
-        for label in ("chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (101.2, 80.9)"):
+        for label in ("chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (kinematic) (101.2, 80.9)"):
             assert label in said
+        assert "polished" not in " ".join(said)
+        assert not front_axes(draw_design(excitation(two_link, wandering(two_link)), two_link))
 
     def page(self, cell: Cell, front: Points, **options) -> tuple[Figure, Axes]:
         figure = draw_design(excitation(cell, wandering(cell)), cell, front=front, **options)
@@ -293,12 +293,12 @@ class TestFront:
         said = " ".join(texts(figure))
         assert "chosen, polished (" in said
         assert f"grew from ({knee[0]:.1f}, {knee[1]:.1f})" in said
+        star = next(line for line in axes.lines if line.get_marker() == "*")
+        at = axes.transLimits.inverted().transform([star.get_xdata()[0], star.get_ydata()[0]])
+        np.testing.assert_allclose(at, measures[::-1])  # beside the front, where its criteria are
         (arrow,) = (text for text in axes.texts if getattr(text, "arrow_patch", None))
         np.testing.assert_allclose(arrow.xy, measures[::-1])
         np.testing.assert_allclose(arrow.xyann, knee[::-1])
-
-    def test_a_motion_on_the_front_is_not_called_polished(self, two_link):
-        assert "polished" not in " ".join(texts(self.draw(two_link, 3, 1)))
 
     def test_a_reference_far_away_does_not_flatten_the_front(self, two_link):
         front = Points(np.array([100.0, 102.0, 103.0]), np.array([70.0, 74.0, 80.0]))
@@ -316,14 +316,6 @@ class TestFront:
         view = FrontView(Points(np.array([1.0, 2.0]), np.zeros(2)), (2.0, 0.0))
         assert np.all(np.diff(view.window, axis=1) > 0.0)
 
-    def test_what_is_far_in_one_measure_has_its_place_in_the_other(self):
-        front = Points(np.array([100.0, 103.0]), np.array([70.0, 80.0]))
-        view = FrontView(front, (101.0, 75.0), references={"A": (105.0, 400.0)})
-        (mark,) = (mark for mark in view.marks if mark.compared)
-        across, up = view.placed(mark)
-        assert across > 1.0
-        assert 0.0 < up < 1.0
-
     def test_no_legend_lies_on_the_front(self, two_link, ns16):
         names = ("A", "B", "C", "balanced", "an older one with a long name", "E")
         references = {name: (101.0 + k, 90.0) for k, name in enumerate(names)}
@@ -337,14 +329,6 @@ class TestFront:
             assert not legend.overlaps(matrix.get_tightbbox(renderer))
             assert legend.x1 < figure.bbox.x1
 
-    def test_references_of_joint_limits_only_are_told_from_the_others(self, two_link):
-        front = Points(np.array([100.0, 105.0]), np.array([70.0, 95.0]))
-        references = {"A": (101.0, 90.0), "B": (102.0, 91.0)}
-        figure, _ = self.page(two_link, front, chosen=0, references=references, kinematic=("B",))
-        said = texts(figure)
-        assert "A (101.0, 90.0)" in said
-        assert "B (kinematic) (102.0, 91.0)" in said
-
     def test_what_earlier_archives_add_is_told_from_the_motion_alone(self, two_link):
         front = Points(np.array([100.0, 105.0]), np.array([70.0, 95.0]))
         figure, axes = self.page(two_link, front, chosen=0, together=True)
@@ -356,17 +340,6 @@ class TestFront:
         assert "together" in axes.get_ylabel()
         assert "from this motion alone" in " ".join(texts(figure))
 
-    def test_a_motion_beside_the_front_is_drawn_where_its_criteria_are(self, two_link):
-        (axes,) = front_axes(self.draw(two_link, 3, None))
-        criteria = excitation(two_link, wandering(two_link)).criteria
-        star = next(line for line in axes.lines if line.get_marker() == "*")
-        at = axes.transLimits.inverted().transform([star.get_xdata()[0], star.get_ydata()[0]])
-        np.testing.assert_allclose(at, [criteria.coupling_index, criteria.log10_det])
-
-    def test_there_is_no_room_for_it_where_there_is_none(self, two_link):
-        figure = draw_design(excitation(two_link, wandering(two_link)), two_link)
-        assert front_axes(figure) == []
-
 
 class TestPage:
     def test_joints_are_drawn_between_their_limits_in_the_angles_of_the_cell(self, ns16):
@@ -374,6 +347,8 @@ class TestPage:
         (position,) = (a for a in figure.axes if a.get_ylabel() == "joint_2")
         assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
         assert "position [deg, controller angles]" in texts(figure)
+        equal = [axes for axes in figure.axes if axes.get_aspect() == 1.0 and not axes.images]
+        assert len(equal) == 2 * POSTURES  # each from the side and from above
 
     @pytest.mark.parametrize(
         ("name", "shown"),
@@ -413,12 +388,7 @@ class TestPage:
         calm = draw_design(designed, two_link, margins="current at most 71 % (motor of joint_2)")
         assert not [text for text in calm.texts if text.get_color() == style.LIMIT]
         assert "current at most 71 % (motor of joint_2)" in texts(calm)
-
-    def test_every_posture_is_seen_from_the_side_and_from_above(self, ns16):
-        figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
-        equal = [axes for axes in figure.axes if axes.get_aspect() == 1.0]
-        strip = [axes for axes in equal if not axes.images]
-        assert len(strip) == 2 * POSTURES
+        assert "bars from joint to joint" in " ".join(texts(calm))  # its shapes are not known
 
     def test_sines_can_be_drawn_bare_and_ramped(self, two_link, tmp_path):
         for ramp in (0.0, 1.0):
@@ -471,7 +441,3 @@ class TestPage:
             ]
         for (first, a), (second, b) in combinations(boxes, 2):
             assert not a.overlaps(b), f"{first!r} upon {second!r}"
-
-    def test_a_description_without_shapes_is_named_on_the_page(self, two_link):
-        said = " ".join(texts(draw_design(excitation(two_link, wandering(two_link)), two_link)))
-        assert "bars from joint to joint" in said
