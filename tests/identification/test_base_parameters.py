@@ -15,15 +15,6 @@ def model() -> RobotModel:
     return RobotModel.from_urdf(urdf_text())
 
 
-def full_regressor(model: RobotModel, samples: int = 50) -> np.ndarray:
-    """Columns of all standard parameters, by torque differences: shape (rows, s)."""
-    random = np.random.default_rng(7)
-    q, qd, qdd = random.uniform(-3.0, 3.0, (3, samples, model.n_joints))
-    rank = model.base.rank
-    rows = model.regressor(q, qd, qdd).dense(model.n_parameters)[:, :, :rank]
-    return rows.reshape(-1, rank)
-
-
 def test_the_ns16_groups_exactly_as_the_papers_table_2(model: RobotModel) -> None:
     rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
     assert set(model.base.names) == set(rows)
@@ -33,10 +24,6 @@ def test_the_ns16_groups_exactly_as_the_papers_table_2(model: RobotModel) -> Non
             # Rows 29 and 31 are printed for minus the pivot.
             expected[model.standard_names.index(standard)] = rows[name].sign * factor
         assert np.abs(group - expected).max() < 1e-10, name
-
-
-def test_only_two_rows_of_table_2_have_the_other_sign() -> None:
-    assert [row.id for row in TABLE2[:N_ESSENTIAL] if row.sign < 0] == [29, 31]
 
 
 def test_the_manufacturers_values_come_out_of_the_planted_truth(model: RobotModel) -> None:
@@ -67,11 +54,9 @@ def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: in
     assert base.rank == len(base.names) == rank
     assert base.gap > 1e10
     assert base.smallest_pivot > 1000 * TOLERANCE
-
-
-def test_hanging_upside_down_groups_alike(model: RobotModel) -> None:
-    hanging = RobotModel.from_urdf(urdf_text(), gravity=(0.0, 0.0, 9.81)).base
-    assert np.allclose(hanging.grouping, model.base.grouping, atol=1e-10)
+    if gravity == (0.0, 0.0, 9.81):  # upside down it groups alike
+        standing = RobotModel.from_urdf(urdf_text()).base
+        assert np.allclose(base.grouping, standing.grouping, atol=1e-10)
 
 
 def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> None:
@@ -84,31 +69,23 @@ def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> No
     assert np.array_equal(rounded.grouping != 0.0, model.base.grouping != 0.0)
 
 
-def test_the_choice_is_the_same_every_time(model: RobotModel) -> None:
-    again = RobotModel.from_urdf(urdf_text()).base
-    assert again.names == model.base.names
-    assert np.array_equal(again.grouping, model.base.grouping)
-
-
-def test_each_kept_parameter_stands_for_itself(model: RobotModel) -> None:
-    base = model.base
+def test_the_first_independent_parameters_stand_for_groups(model: RobotModel) -> None:
+    base, again = model.base, RobotModel.from_urdf(urdf_text()).base
+    assert again.names == base.names
+    assert np.array_equal(again.grouping, base.grouping)
     assert np.array_equal(base.grouping[:, base.pivots], np.eye(base.rank))
     assert tuple(base.standard_names[k] for k in base.pivots) == base.names
     assert np.all(np.diff(base.pivots) > 0)
-
-
-def test_the_first_independent_columns_are_kept(model: RobotModel) -> None:
     # A parameter is only grouped into parameters before it: it was dropped since they explain it.
-    base = model.base
     for column in set(range(len(base.standard_names))) - set(base.pivots.tolist()):
         groups = base.pivots[np.flatnonzero(base.grouping[:, column])]
         assert np.all(groups < column), base.standard_names[column]
 
 
-def test_kept_columns_are_independent_by_far(model: RobotModel) -> None:
-    columns = full_regressor(model)
-    scaled = columns / np.linalg.norm(columns, axis=0)
-    assert np.linalg.cond(scaled) < 100.0
+def test_base_columns_are_independent_by_far(model: RobotModel) -> None:
+    states = np.random.default_rng(7).uniform(-3.0, 3.0, (3, 50, 6))
+    columns = model.regressor(*states).dense(model.n_parameters)[:, :, :40].reshape(-1, 40)
+    assert np.linalg.cond(columns / np.linalg.norm(columns, axis=0)) < 100.0
 
 
 def test_expressions_read_like_the_table(model: RobotModel) -> None:
