@@ -230,7 +230,7 @@ def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
         folder.journal.unlink()
 
 
-# Only what means the same is drawn side by side.
+# Only what means the same is compared.
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def problem(genome: Any = None, **constraints: Any) -> Problem:
 class MoodyGenome:
     """Via points, but some values of the first gene are bad for the process that plans them."""
 
-    plain: ViaPointGenome
+    inner: ViaPointGenome
     crash: tuple[float, float] = (2.0, 2.0)
     hang: tuple[float, float] = (2.0, 2.0)
     refuse: tuple[float, float] = (2.0, 2.0)
@@ -40,7 +40,7 @@ class MoodyGenome:
 
     @property
     def n_genes(self) -> int:
-        return self.plain.n_genes
+        return self.inner.n_genes
 
     def motions(self, genes: np.ndarray) -> list[Any]:
         if np.any(self.within(genes, self.crash)):
@@ -50,16 +50,16 @@ class MoodyGenome:
         if self.still:  # the elbow at least
             genes = genes.copy()
             genes[:, 1:-2:2] = 0.5
-        motions: list[Any] = self.plain.motions(genes)
+        motions: list[Any] = self.inner.motions(genes)
         for index in np.flatnonzero(self.within(genes, self.refuse)):
             motions[index] = PlanningError("this motion cannot be")
         return motions
 
     def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
-        return self.plain.sample(random, count)
+        return self.inner.sample(random, count)
 
     def recorded(self, *args: Any) -> dict[str, Any]:
-        return self.plain.recorded(*args)
+        return self.inner.recorded(*args)
 
     @staticmethod
     def within(genes: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:

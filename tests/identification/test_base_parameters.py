@@ -55,8 +55,8 @@ def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: in
     assert base.gap > 1e10
     assert base.smallest_pivot > 1000 * TOLERANCE
     if gravity == (0.0, 0.0, 9.81):  # upside down it groups alike
-        standing = RobotModel.from_urdf(urdf_text()).base
-        assert np.allclose(base.grouping, standing.grouping, atol=1e-10)
+        upright = RobotModel.from_urdf(urdf_text()).base
+        assert np.allclose(base.grouping, upright.grouping, atol=1e-10)
 
 
 def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> None:

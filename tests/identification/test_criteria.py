@@ -213,7 +213,7 @@ def test_friction_in_degrees_shifts_the_determinant(
         [{"f1": degree, "f2": degree**2}.get(n[:2], 1.0) for n in model.parameter_names]
     )
     before, after = (Criteria.of_gram(g, 1) for g in (gram, gram * scale * scale[:, None]))
-    # Six columns in deg/s and six in (deg/s)², each counted twice: 63.3, as others report.
+    # Six columns in deg/s and six in (deg/s)², each twice: 63.3, as others report.
     shift = after.log10_det - before.log10_det
     assert shift == pytest.approx(36 * math.log10(degree), abs=1e-9)
     assert after.coupling_index == pytest.approx(before.coupling_index, rel=1e-9)

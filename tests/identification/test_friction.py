@@ -356,10 +356,10 @@ def test_either_part_can_be_left_out() -> None:
 
 
 def test_uncoupled_motors_add_nothing() -> None:
-    plain = RobotModel.from_urdf(urdf_text())
+    uncoupled = RobotModel.from_urdf(urdf_text())
     with_gears = RobotModel.from_urdf(urdf_text(), coupling=Coupling(GEARS))
-    assert with_gears.parameter_names == plain.parameter_names
-    for a, b in zip(with_gears.regressor(*states()).blocks, plain.regressor(*states()).blocks,
+    assert with_gears.parameter_names == uncoupled.parameter_names
+    for a, b in zip(with_gears.regressor(*states()).blocks, uncoupled.regressor(*states()).blocks,
                     strict=True):  # fmt: skip
         assert np.array_equal(a, b)
 

@@ -295,10 +295,10 @@ def test_blocks_can_be_picked_put_in_a_row_merged_and_restricted() -> None:
         merged = phase.merged(length)
         assert len(merged) == -(-len(phase) // length)
         np.testing.assert_allclose(merged.weighted(weights).sum(axis=0), dense, rtol=1e-12)
-    kept = np.array([5, 0, 3])
-    place = np.append(kept, MODEL.n_parameters)
-    some = phase.restricted(kept)
-    assert some.parameter_names == tuple(MODEL.parameter_names[k] for k in kept)
+    order = np.array([5, 0, 3])
+    place = np.append(order, MODEL.n_parameters)
+    some = phase.restricted(order)
+    assert some.parameter_names == tuple(MODEL.parameter_names[k] for k in order)
     np.testing.assert_allclose(
         some.weighted(weights), phase.weighted(weights)[:, place[:, None], place], rtol=1e-12
     )

@@ -135,21 +135,21 @@ def test_the_front_is_what_nothing_beats_and_its_knee_wins(population):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_polish_never_costs_anything(population, method):
-    plain = search(population, settings(method))
+    unpolished = search(population, settings(method))
     chosen = settings(method, polish=60)
     polished = search(population, chosen)
-    assert polished.excitation.tried > plain.excitation.tried
-    for one, other in zip(bits(plain)["front"], bits(polished)["front"], strict=True):
+    assert polished.excitation.tried > unpolished.excitation.tried
+    for one, other in zip(bits(unpolished)["front"], bits(polished)["front"], strict=True):
         assert one == other  # the front stays as the search found it
-    before, after = (population.problem.score(design.genes[None]) for design in (plain, polished))
-    assert polished.origin == plain.chosen
-    assert polished.origin_criteria == plain.excitation.criteria
+    before, after = (
+        population.problem.score(design.genes[None]) for design in (unpolished, polished)
+    )
+    assert polished.origin == unpolished.chosen
+    assert polished.origin_criteria == unpolished.excitation.criteria
     if method == "front":
         assert polished.chosen is None, "the polish found a better one"
-        for scores in ((before, after),):
-            gains = (scores[1].measures - scores[0].measures) * [1.0, -1.0]
-            assert np.all(gains >= 0.0)
-        criteria = polished.excitation.criteria, plain.excitation.criteria
+        assert np.all((after.measures - before.measures) * [1.0, -1.0] >= 0.0)
+        criteria = polished.excitation.criteria, unpolished.excitation.criteria
         assert np.all(np.subtract(*(one.measures for one in criteria)) * [1.0, -1.0] >= 0.0)
     else:
         random = Scores.of_rows(population.rows[0])
@@ -251,13 +251,13 @@ class Finer(Watched):
     ("method", "measure"), [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index")]
 )
 def test_a_polish_that_is_worse_at_a_millisecond_is_left_alone(population, method, measure):
-    plain = search(population, settings(method))
+    unpolished = search(population, settings(method))
     assert search(population.begin(), settings(method, polish=60)).chosen is None
-    with Finer(plain.genes, measure) as finer:
+    with Finer(unpolished.genes, measure) as finer:
         design = search(finer, settings(method, polish=60))
-    assert design.genes.tobytes() == plain.genes.tobytes()
-    assert design.chosen == design.origin == plain.chosen
-    assert design.excitation.criteria == design.origin_criteria == plain.excitation.criteria
+    assert design.genes.tobytes() == unpolished.genes.tobytes()
+    assert design.chosen == design.origin == unpolished.chosen
+    assert design.excitation.criteria == design.origin_criteria == unpolished.excitation.criteria
 
 
 class Alike(Watched):
@@ -272,21 +272,21 @@ class Alike(Watched):
 
 
 def test_other_genes_of_the_same_motion_are_no_polish(population):
-    plain = search(population, settings("front"))
+    unpolished = search(population, settings("front"))
     assert search(population.begin(), settings("front", polish=60)).chosen is None
-    with Alike(plain.genes) as alike:
+    with Alike(unpolished.genes) as alike:
         design = search(alike, settings("front", polish=60))
-    assert design.chosen == design.origin == plain.chosen
-    assert design.genes.tobytes() == plain.genes.tobytes()
+    assert design.chosen == design.origin == unpolished.chosen
+    assert design.genes.tobytes() == unpolished.genes.tobytes()
 
 
 def test_motions_are_counted_as_they_are_scored():
-    counted = []
+    counts = []
     chosen = settings("b", population=20, generations=2)
     with Population(problem()) as population:
-        design = search(population, chosen, scored=counted.append)
-    assert max(counted) == 8
-    assert sum(counted) == design.excitation.tried <= most_evaluations(chosen) == 40
+        design = search(population, chosen, scored=counts.append)
+    assert max(counts) == 8
+    assert sum(counts) == design.excitation.tried <= most_evaluations(chosen) == 40
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -376,10 +376,10 @@ with open({str(path)!r}, "xb+") as file, Population(problem(), workers=2) as pop
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     ) as running:
         pids = [int(pid) for pid in running.stdout.readline().split()]
-        told = [int(running.stdout.readline()) for _ in range(6)]
+        seen = [int(running.stdout.readline()) for _ in range(6)]
         os.killpg(running.pid, signal.SIGINT)
         rest, said = running.communicate(timeout=20.0)
-    told += [int(line) for line in rest.split()]
+    seen += [int(line) for line in rest.split()]
     assert said.rstrip().endswith("KeyboardInterrupt")
     for pid in pids:
         with pytest.raises(ProcessLookupError):
@@ -387,7 +387,7 @@ with open({str(path)!r}, "xb+") as file, Population(problem(), workers=2) as pop
     with path.open("rb+") as file:
         journal = opened(file, chosen)
         resumed = search(population, chosen, journal=journal)
-    assert journal.recalled in (told[-1], told[-1] + 12)  # it may come before that was told
+    assert journal.recalled in (seen[-1], seen[-1] + 12)  # it may come before that was seen
     assert bits(resumed) == bits(search(population.begin(), chosen))
 
 
@@ -490,7 +490,7 @@ def test_a_search_stopped_too_early_says_so(population):
 
 
 def test_motions_that_excite_too_little_are_no_result():
-    """The elbow stands still: every constraint is kept, and its friction cannot be identified."""
+    """The elbow rests: every constraint is satisfied, and its friction cannot be identified."""
     with Population(problem(moody(still=True))) as population:
         for method in METHODS:
             with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:

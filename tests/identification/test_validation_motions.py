@@ -63,18 +63,18 @@ def make_currents(model):
 
 
 @pytest.fixture(scope="module")
-def drawn(limits, checker, make_currents):
+def found(limits, checker, make_currents):
     return random_validation_motions(
         limits, home=HOME, seed=3, count=6, checker=checker, currents=make_currents(1)
     )
 
 
-def test_they_are_feasible_wide_and_all_different(drawn, limits, checker, make_currents):
-    motions = [each.trajectory for each in drawn]
+def test_they_are_feasible_wide_and_all_different(found, limits, checker, make_currents):
+    motions = [each.trajectory for each in found]
     assert len(motions) == 6
     for motion in motions:
         assert check_motion(motion, limits, checker=checker, currents=make_currents(1)).ok
-    for one in drawn[:2]:  # moves plan to the motion bit for bit
+    for one in found[:2]:  # moves plan to the motion bit for bit
         again = plan_moves(one.via_points[0], one.moves, limits)
         assert again.trajectory.to_dict() == one.trajectory.to_dict()
     for motion in motions:
@@ -88,20 +88,20 @@ def test_they_are_feasible_wide_and_all_different(drawn, limits, checker, make_c
 
 
 def test_a_seed_gives_the_same_ones_however_many_are_asked_for(
-    drawn, limits, checker, make_currents
+    found, limits, checker, make_currents
 ):
     again = random_validation_motions(
         limits, home=HOME, seed=3, count=2, checker=checker, currents=make_currents(1)
     )
-    assert [m.trajectory.to_dict() for m in again] == [m.trajectory.to_dict() for m in drawn[:2]]
+    assert [m.trajectory.to_dict() for m in again] == [m.trajectory.to_dict() for m in found[:2]]
     other = random_validation_motions(limits, home=HOME, seed=4, count=1)
-    assert not np.array_equal(other[0].via_points, drawn[0].via_points)
+    assert not np.array_equal(other[0].via_points, found[0].via_points)
 
 
 def test_the_motions_of_a_seed_never_change(limits):
     # Taken when campaigns were first recorded; plans of old archives name these seeds.
-    drawn = random_validation_motions(limits, home=HOME, seed=7, count=2)
-    text = json.dumps([[m.via_points.tolist(), m.speed.tolist()] for m in drawn])
+    found = random_validation_motions(limits, home=HOME, seed=7, count=2)
+    text = json.dumps([[m.via_points.tolist(), m.speed.tolist()] for m in found])
     assert (
         hashlib.sha256(text.encode()).hexdigest()
         == "81044cb7520ca0aff3077b96846fdaf58ac975ee6ca4b7021a38891c0c794bf7"
@@ -111,11 +111,11 @@ def test_the_motions_of_a_seed_never_change(limits):
 def test_motions_that_ask_for_too_much_current_are_not_chosen(limits, checker, make_currents):
     modest = make_currents(0.5)
     free = random_validation_motions(limits, home=HOME, seed=3, count=6, checker=checker)
-    kept = random_validation_motions(
+    chosen = random_validation_motions(
         limits, home=HOME, seed=3, count=6, checker=checker, currents=modest
     )
     assert not all(check_motion(m.trajectory, limits, currents=modest).ok for m in free)
-    assert all(check_motion(m.trajectory, limits, currents=modest).ok for m in kept)
+    assert all(check_motion(m.trajectory, limits, currents=modest).ok for m in chosen)
 
 
 def test_a_motion_whose_planning_kills_its_process_is_passed_over(limits, monkeypatch):
