@@ -270,7 +270,7 @@ class TestFront:
         assert [len(line.get_xdata()) for line in points] == ([count] if count > 1 else [])
 
     def test_motions_on_the_page_carry_their_figures(self, two_link):
-        front = Points(np.array([100.0, 105.7]), np.array([70.0, 80.0]))
+        front = Points(np.array([100.0, 105.7, 108.0]), np.array([70.0, 80.0, 110.0]))
         others = {"A": (104.0, 90.5), "B": (101.2, 80.9)}
         figure, _ = self.page(two_link, front, chosen=1, references=others, kinematic=("B",))
         said = texts(figure)
