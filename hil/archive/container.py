@@ -55,6 +55,7 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the co
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _NO_CRC = 0
+_SMALL = 4096  # bytes that are read sooner than skipped
 _UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, behind those of its checksum
 _KINDS: dict[int, type[McapRecord]] = {
     SCHEMA: Schema,
@@ -216,7 +217,9 @@ def records(
             raise Damage(offset, "is zeros, where one must begin")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
-        if opcode not in only:
+        if opcode not in only and length <= _SMALL:
+            read(length)
+        elif opcode not in only:
             seek(length, os.SEEK_CUR)
         elif length > LARGEST_RECORD:
             raise Damage(offset, f"claims {length} bytes of content")
