@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import estimate_repetitions
-from identification.factor.factor import Estimate, Factor, estimate, total
+from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
@@ -428,7 +428,8 @@ def of_one_kilogram(motion: Motion) -> Array:
 
 
 def causes(model: RobotModel, recordings: Sequence[Samples]) -> tuple[Cause, ...]:
-    values = estimate(model, total([Factor.of(model, one) for one in recordings])).values
+    factors = (Factor.of(model, one) for one in recordings)
+    values = estimate(model, sum(factors, Factor.zero(model))).values
     names = [f"{k}.mcap" for k in range(len(recordings))]
     return find_causes(model, recordings, values, names).found
 
