@@ -18,3 +18,8 @@ def __getattr__(name: str) -> Any:
         if name in ("__all__", *api.__all__):
             return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """All names, also those that are not loaded yet: the reference documents them."""
+    return [*globals(), *import_module("identification.api").__all__]
