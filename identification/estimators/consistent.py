@@ -80,7 +80,9 @@ _SINGULAR: Final = 1e-7
 _ROUNDING: Final = 1e-12
 _VANISHING: Final = 1e-30
 _ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
-_WEIGHT_STEP: Final = 10.0
+# By which the prior's weight falls at once: quick where some machine fits, and careful.
+_QUICK, _CAREFUL = 1e4, 10.0
+_QUICK_STEPS: Final = 250
 _SAME_WEIGHT: Final = 1e-9
 _N_LINK: Final = len(LINK_SYMBOLS)
 # Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
@@ -268,6 +270,7 @@ def follow_path(
     first: float,
     most_steps: int = _PATH_STEPS,
     same: float = _SAME_WEIGHT,
+    fall: float = _CAREFUL,
 ) -> Minimum:
     """Return the minimum from far away: the weight of the prior falls in steps (a barrier method).
 
@@ -281,6 +284,7 @@ def follow_path(
         first: the weight to begin with.
         most_steps: of Newton's method, in all.
         same: relative change of the weight at which it is the one to end with.
+        fall: factor by which the weight falls at once.
     """
     found, steps, now = Minimum(start, converged=False), 0, first
     while steps < most_steps:
@@ -289,7 +293,7 @@ def follow_path(
         last = weight(found.u)
         if found.converged and abs(last - now) <= same * now:
             return found
-        now = max(last, now / _WEIGHT_STEP)
+        now = max(last, now / fall)
     return found._replace(converged=False)
 
 
@@ -409,12 +413,16 @@ class Program:
         for cone in smooth.cones:
             reference[cone.places] = cone.unit
         first = max(smooth.excess(reference), weight(reference))
-        found = follow_path(smooth, reference, lambda _: smooth.weight, first)
-        if found.converged and weight(found.u) == smooth.weight:
-            return found.u, "optimal"
-        found = follow_path(smooth, reference, weight, first)
+        found = follow_path(
+            smooth, reference, lambda _: smooth.weight, first, _QUICK_STEPS, fall=_QUICK
+        )
+        if not (found.converged and weight(found.u) == smooth.weight):
+            found = follow_path(smooth, reference, weight, first)
         if found.converged:
-            return found.u, "optimal (no machine fits these data to their noise)"
+            fits = weight(found.u) == smooth.weight
+            return found.u, "optimal" + (
+                "" if fits else " (no machine fits these data to their noise)"
+            )
         raise SolverError(
             f"no solution was found in {_PATH_STEPS} steps of Newton's method; with a prior weight"
             f" above {smooth.weight:g} there may be one"
