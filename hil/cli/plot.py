@@ -11,9 +11,7 @@ from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically, writing_to
 from hil.plots import save
-from hil.plots.archive_panels import BINS as PAGE_BINS
-from hil.plots.archive_panels import archive_page
-from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_picture import PAGE_BINS, archive_page, draw_archive
 from hil.plots.archive_view import BINS, view_of
 from hil.plots.plan_picture import FORMATS
 from hil.terminal_text import printable

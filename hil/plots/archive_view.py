@@ -21,8 +21,8 @@ from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
-from hil.plots import style
 from hil.report.drawing import thinned
+from hil.terminal_text import plural
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 
@@ -34,6 +34,13 @@ BINS: Final = 600
 """Stretches of the whole time of which the lowest and the highest sample are drawn."""
 _LEAP: Final = 10.0
 """Samples left out, by which a line is broken."""
+_TITLES: Final = {
+    "position": "position [deg]",
+    "velocity": "speed [deg/s]",
+    "current": "motor current [A]",
+    "torque": "torque at the joint [N·m]",
+    "following": "following error [{}]",
+}
 _FIELDS: Final = (
     "position", "velocity", "torque", "target_current", "motor_current", "target_position",
     "state", "status", "gap",
@@ -70,9 +77,7 @@ class Quantity:
     """One column of the picture: a quantity of every joint shown."""
 
     title: str
-    colour: str
     traces: tuple[Trace, ...]
-    limits_shown: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,13 @@ class ArchiveView:
     events: tuple[tuple[float, str, str, bool], ...] = ()
     gaps: Array = field(default_factory=lambda: np.zeros(0))
     frame: str = ""
+
+    @property
+    def missed(self) -> str:
+        """Packets that were missed, also where none was; "" where nobody counts them."""
+        if not self.states:
+            return ""
+        return f"missed at {plural(len(self.gaps), 'place')}" if len(self.gaps) else "none missed"
 
 
 def view_of(
@@ -138,9 +150,19 @@ def view_of(
         )
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
-    collected = _Collected(shown, end - begin, bins)
+    lines: dict[str, list[list[tuple[Array, Array]]]] = {
+        name: [[] for _ in shown] for name in _TITLES
+    }
+    states, gaps = list[tuple[float, float, str]](), list[float]()
     for archive in _windows(path, stamp * 1e-9, origin + begin, origin + end):
-        collected.take(archive, scales, origin)
+        if not archive.n_samples:
+            continue
+        columns, time = archive.columns, archive.columns["stamp"] * 1e-9 - origin
+        share = (time[-1] - time[0]) / max(end - begin, 1e-9)
+        _collect(lines, scales, columns, time, shown, max(2, round(bins * share)))
+        if "state" in columns:
+            _add_states(states, time, columns["state"])
+            gaps += time[columns["gap"] > 0].tolist()
     events = tuple(
         (event.time - origin, event.name, event.text, event.level >= 30)
         for event in head.events
@@ -154,10 +176,10 @@ def view_of(
         ),
         start=begin,
         stop=end,
-        quantities=tuple(collected.quantities(scales)),
-        states=tuple(collected.states),
+        quantities=tuple(_quantities(lines, scales, shown)),
+        states=tuple(states),
         events=events,
-        gaps=np.array(collected.gaps),
+        gaps=np.array(gaps),
         frame=scales.words,
     )
 
@@ -280,69 +302,52 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
     return np.array([not turns.get(name, True) for name in archive.joint_names])
 
 
-class _Collected:
-    """Thinned lines, grown window by window."""
-
-    def __init__(self, joints: Sequence[int], duration: float, bins: int) -> None:
-        self.states: list[tuple[float, float, str]] = []
-        self.gaps: list[float] = []
-        self._joints = list(joints)
-        self._duration = max(duration, 1e-9)
-        self._bins = bins
-        self._lines: dict[str, list[list[tuple[Array, Array]]]] = {}
-
-    def take(self, archive: Archive, scales: _Scales, origin: float) -> None:
-        columns = archive.columns
-        if not archive.n_samples:
-            return
-        time = columns["stamp"] * 1e-9 - origin
-        share = (time[-1] - time[0]) / self._duration
-        bins = max(2, round(self._bins * share))
-        leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-        # What is too large in degrees for any float is missing in the picture.
-        with np.errstate(over="ignore", invalid="ignore"):
-            shown = list(scales.shown(columns))
-        gaps = np.flatnonzero(np.diff(time) > leap) + 1
-        broken = np.insert(time, gaps, time[gaps])
-        for name, values in shown:
-            lines = self._lines.setdefault(name, [[] for _ in self._joints])
-            for line, joint in zip(lines, self._joints, strict=True):
-                for t, v in runs(broken, np.insert(values[:, joint], gaps, np.nan), bins):
+def _collect(
+    lines: Mapping[str, list[list[tuple[Array, Array]]]],
+    scales: _Scales,
+    columns: Mapping[str, NDArray[Any]],
+    time: Array,
+    joints: Sequence[int],
+    bins: int,
+) -> None:
+    """Add a window of a recording, thinned, to the lines of each quantity and joint."""
+    leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+    gaps = np.flatnonzero(np.diff(time) > leap) + 1
+    unbroken = np.insert(time, gaps, time[gaps])
+    # What is too large in degrees for any float is missing in the picture.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for name, values in scales.shown(columns):
+            for line, joint in zip(lines[name], joints, strict=True):
+                for t, v in runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
                     if line and t[0] - line[-1][0][-1] > leap:
                         line.append((np.array([np.nan]), np.array([np.nan])))
                     line.append((t, v))
-        if "state" in columns:
-            self._take_states(time, columns["state"])
-            self.gaps += time[columns["gap"] > 0].tolist()
 
-    def quantities(self, scales: _Scales) -> Iterator[Quantity]:
-        motor = scales.motor_from_joint is not None
-        for name, title, colour in (
-            ("position", "position [deg]", style.POSITION),
-            ("velocity", "speed [deg/s]", style.VELOCITY),
-            ("current", "motor current [A]", style.ACCELERATION),
-            ("torque", "torque at the joint [N·m]", "#5b3a8c"),
-            ("following", f"following error [{'motor rev' if motor else 'deg'}]", style.INK),
-        ):
-            lines = self._lines.get(name, [])
-            if any(lines):
-                traces = []
-                for line, joint in zip(lines, self._joints, strict=True):
-                    t, v = zip(*line, strict=True) if line else ((np.zeros(0),), (np.zeros(0),))
-                    limits = scales.limits.get(name)
-                    bounds = () if limits is None else map(float, limits[:, joint])
-                    traces.append(Trace(np.concatenate(t), np.concatenate(v), *bounds))
-                yield Quantity(title, colour, tuple(traces), limits_shown=name == "current")
 
-    def _take_states(self, time: Array, state: NDArray[np.uint8]) -> None:
-        edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist()]
-        ends = [*(time[edge] for edge in edges[1:]), time[-1]]
-        for edge, until in zip(edges, ends, strict=True):
-            name = _state_name(int(state[edge]))
-            begin = float(time[edge])
-            if self.states and self.states[-1][2] == name:
-                begin = self.states.pop()[0]
-            self.states.append((begin, float(until), name))
+def _quantities(
+    lines: Mapping[str, list[list[tuple[Array, Array]]]], scales: _Scales, joints: Sequence[int]
+) -> Iterator[Quantity]:
+    unit = "deg" if scales.motor_from_joint is None else "motor rev"
+    empty = np.zeros(0), np.zeros(0)
+    for name, found in lines.items():
+        if any(found):
+            limits, traces = scales.limits.get(name), []
+            for line, joint in zip(found, joints, strict=True):
+                t, v = (np.concatenate(parts) for parts in zip(empty, *line, strict=True))
+                bounds = () if limits is None else map(float, limits[:, joint])
+                traces.append(Trace(t, v, *bounds))
+            yield Quantity(_TITLES[name].format(unit), tuple(traces))
+
+
+def _add_states(
+    states: list[tuple[float, float, str]], time: Array, state: NDArray[np.uint8]
+) -> None:
+    edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state) - 1]
+    for edge, until in pairwise(edges):
+        name, begin = _state_name(int(state[edge])), float(time[edge])
+        if states and states[-1][2] == name:
+            begin = states.pop()[0]
+        states.append((begin, float(time[until]), name))
 
 
 def _state_name(number: int) -> str:

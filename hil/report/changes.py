@@ -80,8 +80,8 @@ def comparison_page(found: Comparison) -> bytes:
         shares = 100.0 * friction.shares[j, 1:, 0]
         note = ", ".join(f"{one:+.1f} %" for one in shares if np.isfinite(one)).replace("-", "−")
         texts = ", ".join(significant(float(one)) for one in value)
-        alt = f"{axis.joint}: friction in {axis.unit} by campaign: {texts}."
-        caption = Caption(f"f{j}", label(axis.joint), note, alt)
+        what = f"friction in {axis.unit} by campaign, {texts}"
+        caption = Caption(f"f{j}", label(axis.joint), note, what)
         dots = [
             np.column_stack([k + _SPREAD * np.linspace(-1.0, 1.0, len(own)), own[:, j]])
             for k, own in enumerate(found.repetitions, 1)
@@ -139,10 +139,11 @@ def _trend(arm: ArmTrend, key: str) -> dict[str, Any]:
             judged = np.isfinite(watched.limits[:, 0]).sum()
             note = f"{sum(watched.departs)} of {judged} outside" if judged else "too few to judge"
             ends = " to ".join(significant(float(one)) for one in known[[0, -1]])
-            alt = f"{axis.joint}: {what}, from {ends} {axis.unit}; {note}."
             _panel(
                 panels,
-                Caption(f"{key}{what[0]}{j}", label(axis.joint), note, alt),
+                Caption(
+                    f"{key}{what[0]}{j}", label(axis.joint), note, f"{what}, {ends} {axis.unit}"
+                ),
                 axis.unit,
                 order,
                 watched.values,
@@ -192,8 +193,8 @@ def _part(
     mass: list[Panel] = []
     if np.isfinite(payload.mass[1:]).any():
         note = f"{significant(float(payload.mass[-1]), 2)} kg in the last campaign"
-        alt = f"Mass on the last link on top of the first campaign's: {note}."
-        caption, changed = Caption(f"{key}p", "Mass put on", note, alt), np.array(payload.changed)
+        caption = Caption(f"{key}p", "Mass put on", note, "on top of the first campaign's")
+        changed = np.array(payload.changed)
         line = order.at[[0, -1]], np.zeros(2)
         _panel(mass, caption, "kg", order, payload.mass, payload.mass_std, changed, line=line)
     return {

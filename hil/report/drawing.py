@@ -10,15 +10,16 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import re
 import threading
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -56,16 +57,26 @@ _LONG_DECIMAL: Final = re.compile(r"-?\d+\.\d{3,}")
 _FONT_FAMILY: Final = re.compile(r"font-family:[^;]*;?\s*")
 _REFERENCE: Final = re.compile(r"url\(#([^)]+)\)")
 _LABEL_LENGTH: Final = 28
+FEWEST_FOR_A_BOX: Final = 5
+"""Quartiles of fewer are nearly the values themselves."""
 _settings = threading.RLock()
 
 
 class Caption(NamedTuple):
-    """Words of a panel, see :func:`to_panel`."""
+    """Words of a panel: `key` makes its ids unique in the page, `what` says what it shows."""
 
     key: str
     title: str
     note: str
-    alt: str
+    what: str
+
+    @property
+    def alt(self) -> str:
+        """What is read to those who cannot see it."""
+        parts = [f"{self.title}: {self.what}", self.note]
+        return (
+            "; ".join("".join(c if c.isprintable() else " " for c in p) for p in parts if p) + "."
+        )
 
 
 @dataclass(frozen=True)
@@ -146,22 +157,6 @@ def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
         axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
 
 
-def boxed(axes: Axes, columns: Sequence[Array], width: float, **options: Any) -> None:
-    """A box for each column, side by side from 1 on: quartiles, median and whiskers."""
-    thin = {"color": MUTED, "linewidth": 1.1}
-    axes.boxplot(
-        columns,
-        positions=range(1, len(columns) + 1),
-        widths=width,
-        patch_artist=True,
-        boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
-        medianprops={"color": INK, "linewidth": 2.2},
-        whiskerprops=thin,
-        capprops=thin,
-        **options,
-    )
-
-
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
     """Lowest and highest sample of each of `bins` equal stretches, in order; (m,) -> (<= 2 bins,).
 
@@ -198,31 +193,27 @@ def label(text: str) -> str:
     return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
 
 
-def to_panel(
-    figure: Figure, *, key: str, title: str, note: str, alt: str, traces: str = ""
-) -> Panel:
-    """`figure` as SVG; `key` makes its ids unique in the page, `alt` says what it shows.
-
-    With `traces` (see :func:`traces_text`) a reader can zoom into it.
-    """
+def to_panel(figure: Figure, caption: Caption, traces: str = "") -> Panel:
+    """`figure` as SVG; with `traces` (see :func:`traces_text`) a reader can zoom into it."""
     out = io.BytesIO()
     metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(out, format="svg", metadata=metadata)
     root = ET.fromstring(out.getvalue())
     _drop_document_parts(root)
-    _rename_ids(root, key)
+    _rename_ids(root, caption.key)
     for element in root.iter():
         _restyle(element)
     width, height = figure.get_size_inches() * 72.0
     root.attrib.clear()
     root.set("viewBox", f"0 0 {width:g} {height:g}")
     root.set("role", "img")
-    root.set("aria-label", " ".join("".join(c if c.isprintable() else " " for c in alt).split()))
+    root.set("aria-label", " ".join(caption.alt.split()))
     if traces:
         root.set("data-traces", traces)
     ET.register_namespace("", _SVG)
     ET.register_namespace("xlink", _XLINK)
-    return Panel(title, note, Markup(ET.tostring(root, encoding="unicode")), width)
+    svg = Markup(ET.tostring(root, encoding="unicode"))
+    return Panel(caption.title, caption.note, svg, width)
 
 
 def _drop_document_parts(root: ET.Element) -> None:
@@ -274,35 +265,6 @@ def _restyle(element: ET.Element) -> None:
         del element.attrib["transform"]
 
 
-@contextmanager
-def panel(
-    panels: list[Panel],
-    height: float,
-    caption: Caption,
-    heading: str = "",
-    foot: str = "",
-    **room: float,
-) -> Iterator[Axes]:
-    """Axes of a :func:`plot_panel` to draw on; what was drawn is then added to some panels.
-
-    Args:
-        panels: it becomes the last of them.
-        height: of the figure [px].
-        caption: of the panel.
-        heading: above the axes: the quantity and its unit.
-        foot: below the axes.
-        room: for labels, see :func:`plot_panel`.
-    """
-    with drawing():
-        figure, axes = plot_panel(height, **room)
-        yield axes
-        if heading:
-            headed(axes, heading)
-        if foot:
-            footed(axes, foot)
-        panels.append(to_panel(figure, **caption._asdict()))
-
-
 MOST_POINTS: Final = 3000
 """Of a line; more than three times what a panel shows at once."""
 _STEPS: Final = 65534
@@ -350,46 +312,28 @@ class Plot:
     reach: float | None = None
 
 
-def traces_text(time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS) -> str:
-    """Plots over time (m,) [s] from zero as the page's script reads them: JSON.
+def traces_text(
+    time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS, marks: Sequence[float] = ()
+) -> str:
+    """Plots over time (m,) [s] as the page's script reads them: JSON.
 
-    Lines are resampled evenly, to at most `points`; "" where there is nothing to zoom into.
+    Lines are resampled evenly, to at most `points`; "" where there is nothing to zoom into. At
+    `marks` upright lines are drawn [s].
     """
     if time.size < 2 or not time[-1] > time[0]:
         return ""
-    grid = np.linspace(time[0], time[-1], min(points, time.size))
-    even = [
-        replace(
-            plot,
-            traces=[replace(one, values=np.interp(grid, time, one.values)) for one in plot.traces],
-        )
-        for plot in plots
-    ]
-    return even_traces_text(0.0, float(time[-1] - time[0]), even)
-
-
-def even_traces_text(
-    begin: float, length: float, plots: Sequence[Plot], marks: Sequence[float] = ()
-) -> str:
-    """Plots whose lines are evenly sampled in time already, from the first instant to the last.
-
-    Args:
-        begin: what the first instant is called [s].
-        length: time from the first to the last [s].
-        plots: them.
-        marks: instants at which upright lines are drawn [s], named like `begin`.
-    """
+    begin, grid = float(time[0]), np.linspace(time[0], time[-1], min(points, time.size))
     content = {
         "begin": round(begin, 6),
-        "end": round(length, 6),
-        "marks": [round(time - begin, 6) for time in marks],
+        "end": round(float(time[-1]) - begin, 6),
+        "marks": [round(mark - begin, 6) for mark in marks],
         "plots": [
             {
                 "box": plot.box,
                 "heading": plot.heading,
                 "limits": [float(f"{limit:.7g}") for limit in plot.limits],
                 "shaded": [[round(start, 4), round(stop, 4)] for start, stop in plot.shaded],
-                "lines": [_line(one.values, one) for one in plot.traces],
+                "lines": [_line(np.interp(grid, time, one.values), one) for one in plot.traces],
             }
             for plot in plots
         ],
@@ -412,3 +356,113 @@ def _line(values: Array, trace: Trace) -> dict[str, str | float]:
         "step": float(f"{step:.7g}"),
         "data": base64.b64encode(counts.tobytes()).decode("ascii"),
     }
+
+
+@contextmanager
+def panel(
+    panels: list[Panel],
+    height: float,
+    caption: Caption,
+    heading: str = "",
+    foot: str = "",
+    **room: float,
+) -> Iterator[Axes]:
+    """Axes of a :func:`plot_panel` to draw on; what was drawn is then added to some panels.
+
+    Args:
+        panels: it becomes the last of them.
+        height: of the figure [px].
+        caption: of the panel.
+        heading: above the axes: the quantity and its unit.
+        foot: below the axes.
+        room: for labels, see :func:`plot_panel`.
+    """
+    with drawing():
+        figure, axes = plot_panel(height, **room)
+        yield axes
+        if heading:
+            headed(axes, heading)
+        if foot:
+            footed(axes, foot)
+        panels.append(to_panel(figure, caption))
+
+
+def time_panel(
+    height: float, time: Array, plots: Sequence[Plot], caption: Caption, points: int = MOST_POINTS
+) -> Panel:
+    """Plots over the same time, one above the other, with their samples to zoom into."""
+    with drawing():
+        figure = blank(PANEL_WIDTH, height)
+        for k, plot in enumerate(plots):
+            axes = place(figure, *plot.box)
+            for stretch in plot.shaded:
+                axes.axvspan(*stretch, color=BAND, linewidth=0.0, zorder=0.5)
+            for trace in plot.traces:
+                axes.plot(
+                    *thinned(time, trace.values),
+                    color=trace.colour,
+                    linewidth=trace.width,
+                    linestyle=(0, (4, 2)) if trace.dashed else "-",
+                    solid_joinstyle="round",
+                )
+            if plot.reach is not None:
+                axes.set_ylim(-plot.reach, plot.reach)
+            headed(axes, plot.heading)
+            values = np.concatenate([one.values for one in plot.traces])
+            if values.min() < 0.0 < values.max():
+                axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
+            ruled(axes, "both", x_ticks=6, y_ticks=3 if k else 4)
+            axes.set_xlim(0.0, max(float(time[-1]), 1e-9))
+            axes.tick_params(labelbottom=plot is plots[-1])
+        footed(axes, "time [s]")
+        return to_panel(figure, caption, traces_text(time, plots, points=points))
+
+
+def box_panel(
+    caption: Caption,
+    columns: Sequence[Array],
+    colours: Sequence[str],
+    heading: str,
+    labels: Sequence[str] = (),
+    level: float = math.nan,
+) -> Panel:
+    """Columns of values (m,) side by side: each value as a dot, and a box where there are enough.
+
+    At `level` a dashed line is drawn.
+    """
+    lines = max([label.count("\n") for label in labels], default=-1) + 1
+    thin = {"color": MUTED, "linewidth": 1.1}
+    with drawing():
+        width = 110.0 + 40.0 * len(columns)
+        figure = blank(width, 216.0 + 13.0 * lines)
+        axes = place(figure, 46.0, 24.0, width - 54.0, 182.0)
+        for k, (values, colour) in enumerate(zip(columns, colours, strict=True), 1):
+            if values.size >= FEWEST_FOR_A_BOX:
+                axes.boxplot(
+                    [values],
+                    positions=[k],
+                    widths=0.6,
+                    patch_artist=True,
+                    showfliers=False,
+                    boxprops={"facecolor": BAND, "edgecolor": MUTED, "linewidth": 1.1},
+                    medianprops={"color": INK, "linewidth": 2.2},
+                    whiskerprops=thin,
+                    capprops=thin,
+                )
+            # Side steps that keep neighbours in value apart; the golden ratio never lines up.
+            rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
+            side = k + 0.34 * ((rank * 0.6180339887498949) % 1.0 - 0.5)
+            axes.scatter(side, values, s=14.0, color=colour, alpha=0.85, linewidths=0.0, zorder=3)
+        if math.isfinite(level):
+            axes.axhline(level, color=SECOND, linewidth=1.3, linestyle=DASHED, zorder=4)
+        ruled(axes, "y", y_ticks=5)
+        axes.set_xticks(range(1, len(columns) + 1) if labels else [], labels, fontsize=TICK_SIZE)
+        axes.set_xlim(0.4, len(columns) + 0.6)
+        axes.tick_params(axis="x", length=0.0)
+        # A scale that shows every value, and never makes a small change look large.
+        every = np.concatenate([*columns, [level] if math.isfinite(level) else []])
+        middle = float(np.median(every))
+        low, high = min(float(every.min()), 0.9 * middle), max(float(every.max()), 1.1 * middle)
+        axes.set_ylim(max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0)
+        headed(axes, heading)
+        return to_panel(figure, caption)

@@ -10,20 +10,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive.header import ArchiveName
 from hil.report import figures
 from hil.report.numbers import MISSING, beside, fixed, significant
 from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
-from hil.results import (
-    ChoiceResult,
-    ParameterResult,
-    RecordedResult,
-    Results,
-    outside_mark,
-)
+from hil.results import ChoiceResult, ParameterResult, RecordedResult, Results, outside_mark
 
 _METHODS: Final = {
     "a": "designed by the paper's method A",
@@ -43,7 +36,6 @@ _CRITERIA: Final = (
 )
 _MOST_CANDIDATES: Final = 6
 """Candidates of one choice that are shown: the first, and the best of the others."""
-_PAIRS: Final = 10
 
 Fact = tuple[str, str]
 """A term and what is known of it."""
@@ -55,23 +47,11 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     Raises:
         SeriesError: the series belong to another number of joints than the results.
     """
-    return page_bytes(render_report(results, series))
-
-
-def render_report(results: Results, series: ReportSeries) -> str:
-    """The page as text.
-
-    Raises:
-        SeriesError: the series belong to another number of joints than the results.
-    """
     series = series.checked_for(len(results.joint_names))
-    template = environment().get_template("report.html.j2")
-    return template.render(**_context(results, series))
-
-
-def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
-    joints = figures.joints_of(results)
-    return {
+    joints, runs = figures.joints_of(results), results.validation
+    recorded = [] if results.conduct is None else results.conduct.recorded
+    errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
+    context = {
         "results": results,
         "series": series,
         "facts": facts(results),
@@ -81,11 +61,19 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "expression": expression,
         "routes": routes(results),
         "reported_title": ROUTES[results.uncertainty.reported][0],
-        "pairs": strongest_pairs(results),
-        "pairs_above": pairs_above(results, 0.9),
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
+        "by_name": {parameter.name: parameter for parameter in results.parameters},
+        "outside_mark": outside_mark,
+        "unseen": np.median(errors, axis=0).tolist() if runs else None,
+        "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
+        "error_rows": error_rows(results),
+        "every_row_errors": every_row_errors(results),
+        "when": when(recorded),
+        "health": health(recorded),
+        "motion_name": motion_name,
+        "warm_up_panels": figures.warm_up_panels(results),
         "excitation_panels": figures.excitation_panels(series, results.joint_names),
         "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
         "correlation": figures.correlation_matrix(results),
@@ -95,109 +83,12 @@ def _context(results: Results, series: ReportSeries) -> dict[str, Any]:
         "spectrum_panels": figures.spectrum_panels(series, joints),
         "replay_panels": figures.replay_panels(series, joints),
         "curve_panels": figures.friction_curve_panels(series, joints),
-        **validation_context(results),
-        **judgement_context(results),
-        **trust_context(results),
-        **conduct_context(results),
+        **figures.residual_panels(results),
     }
-
-
-def validation_context(results: Results) -> dict[str, Any]:
-    """What `verdict.html.j2` and `validation.html.j2` need; `unseen` is None without runs."""
-    runs, unseen = results.validation, None
-    measures = [
-        ("Mean |e|", "mean_abs_error", ""),
-        ("RMS error", "rms_error", ""),
-        ("Signed mean error", "mean_error", ""),
-        ("Relative error", "relative_error", "overall_relative_error"),
-    ]
-    if all(run.all_rows_joint_errors for run in runs):
-        every = ("Relative error over every row", "all_rows_joint_errors")
-        measures.append((*every, "all_rows_relative_error"))
-    if runs:
-        worst = max(runs, key=lambda run: run.overall_relative_error)
-        unseen = {
-            "seconds": sum(run.duration for run in runs),
-            "median": float(np.median([run.overall_relative_error for run in runs])),
-            "worst": worst.overall_relative_error,
-            "worst_archive": worst.archive,
-            "every_row": float(np.median([run.all_rows_relative_error for run in runs])),
-        }
-    return {
-        "unseen": unseen,
-        "error_rows": error_rows(results),
-        "joint_errors": joint_errors(results),
-        "run_measures": measures,
-        # One number of decimals per joint, so that a column of signed means can be read down.
-        "usual_rms": [float(x) for x in np.median([r.rms_error for r in runs] or [[]], axis=0)],
-    }
-
-
-def judgement_context(results: Results) -> dict[str, Any]:
-    """What `judgement.html.j2` and `residuals.html.j2` need."""
-    judgement = results.judgement
-    if judgement is None:
-        return {}
-    return {
-        "every_row_errors": every_row_errors(results),
-        "speed_panels": figures.speed_panels(judgement),
-        "position_panels": figures.position_panels(judgement),
-        "autocorrelation_panels": figures.autocorrelation_panels(judgement),
-        "friction_panels": figures.friction_panels(judgement),
-    }
-
-
-def trust_context(results: Results) -> dict[str, Any]:
-    """What `trust.html.j2` and `consistency.html.j2` need."""
-    by_name = {parameter.name: parameter for parameter in results.parameters}
-    return {"by_name": by_name, "outside_mark": outside_mark}
-
-
-def conduct_context(results: Results) -> dict[str, Any]:
-    """What `conduct.html.j2` needs."""
-    if results.conduct is None:
-        return {}
-    recorded = results.conduct.recorded
-    return {
-        "when": when(recorded),
-        "health": health(recorded),
-        "motion_name": motion_name,
-        "warm_up_panels": figures.warm_up_panels(results),
-    }
+    return page_bytes(environment().get_template("report.html.j2").render(**context))
 
 
 # Torque prediction
-
-
-def joint_errors(results: Results) -> list[dict[str, Any]]:
-    """Errors of each joint over all validation runs, N·m or N, and as shares of its torque.
-
-    Quartiles of the mean absolute error over the runs; RMS and signed mean over all runs, each
-    counting by its duration.
-    """
-    runs = results.validation
-    if not runs:
-        return []
-    seconds = np.array([run.duration for run in runs])
-    mean_abs, rms, signed, relative = (
-        np.array([getattr(run, name) for run in runs])
-        for name in ("mean_abs_error", "rms_error", "mean_error", "relative_error")
-    )
-    lower, median, upper = np.percentile(mean_abs, (25.0, 50.0, 75.0), axis=0)
-    columns: dict[str, NDArray[np.float64]] = {
-        "lower": lower,
-        "median": median,
-        "upper": upper,
-        "rms": np.sqrt(np.average(rms**2, axis=0, weights=seconds)),
-        "mean": np.average(signed, axis=0, weights=seconds),
-        "relative_median": np.median(relative, axis=0),
-        "relative_worst": relative.max(axis=0),
-        "fit_std": np.array(results.noise_std),
-    }
-    return [
-        {"joint": joint} | {name: float(column[j]) for name, column in columns.items()}
-        for j, joint in enumerate(results.joint_names)
-    ]
 
 
 def error_rows(results: Results) -> list[tuple[str, float | None, float]]:
@@ -274,32 +165,25 @@ def expression(p: ParameterResult) -> str:
 def routes(results: Results) -> list[dict[str, Any]]:
     """The standard-deviation routes that were computed, compared with the reported one."""
     uncertainty, reported = results.uncertainty, np.array([p.std for p in results.parameters])
+    far = np.array(
+        [abs(p.estimate - p.truth) if p.truth is not None else np.nan for p in results.parameters]
+    )
     found = []
     for key, (title, assumes) in ROUTES.items():
         if getattr(uncertainty, key) is None:
             continue
         std = np.array(getattr(uncertainty, key), dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = std / reported
-        ratio = ratio[np.isfinite(ratio)]
-        median, low, high = (
-            significant(float(edge(ratio)), 2) if ratio.size else MISSING
-            for edge in (np.median, np.min, np.max)
-        )
-        far = [
-            abs(p.estimate - p.truth) / one if one else math.inf
-            for p, one in zip(results.parameters, std.tolist(), strict=True)
-            if p.truth is not None
-        ]
+            ratio, z = std / reported, far / std
+        ratio, z = ratio[np.isfinite(ratio)], z[~np.isnan(far)]
+        low, median, high = np.quantile(ratio, (0.0, 0.5, 1.0)) if ratio.size else [None] * 3
         found.append(
             {
                 "title": title,
                 "assumes": assumes,
                 "reported": key == uncertainty.reported,
-                "median_ratio": median,
-                "span": f"{low} to {high}" if ratio.size else MISSING,
-                "within_2": f"{sum(z <= 2.0 for z in far)} of {len(far)}" if far else MISSING,
-                "within_3": f"{sum(z <= 3.0 for z in far)} of {len(far)}" if far else MISSING,
+                "ratios": (median, low, high),
+                "within": [f"{np.sum(z <= most)} of {z.size}" for most in (2.0, 3.0)],
             }
         )
     return found
@@ -312,27 +196,25 @@ def facts(results: Results) -> list[Fact]:
     """Cell, motion and software; the archives are listed in the provenance."""
     excitation, runs = results.excitation, results.validation
     rate = 1.0 / results.period if results.period > 0 else float("inf")
-    n_friction = len(results.parameters) - results.n_base
-    motion = [f"{fixed(excitation.duration, 2)} s"]
-    if excitation.n_sines is not None:
-        motion.append(f"{excitation.n_sines} sines per joint")
-    if excitation.n_via is not None:
-        motion.append(f"{excitation.n_via} via points")
-    if excitation.fly is not None:
-        motion.append(f"fly-by {100.0 * excitation.fly:g} %")
-    if excitation.method is not None:
-        motion.append(_METHODS.get(excitation.method, f"found by {excitation.method}"))
+    method = excitation.method
+    motion = {
+        f"{fixed(excitation.duration, 2)} s": True,
+        f"{excitation.n_sines} sines per joint": excitation.n_sines is not None,
+        f"{excitation.n_via} via points": excitation.n_via is not None,
+        f"fly-by {100.0 * (excitation.fly or 0.0):g} %": excitation.fly is not None,
+        _METHODS.get(method or "", f"found by {method}"): method is not None,
+    }
     seconds = significant(sum(run.duration for run in runs))
-    held_out = f"{len(runs)}, {seconds} s in all, none of it used for fitting" if runs else "none"
     return [
         ("Cell", results.cell),
         ("Joints", f"{len(results.joint_names)}: " + ", ".join(results.joint_names)),
         ("Cycle", f"{1e3 * results.period:g} ms ({rate:g} Hz)"),
-        ("Excitation", ", ".join(motion)),
-        ("Repetitions", str(len(results.repetitions))),
-        ("Validation runs", held_out),
-        ("Parameters", f"{results.n_base} base + {n_friction} friction"),
-        ("Software", " · ".join(f"{k} {v}" for k, v in results.software.items())),
+        ("Excitation", ", ".join(words for words, known in motion.items() if known)),
+        ("Validation runs", f"{len(runs)}, {seconds} s in all" if runs else "none"),
+        (
+            "Parameters",
+            f"{results.n_base} base + {len(results.parameters) - results.n_base} friction",
+        ),
     ]
 
 
@@ -361,18 +243,17 @@ def estimation_facts(results: Results) -> list[Fact]:
     return found
 
 
-def criteria(results: Results) -> list[tuple[str, str, str, str, str]]:
+def criteria(results: Results) -> list[tuple[str, ...]]:
     """Title, meaning, planned, executed and change; the paper's equations by number."""
     planned, executed = results.excitation.planned, results.excitation.executed
-    rows = []
-
-    def shown(value: float | None, decimals: int) -> str:
-        large = value is not None and abs(value) >= 1e7
-        return significant(value) if large else fixed(value, decimals)
-
+    rows: list[tuple[str, ...]] = []
     for name, title, meaning, decimals in _CRITERIA:
-        before = None if planned is None else getattr(planned, name)
-        after = getattr(executed, name)
+        pair = [None if one is None else getattr(one, name) for one in (planned, executed)]
+        texts = [
+            significant(one) if one is not None and abs(one) >= 1e7 else fixed(one, decimals)
+            for one in pair
+        ]
+        before, after = pair
         change = MISSING
         if before is not None and after is not None and name != "n_samples":
             # A log has no meaningful percentage, the others get one.
@@ -380,28 +261,8 @@ def criteria(results: Results) -> list[tuple[str, str, str, str, str]]:
                 change = fixed(after - before, decimals, sign=True)
             else:
                 change = fixed(100.0 * (after / before - 1.0), 1, sign=True) + " %"
-        rows.append((title, meaning, shown(before, decimals), shown(after, decimals), change))
+        rows.append((title, meaning, *texts, change))
     return rows
-
-
-def strongest_pairs(results: Results) -> list[tuple[str, str, float]]:
-    """Ten pairs of largest |correlation| with it, friction included."""
-    size, rho = len(results.correlation), results.correlation
-    labels = [p.label for p in results.parameters]
-    pairs = [
-        (labels[i], labels[j], rho[i][j])
-        for i in range(size)
-        for j in range(i + 1, size)
-        if math.isfinite(rho[i][j])  # none is, where the motion excites too little
-    ]
-    return sorted(pairs, key=lambda pair: -abs(pair[2]))[:_PAIRS]
-
-
-def pairs_above(results: Results, limit: float) -> tuple[int, int]:
-    """Pairs of base parameters with |correlation| above `limit`, and all such pairs."""
-    n = results.n_base
-    above = sum(abs(results.correlation[i][j]) > limit for i in range(n) for j in range(i + 1, n))
-    return above, n * (n - 1) // 2
 
 
 def shown_candidates(choice: ChoiceResult) -> list[int]:
@@ -433,19 +294,18 @@ def health(recorded: Sequence[RecordedResult]) -> str:
     cycles = sum(one.cycles for one in recorded)
     if not cycles:
         return "No archive could be read."
-    sums = {
+    counts = {
         "packets missed": sum(one.missed for one in recorded),
         "answers late": sum(one.late for one in recorded),
         "replies not accepted": sum(one.not_accepted for one in recorded),
         "cycles not archived": sum(one.lost for one in recorded),
     }
-    losses = [
+    losses = ", ".join(
         f"{count} {words} ({significant(1e6 * count / cycles, 2)} in a million)"
-        for words, count in sums.items()
+        for words, count in counts.items()
         if count
-    ]
-    size = f"{cycles:,} cycles in {len(recorded)} archives".replace(",", "\u202f")
-    return f"{size}: {', '.join(losses) or 'no packet missed, no answer late, none lost'}."
+    )
+    return f"{cycles} cycles in {len(recorded)} archives: {losses or 'none lost or late'}."
 
 
 def motion_name(one: RecordedResult) -> str:

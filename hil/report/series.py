@@ -14,14 +14,7 @@ _TOO_LARGE: Final = 1e100
 
 
 class SeriesError(ValueError):
-    """A series does not fit the others: carries the field, its shape and the one expected."""
-
-    def __init__(self, field: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-        super().__init__(
-            f"{field} has shape {shape}, or is of no numbers that can be drawn; "
-            f"{expected} was expected"
-        )
-        self.field, self.shape, self.expected = field, shape, expected
+    """A series does not fit the others, or holds what cannot be drawn: names field and shapes."""
 
 
 # The field whose length each letter is; n is the number of joints.
@@ -123,8 +116,13 @@ class ReportSeries:
             if letters is None or (optional and found.size == 0):
                 continue
             shape = tuple(sizes[letter] for letter in letters[0])
-            if found.shape != shape or found.dtype != np.float64 or not _drawable(found):
-                raise SeriesError(one.name, found.shape, shape)
+            numbers = found.dtype == np.float64
+            # No number is so large that an axis cannot be divided.
+            if found.shape != shape or not numbers or np.any(np.abs(found) >= _TOO_LARGE):
+                raise SeriesError(
+                    f"{one.name} has shape {found.shape}, or is of no numbers that can be drawn; "
+                    f"{shape} was expected"
+                )
 
     @property
     def n_joints(self) -> int:
@@ -138,11 +136,5 @@ class ReportSeries:
             SeriesError: it has another number of joints.
         """
         if self.n_joints != n_joints:
-            shape = self.excitation_position.shape
-            raise SeriesError("excitation_position", shape, (shape[0], n_joints))
+            raise SeriesError(f"excitation_position has {self.n_joints} columns, not {n_joints}")
         return self
-
-
-def _drawable(values: Array) -> bool:
-    """Whether no number is so large that an axis cannot be divided."""
-    return bool(np.all(np.isnan(values) | (np.abs(values) < _TOO_LARGE)))

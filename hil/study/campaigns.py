@@ -288,12 +288,16 @@ def plan_study(
     excitations = {key: found[name].found for key, name in searched.items()}
     count, seed, fly = settings.motions, settings.seed, excitations[B].fly
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
+
+    def via_motions(key: str, fly: float, seed: int) -> tuple[PlannedMotion, ...]:
+        """Wide random motions through as many via points as the cell's excitation has."""
+        own = {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
+        return plan_around(cell.with_values(own), excitations[key], checks).validation
+
     held_out = {
         A: _sine_motions(cell, found[sines].settings, checks, count=count, seed=seed),
-        B: _via_motions(cell, excitations[B], checks, fly=fly, count=count, seed=seed),
-        B0: _via_motions(
-            cell, excitations[B0], checks, fly=0.0, count=count, seed=seed + _STOPS_SEED
-        ),
+        B: via_motions(B, fly, seed),
+        B0: via_motions(B0, 0.0, seed + _STOPS_SEED),
     }
     main = cell.with_campaign(
         repetitions=settings.repetitions, validation_runs=count, simulation_seed=seed
@@ -354,14 +358,6 @@ def _plan(
     if moves is not None and points is not None:
         file = PlanFile(cell.joint_names, points[0], moves, limits=cell.joint_limits)
     return CampaignPlan(excitation, tuple(held_out), file)
-
-
-def _via_motions(
-    cell: Cell, excitation: Excitation, checks: MotionChecks, *, fly: float, count: int, seed: int
-) -> tuple[PlannedMotion, ...]:
-    """Wide random motions through as many via points as the cell's excitation has."""
-    own = {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
-    return plan_around(cell.with_values(own), excitation, checks).validation
 
 
 def _sine_motions(

@@ -42,7 +42,7 @@ from .campaigns import in_children
 Array = NDArray[np.float64]
 MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION: Final = 5
+VERSION: Final = 6
 """Counted up when the same archives come to give other numbers, or a record another form."""
 PLANTED: Final = "planted"
 """Name of the planted parameters among the estimates."""
@@ -66,7 +66,6 @@ class Fitted(Frozen):
     pooled: list[float]
     pooled_std: list[float]
     undetermined: list[str]
-    noise_std: list[float]
     log10_det: float
     """Of the motion as it was executed, as the next ones."""
     coupling_index: float
@@ -74,7 +73,6 @@ class Fitted(Frozen):
     time: list[float]
     position: list[list[float]]
     """Joint by joint, of the first repetition."""
-    velocity: list[list[float]]
 
 
 class FitRecord(Record, Fitted):
@@ -88,23 +86,6 @@ class FitRecord(Record, Fitted):
     duration: float
 
 
-class ClassErrors(Frozen):
-    """Relative errors ||e|| / ||tau|| of estimates on the motions of a class, over all joints.
-
-    They are low-passed at 30 Hz as the paper's Fig. 4 is: what remains is the error of the model,
-    and not the noise of the currents, which is the same for every estimate.
-    """
-
-    durations: list[float]
-    overall: dict[str, list[float]]
-    own: dict[str, list[float]]
-    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
-    mean_abs: dict[str, list[list[float]]]
-    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
-    all_rows: dict[str, list[float]]
-    """As `overall`, over the whole motion: rows at rest, near ends and at reversals included."""
-
-
 class ExampleRecord(Frozen):
     """One motion in time, low-passed for the figure; lists are joint by joint."""
 
@@ -115,27 +96,30 @@ class ExampleRecord(Frozen):
 
 
 class MotionForm(Frozen):
-    """Gram matrices of one held-out motion, over its usable rows; p parameters, n joints."""
+    """Gram matrices of one held-out motion, over its usable rows, all joints; p parameters."""
 
     archive: str
-    torque_squared: list[float]
-    """Sum of the measured torque², per joint."""
-    columns: list[list[int]]
-    """Parameters that each joint's torque depends on."""
-    slow: list[list[list[float]]]
-    """Of the low-passed [Phi | tau] of each joint, in these columns and the last."""
+    torque_squared: float
+    """Sum of the measured torque²."""
+    slow: list[list[float]]
+    """Of the low-passed [Phi | tau] (p + 1, p + 1)."""
     whole: list[list[float]]
-    """Of Phi as it is, all joints together (p, p)."""
+    """Of Phi as it is (p, p)."""
 
 
-class ScoreRecord(Record, ClassErrors):
-    """How well several estimates predict the motions of one class."""
+class ScoreRecord(Record):
+    """The motions of one class, and what of their errors the forms do not give."""
 
+    durations: list[float]
     samples: list[int]
     """Of each motion, from the first to the last at which a joint moves."""
     left_out: list[list[int]]
     """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
     forms: list[MotionForm]
+    mean_abs: dict[str, list[list[float]]]
+    """By estimate, motion by motion: mean |e| per joint, N·m."""
+    all_rows: dict[str, list[float]]
+    """By estimate: relative error of each motion, rows that are left out included."""
     examples: list[ExampleRecord]
 
 
@@ -164,9 +148,9 @@ class ClassForms(NamedTuple):
     """The forms of all motions of one class; m motions, n joints, p parameters.
 
     Attributes:
-        slow: of the low-passed [Phi | tau] (m, n, p + 1, p + 1).
-        whole: of Phi, all joints together (m, p, p).
-        torque_squared: (m, n).
+        slow: of the low-passed [Phi | tau], all joints together (m, p + 1, p + 1).
+        whole: of Phi, likewise (m, p, p).
+        torque_squared: sum over all joints (m,).
     """
 
     slow: Array
@@ -177,23 +161,16 @@ class ClassForms(NamedTuple):
     def of(cls, forms: Sequence[MotionForm]) -> ClassForms:
         """Arrays of the forms of the motions."""
         whole = np.array([one.whole for one in forms])
-        size = whole.shape[1] + 1
-        slow = np.zeros((len(forms), len(forms[0].columns), size, size))
-        for m, one in enumerate(forms):
-            for j, (used, gram) in enumerate(zip(one.columns, one.slow, strict=True)):
-                index = [*used, size - 1]
-                slow[m, j][np.ix_(index, index)] = gram
+        slow = np.array([one.slow for one in forms])
         return cls(slow, whole, np.array([one.torque_squared for one in forms]))
 
-    def torque_kernels(self, values: Array, joint: int | None = None) -> Array:
+    def torque_kernels(self, values: Array) -> Array:
         """Inner products (m, r, r) of the low-passed errors that r estimates (r, p) leave.
 
-        The error of a weighted mean of estimates is the same mean of their errors. All joints
-        together, or one of them.
+        The error of a weighted mean of estimates is the same mean of their errors.
         """
-        gram = self.slow.sum(axis=1) if joint is None else self.slow[:, joint]
         left = np.column_stack([-values, np.ones(len(values))])
-        return np.asarray(left @ gram @ left.T)
+        return np.asarray(left @ self.slow @ left.T)
 
     def own_kernels(self, values: Array, truth: Array) -> Array:
         """The same (m, r, r) of Phi (pi - truth), the errors of the estimates themselves."""
@@ -206,7 +183,7 @@ class ClassForms(NamedTuple):
         `kernels` (m, r, r) are of one of the two kinds above.
         """
         squared = np.maximum(((weights @ kernels) * weights).sum(axis=2), 0.0)
-        return np.asarray(np.sqrt(squared / self.torque_squared.sum(axis=1)[:, None]))
+        return np.asarray(np.sqrt(squared / self.torque_squared[:, None]))
 
     def overall(self, estimate: Array) -> Array:
         """||e|| / ||tau|| of one estimate (p,) on each motion (m,), low-passed."""
@@ -219,20 +196,18 @@ class ClassForms(NamedTuple):
 
 def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
     """Form of one motion; rows that are not usable count as zero, as in the errors."""
-    blocks, columns = run.regressor(model)
     n = model.n_parameters
-    whole, slow = np.zeros((n, n)), []
-    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+    whole, slow = np.zeros((n, n)), np.zeros((n + 1, n + 1))
+    for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
         usable = run.usable[:, j]
         table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
         whole[np.ix_(used, used)] += table[:, :-1].T @ table[:, :-1]
-        passed = low_passed(run, table)[usable]
-        slow.append((passed.T @ passed).tolist())
+        passed, both = low_passed(run, table)[usable], [*used, n]
+        slow[np.ix_(both, both)] += passed.T @ passed
     return MotionForm(
         archive=archive,
-        torque_squared=(np.where(run.usable, run.torque, 0.0) ** 2).sum(axis=0).tolist(),
-        columns=[[int(k) for k in used] for used in columns],
-        slow=slow,
+        torque_squared=float((np.where(run.usable, run.torque, 0.0) ** 2).sum()),
+        slow=slow.tolist(),
         whole=whole.tolist(),
     )
 
@@ -270,7 +245,6 @@ def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
         pooled=found.pooled.values.tolist(),
         pooled_std=found.pooled.std.tolist(),
         undetermined=list(found.pooled.undetermined),
-        noise_std=found.pooled.noise_std.tolist(),
         log10_det=log10_det(gram, count * len(sources)),
         coupling_index=coupling_index(gram),
         n_samples=count,
@@ -278,7 +252,6 @@ def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
         duration=float(motion.time[rows.stop - 1] - motion.time[rows.start]),
         time=_rounded(shown.time - shown.time[0]),
         position=[_rounded(column) for column in shown.position.T],
-        velocity=[_rounded(column) for column in shown.velocity.T],
     )
 
 
@@ -303,64 +276,47 @@ def score(
         runs |= zip(names, prepared.fitted, strict=True)
     model = prepared.sources.cell.model
     table = np.array(list(estimates.values()), dtype=np.float64)
-    truth = list(estimates).index(PLANTED) if PLANTED in estimates else None
-    by_motion = [_errors(model, table, run, truth) for run in runs.values()]
+    errors = [_errors(model, table, run) for run in runs.values()]
     usable = [run.usable[_motion_rows(run)] for run in runs.values()]
-    errors: dict[str, dict[str, Any]] = {"own": {}} | {
-        quantity: {
-            name: [some[quantity][k].tolist() for some in by_motion]
-            for k, name in enumerate(estimates)
-            if quantity != "own" or k != truth
-        }
-        for quantity in by_motion[0]
-    }
+    forms = [motion_form(model, name, run) for name, run in runs.items()]
     examples = []
     if shown:
-        every = np.mean([errors["overall"][name] for name in shown], axis=0)
-        typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
         series = {name: np.asarray(estimates[name]) for name in shown}
+        both = ClassForms.of(forms)
+        every = np.mean([both.overall(one) for one in series.values()], axis=0)
+        typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
         examples.append(_example(model, runs[typical], typical, series))
     return ScoreRecord(
         inputs=inputs,
         durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs.values()],
         samples=[len(rows) for rows in usable],
         left_out=[np.count_nonzero(~rows, axis=0).tolist() for rows in usable],
-        forms=[motion_form(model, name, run) for name, run in runs.items()],
+        forms=forms,
+        mean_abs={n: [one[k].tolist() for one, _ in errors] for k, n in enumerate(estimates)},
+        all_rows={n: [float(one[k]) for _, one in errors] for k, n in enumerate(estimates)},
         examples=examples,
-        **errors,
     )
 
 
-def _errors(model: RobotModel, table: Array, run: Samples, truth: int | None) -> dict[str, Array]:
-    """Errors of every row of a table of estimates (k, p) on one motion: (k,), `mean_abs` (k, n).
+def _errors(model: RobotModel, table: Array, run: Samples) -> tuple[Array, Array]:
+    """Low-passed errors of every row of a table of estimates (k, p) on one motion.
 
-    The regressor and the low-pass, which cost most, are made once for all of them. `own` is what an
-    estimate adds to what the planted values, one of the rows, leave: noise and unmodelled effects.
+    Mean |e| per joint over usable rows (k, n), and the relative error over all rows (k,). The
+    regressor and the low-pass, which cost most, are made once for all of them.
     """
     left = np.zeros((*run.torque.shape, len(table)))
-    blocks, columns = run.regressor(model)
-    for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+    for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
         left[:, j] = run.torque[:, j, None] - block @ table[:, used].T
 
     def filtered(error: Array) -> Array:
         return low_passed(run, error.reshape(len(error), -1)).reshape(error.shape)
 
-    def relative(error: Array, torque: Array) -> Array:
-        return np.asarray(np.sqrt((error**2).sum(axis=(0, 1)) / (torque**2).sum()))
-
-    everywhere, whole = filtered(left), _motion_rows(run)
+    whole = _motion_rows(run)
+    squared = (filtered(left)[whole] ** 2).sum(axis=(0, 1)) / (run.torque[whole] ** 2).sum()
     left[~run.usable] = 0.0
     slow = np.where(run.usable[..., None], filtered(left), 0.0)
-    torque = np.where(run.usable, run.torque, 0.0)
     rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
-    found = {
-        "overall": relative(slow, torque),
-        "all_rows": relative(everywhere[whole], run.torque[whole]),
-        "mean_abs": (np.abs(slow).sum(axis=0) / rows[:, None]).T,
-    }
-    if truth is not None:
-        found["own"] = relative(left - left[..., truth, None], torque)
-    return found
+    return (np.abs(slow).sum(axis=0) / rows[:, None]).T, np.sqrt(squared)
 
 
 def _motion_rows(run: Samples) -> slice:

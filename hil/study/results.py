@@ -16,7 +16,7 @@ from hil.report.numbers import capitalised, fixed, significant
 from hil.results import Frozen
 
 from .campaigns import AP, B0, A, B
-from .records import ClassErrors, ExampleRecord, Fitted
+from .records import ExampleRecord, Fitted
 from .settings import StudySettings, load_json
 
 SCHEMA_VERSION: Final = 1
@@ -88,31 +88,13 @@ class MethodResult(Fitted):
     """Over the repetitions, of one of them."""
 
 
-class CrossCell(Frozen):
-    """How well one estimate predicts the motions of one class: ||e|| / ||tau||."""
-
-    method: str
-    motion_class: str
-    median: float
-    lower: float
-    upper: float
-    """Quartiles over the motions."""
-    all_rows_median: float
-    """Over the whole motion: rows at rest, near ends and at reversals are included."""
-    own_median: float | None
-    """Of ||Phi (pi - planted)|| / ||tau||; null with effects, or where nothing is planted."""
-
-
 class ComparisonResult(Frozen):
     """Two estimates on the same motions: errors with `second` over errors with `first`.
 
-    The interval treats motions and repetitions as random samples; the verdict rests on it alone.
-    The signed-rank test is over the motions, for these two estimates as they are.
+    The interval treats motions and repetitions as random samples; the verdict rests on it.
     """
 
     motion_class: str
-    joint: str | None
-    """Null for all joints together."""
     first: str
     second: str
     motions: int
@@ -120,23 +102,19 @@ class ComparisonResult(Frozen):
     """Of `first` and `second`."""
     ratio: float
     """Geometric mean over the motions."""
+    wins: int
+    """Motions that `second` predicts better."""
     error: float | None
     """Standard error of the log ratio; null with fewer than three repetitions, or one motion."""
     freedom: float | None
     """Its degrees of freedom."""
-    level: float
+    level: float = 1.0 - ALPHA
     """Of the interval by itself, such that all of its table hold at 95 % (Bonferroni)."""
-    low: float | None
-    high: float | None
+    low: float | None = None
+    high: float | None = None
     """Interval of the ratio at that level."""
-    verdict: Verdict
+    verdict: Verdict = "too few"
     """On `second`: whether the interval excludes 1."""
-    wins: int
-    """Motions that `second` predicts better."""
-    p_value: float
-    """Wilcoxon's signed-rank test, two-sided."""
-    p_corrected: float
-    """The same after Holm, for all comparisons of its table."""
 
     @property
     def differs(self) -> bool:
@@ -144,15 +122,31 @@ class ComparisonResult(Frozen):
         return self.verdict not in ("none", "too few")
 
 
-class ClassResult(ClassErrors):
-    """The motions of one class, and the errors of every estimate on each of them."""
+class ClassResult(Frozen):
+    """The motions of one class, and relative errors ||e|| / ||tau|| of every estimate on each.
+
+    They are low-passed at 30 Hz as the paper's Fig. 4 is: what remains is the error of the model,
+    and not the noise of the currents, which is the same for every estimate.
+    """
 
     motion_class: str
     archives: list[str]
+    durations: list[float]
+    overall: dict[str, list[float]]
+    """Of all joints together, for each estimate."""
+    own: dict[str, list[float]]
+    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
+    mean_abs: dict[str, list[list[float]]]
+    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
+    all_rows: dict[str, list[float]]
+    """As `overall`, over the whole motion: rows at rest, near ends and at reversals included."""
     left_out: list[float]
     """Share of the samples of the motions that all other errors leave out, per joint."""
-    left_out_share: float
-    """Of all joints together."""
+
+    @property
+    def left_out_share(self) -> float:
+        """Of all joints together."""
+        return sum(self.left_out) / len(self.left_out)
 
 
 class ClosenessResult(Frozen):
@@ -191,11 +185,9 @@ class ConditionResult(Frozen):
     effects: list[str]
     methods: list[MethodResult]
     classes: list[ClassResult]
-    cross: list[CrossCell]
     comparisons: list[ComparisonResult]
     own_comparisons: list[ComparisonResult]
     """The first two, class by class, in the errors of the estimates themselves."""
-    joint_comparisons: list[ComparisonResult]
     equal_data: EqualDataResult | None
     """Null where both have as much motion anyway."""
     closeness: list[ClosenessResult]
@@ -239,7 +231,7 @@ class AblationPoint(Frozen):
         return self.label or f"{self.value:g}"
 
 
-class AblationBand(Frozen):
+class ChanceRange(Frozen):
     """Range of a figure over subsets of the study's own repetitions of one method."""
 
     method: str
@@ -264,8 +256,6 @@ class AblationResult(Frozen):
     points: list[AblationPoint]
     comparisons: list[ComparisonResult] = Field(default_factory=list)
     """With B, where the settings are another method's."""
-    bands: list[AblationBand] = Field(default_factory=list)
-    """Of as many repetitions as the points have; none where the study has no more itself."""
 
 
 class Paragraph(Frozen):
@@ -296,6 +286,8 @@ class StudyResults(Frozen):
     table1: list[MotionRow]
     conditions: list[ConditionResult]
     ablations: list[AblationResult]
+    ranges: list[ChanceRange]
+    """Of as many repetitions as the ablations have; none where the study has no more itself."""
     reading: list[Paragraph]
     missing: list[str]
     """What of the paper's study is not in this one, and why."""
@@ -318,19 +310,18 @@ _OUTCOMES: Final = {
     "none": "No significant difference",
     "too few": "Too few repetitions or motions for a conclusion",
 }
-_Pairs = Sequence[tuple[ConditionResult, ComparisonResult]]
 
 
 def conclusions(results: StudyResults) -> list[Paragraph]:
     """All paragraphs, the paper's question first."""
     found = [_prediction(results), _classes(results), _effects(results)]
-    found += [_ablation(one) for one in results.ablations]
+    found += [_ablation(one, results.ranges) for one in results.ablations]
     return [one for one in found if one is not None]
 
 
 def summary_of(results: StudyResults) -> dict[str, Any]:
     """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
-    fields = {"motion_class", "first", "second", "ratio", "level", "verdict", "p_corrected"}
+    fields = {"motion_class", "first", "second", "ratio", "level", "verdict"}
     lines = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]
     return {
         "name": results.name,
@@ -347,7 +338,6 @@ def summary_of(results: StudyResults) -> dict[str, Any]:
             for condition in results.conditions
             for one in condition.comparisons
         ],
-        "cross": [one.model_dump() for some in results.conditions for one in some.cross],
         "missing": results.missing,
     }
 
@@ -360,14 +350,20 @@ def _prediction(results: StudyResults) -> Paragraph | None:
         return None
     pairs = [(one, row) for one in conditions if (row := _main(one)) is not None]
     printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
-    sentences = [f"{capitalised(one.words)}, {_ratio(row, one.labels)}." for one, row in pairs]
+    sentences = [
+        f"{capitalised(one.words)}, the error with {one.labels[row.second]} is"
+        f" {fixed(row.ratio, 3)} times that with {one.labels[row.first]}"
+        f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
+        f" smaller on {row.wins} of {row.motions} motions."
+        for one, row in pairs
+    ]
     if printed:
         sentences.append(
             "A is its best search here, beyond the frequencies that the paper prints. Compared"
             f" with A as printed: {_each(printed)}"
         )
-    directions = {row.ratio < 1.0 for _, row in pairs if row.differs}
-    if len(directions) == 2 and all(one.key.startswith("recorded") for one, _ in pairs):
+    opposite = len({row.ratio < 1.0 for _, row in pairs if row.differs}) == 2
+    if opposite and pairs[0][0].key.startswith("recorded"):
         sentences.insert(
             0,
             "The same motions, run in each campaign, lead to opposite conclusions: the state of"
@@ -415,9 +411,8 @@ def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
 def _effects(results: StudyResults) -> Paragraph | None:
     """How the conclusion depends on what the model leaves out."""
     by_key = {one.key: one for one in results.conditions}
-    if not {"plain", "effects"} <= by_key.keys():
-        return None
-    before, after = (_main(by_key[key]) for key in ("plain", "effects"))
+    pair = [_main(by_key[key]) if key in by_key else None for key in ("plain", "effects")]
+    before, after = pair
     if before is None or after is None:
         return None
     same = (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0)
@@ -434,20 +429,20 @@ def _effects(results: StudyResults) -> Paragraph | None:
     )
 
 
-def _ablation(ablation: AblationResult) -> Paragraph | None:
+def _ablation(ablation: AblationResult, ranges: Sequence[ChanceRange]) -> Paragraph | None:
     """Which settings lie beyond what other repetitions of the study's own motion would give."""
-    bands = [one for one in ablation.bands if one.motion_class == "fly-by" and one.method == B]
-    if not bands or ablation.key not in ("fly", "n_via", "weight"):
+    known = [one for one in ranges if (one.method, one.motion_class) == (B, "fly-by")]
+    if not known or ablation.key not in ("fly", "n_via", "weight"):
         return None
-    band = bands[-1]  # that of the estimate itself, where it is known
+    chance = known[-1]  # that of the estimate itself, where it is known
     outside = [
         point.name
         for point in ablation.points
-        for value in [getattr(point, band.quantity).get("fly-by", band.low)]
-        if not (point.base or band.low <= value <= band.high)
+        for value in [getattr(point, chance.quantity).get("fly-by", chance.low)]
+        if not (point.base or chance.low <= value <= chance.high)
     ]
-    low, high = (significant(100.0 * bound, 3) for bound in (band.low, band.high))
-    own = "own " if band.quantity == "own" else ""
+    low, high = (significant(100.0 * bound, 3) for bound in (chance.low, chance.high))
+    own = "own " if chance.quantity == "own" else ""
     text = (
         f"The {own}fly-by error for other repetitions of the study's own B ranges from {low} % to"
         f" {high} %; outside: {', '.join(outside) or 'no setting'}."
@@ -464,13 +459,12 @@ def _main(condition: ConditionResult) -> ComparisonResult | None:
     return condition.compared("fly-by" if "fly-by" in names else names[0], first, second)
 
 
-def _each(pairs: _Pairs) -> str:
+def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
     """The conclusion under each condition; once where it is the same."""
     texts = [_outcome(condition, row) for condition, row in pairs]
     if len(set(texts)) > 1:
-        texts = [
-            f"{capitalised(one.words)}: {text}" for (one, _), text in zip(pairs, texts, strict=True)
-        ]
+        named = zip(pairs, texts, strict=True)
+        texts = [f"{capitalised(one.words)}: {text}" for (one, _), text in named]
     return " ".join(f"{text}." for text in dict.fromkeys(texts))
 
 
@@ -485,11 +479,3 @@ def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
     equal = condition.equal_data.comparisons if condition.equal_data is not None else []
     gone = any(o.verdict == "none" for o in equal if o.motion_class == row.motion_class)
     return f"{text}, but not with as much motion of each" if gone else text
-
-
-def _ratio(row: ComparisonResult, labels: dict[str, str]) -> str:
-    interval = "" if row.low is None else f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)})"
-    return (
-        f"the error with {labels[row.second]} is {fixed(row.ratio, 3)} times that with"
-        f" {labels[row.first]}{interval}, smaller on {row.wins} of {row.motions} motions"
-    )

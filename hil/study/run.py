@@ -41,7 +41,6 @@ from .campaigns import (
     NO_EFFECTS,
     A,
     B,
-    Execution,
     Plans,
     Search,
     execute_all,
@@ -155,14 +154,12 @@ def _results(
         effects = tuple(json.loads(simulated_provenance(cell, on)["effects"]))
         condition = Condition(name, _WORDS[name], effects, drifts=on)
         labels = {run.key: run.label for run in runs}
-        conditions.append(
-            condition_result(
-                condition, labels, fits[name], scores[name], parameters, cell.joint_names
-            )
-        )
+        conditions.append(condition_result(condition, labels, fits[name], scores[name], parameters))
     sines, sizes = plans.searched[A], preset("b").search
     main = fits[NO_EFFECTS]
-    evidence = Evidence(fits[ABLATION], main, [scores[NO_EFFECTS]], truth, sines)
+    varied, ranges = ablations(
+        settings, Evidence(fits[ABLATION], main, [scores[NO_EFFECTS]], truth, sines)
+    )
     return study_results(
         root,
         cell,
@@ -172,15 +169,31 @@ def _results(
         settings=settings,
         searches=[_search_result(one, chosen=key in (sines, B, B0)) for key, one in found.items()],
         table1=[
-            _table1(key, found[plans.searched[key]], one, main[key])
+            _row(key, found[plans.searched[key]].notes, one.plan.excitation, main[key])
             for key, one in executions[NO_EFFECTS].items()
         ]
         + printed_rows(cell),
         conditions=conditions,
-        ablations=ablations(settings, evidence),
+        ablations=varied,
+        ranges=ranges,
         missing=plans.missing
         + ([] if settings.effects else ["The unmodelled effects were not run."]),
         times={},
+    )
+
+
+def _row(key: str, words: str, excitation: Excitation | None, record: FitRecord) -> MotionRow:
+    """Row of Table 1, as planned where that is known, and as executed."""
+    planned = record if excitation is None else excitation.criteria
+    return MotionRow(
+        key=key,
+        words=words,
+        n_samples=record.n_samples if excitation is None else excitation.criteria.n_samples,
+        log10_det=planned.log10_det,
+        coupling_index=planned.coupling_index,
+        executed_log10_det=record.log10_det,
+        executed_coupling_index=record.coupling_index,
+        duration=record.duration if excitation is None else excitation.trajectory.duration,
     )
 
 
@@ -195,21 +208,6 @@ def _search_result(search: Search, *, chosen: bool) -> SearchResult:
         log10_det=None if one is None else one.criteria.log10_det,
         coupling_index=None if one is None else one.criteria.coupling_index,
         duration=None if one is None else float(one.trajectory.duration),
-    )
-
-
-def _table1(key: str, search: Search, execution: Execution, record: FitRecord) -> MotionRow:
-    """Row of an excitation that the arm bore."""
-    one = execution.plan.excitation
-    return MotionRow(
-        key=key,
-        words=search.notes,
-        n_samples=one.criteria.n_samples,
-        log10_det=one.criteria.log10_det,
-        coupling_index=one.criteria.coupling_index,
-        executed_log10_det=record.log10_det,
-        executed_coupling_index=record.coupling_index,
-        duration=float(one.trajectory.duration),
     )
 
 
@@ -258,21 +256,6 @@ class Recorded:
         stops = self.excitation.method == B and class_in(self.archive) == "stop-to-stop"
         return B0 if stops else self.excitation.method
 
-    def row(self, record: FitRecord) -> MotionRow:
-        """Row of Table 1."""
-        one = self.excitation
-        planned = record if one is None else one.criteria
-        return MotionRow(
-            key=self.run.key,
-            words="not known" if one is None else f"found by method {one.method}",
-            n_samples=record.n_samples,
-            log10_det=planned.log10_det,
-            coupling_index=planned.coupling_index,
-            executed_log10_det=record.log10_det,
-            executed_coupling_index=record.coupling_index,
-            duration=record.duration,
-        )
-
 
 def study_campaigns(
     root: Path, campaigns: Sequence[Path], reporter: Reporter, *, workers: int = 2
@@ -317,12 +300,24 @@ def study_campaigns(
             quick=False,
             settings=None,
             searches=[],
-            table1=[one.row(fits[one.run.key]) for one in recorded] + printed_rows(cell),
+            table1=[
+                _row(
+                    one.run.key,
+                    "not known"
+                    if one.excitation is None
+                    else f"found by method {one.excitation.method}",
+                    one.excitation,
+                    fits[one.run.key],
+                )
+                for one in recorded
+            ]
+            + printed_rows(cell),
             conditions=[
-                condition_result(one, labels, fits, some, parameters, cell.joint_names)
+                condition_result(one, labels, fits, some, parameters)
                 for (one, _), some in zip(parts, scores, strict=True)
             ],
             ablations=[repetition_ablation(Evidence({}, fits, scores, truth), SUBSETS, keys)],
+            ranges=[],
             missing=_missing(recorded, truth, {name for some in scores for name in some}),
             times={"estimates and predictions": round(time.perf_counter() - begin, 1)},
         )

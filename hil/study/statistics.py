@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from hil.compare.spread import holm
-
 from .records import ClassForms
-from .results import ALPHA, SMALL, AblationBand, ComparisonResult, Quantity, Verdict
+from .results import ALPHA, SMALL, ChanceRange, ComparisonResult, Quantity, Verdict
 
 Array = NDArray[np.float64]
 
@@ -30,20 +28,6 @@ asked."""
 _CHUNK: Final = 500
 _SUBSETS: Final = 400
 _SEED, _BAND_SEED = 20140901, 20140902
-
-
-def compare(first: Array, second: Array) -> tuple[float, int, float]:
-    """Compare positive errors (m,) of two methods on the same m motions, by their ratio.
-
-    Motions differ in size, and each counts the same.
-
-    Returns:
-        Geometric mean of second over first, motions with a smaller second, and the p value of
-        Wilcoxon's signed-rank test of the log ratios, two-sided (1 where all are equal).
-    """
-    logs = np.log(second / first)
-    p_value = float(stats.wilcoxon(logs).pvalue) if np.any(logs) else 1.0
-    return float(np.exp(logs.mean())), int(np.count_nonzero(logs < 0.0)), p_value
 
 
 def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
@@ -58,41 +42,30 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
 
 
 def compared_on(
-    motion_class: str,
-    keys: tuple[str, str],
-    inner: tuple[Array, Array],
-    *,
-    joint: str | None = None,
-    drifts: bool,
+    motion_class: str, keys: tuple[str, str], inner: tuple[Array, Array], *, drifts: bool
 ) -> ComparisonResult:
     """Errors with the second estimate over errors with the first, motion by motion; a table of one.
 
-    `inner` are the inner products (m, r, r) of the errors that the r repetitions of each estimate
-    leave, of one joint or of all; with `drifts`, repetitions may resemble their neighbours.
+    Motions differ in size, and each counts the same. `inner` are the inner products (m, r, r) of
+    the errors that the r repetitions of each estimate leave; with `drifts`, repetitions may
+    resemble their neighbours.
     """
     # The sum of a mean's squared errors: weights 1 / r on either side.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
-    ratio, wins, p_value = compare(before, after)
+    logs = np.log(after / before)
     error, freedom = spread(*inner, drifts=drifts, seed=_SEED) or (None, None)
     (one,) = corrected(
         [
             ComparisonResult(
                 motion_class=motion_class,
-                joint=joint,
                 first=keys[0],
                 second=keys[1],
-                motions=len(before),
+                motions=len(logs),
                 repetitions=[one.shape[1] for one in inner],
-                ratio=ratio,
+                ratio=float(np.exp(logs.mean())),
+                wins=int(np.count_nonzero(logs < 0.0)),
                 error=error,
                 freedom=freedom,
-                level=1.0 - ALPHA,
-                low=None,
-                high=None,
-                verdict="too few",
-                wins=wins,
-                p_value=p_value,
-                p_corrected=p_value,
             )
         ]
     )
@@ -102,20 +75,19 @@ def compared_on(
 def corrected(comparisons: Sequence[ComparisonResult]) -> list[ComparisonResult]:
     """The comparisons of one table with interval and verdict, corrected for their number.
 
-    Intervals by Student's t and verdicts after Bonferroni, so that all intervals of the table hold
-    together and a verdict is exactly that of its interval; signed ranks after Holm.
+    Intervals by Student's t after Bonferroni, so that all of the table hold together and a verdict
+    is exactly that of its interval.
     """
-    after = holm(np.array([one.p_value for one in comparisons])).tolist()
     level = 1.0 - ALPHA / max(1, len(comparisons))
     found = []
-    for one, p_value in zip(comparisons, after, strict=True):
+    for one in comparisons:
         low, high = None, None
         if one.error is not None and one.freedom is not None:
             width = float(stats.t.ppf(0.5 + 0.5 * level, one.freedom)) * one.error
             low, high = (float(bound) for bound in one.ratio * np.exp([-width, width]))
-        judged = {"level": level, "low": low, "high": high, "p_corrected": p_value}
-        judged["verdict"] = verdict_of(one.ratio, low, high)
-        found.append(one.model_copy(update=judged))
+        verdict = verdict_of(one.ratio, low, high)
+        update = {"level": level, "low": low, "high": high, "verdict": verdict}
+        found.append(one.model_copy(update=update))
     return found
 
 
@@ -207,18 +179,19 @@ def parameter_error(estimate: Array, base: Array, truth: Array) -> float | None:
     return float(np.exp(np.mean(np.log(own[usable] / reference[usable])))) if usable.any() else None
 
 
-def bands_of(
+def ranges_of(
     method: str,
     values: Array,
     size: int,
     forms: Mapping[str, ClassForms],
     truth: Array | None,
     reference: Array,
-) -> list[AblationBand]:
-    """Where an ablation's figures lie for other repetitions of the very same motion.
+) -> list[ChanceRange]:
+    """Where figures lie for other repetitions of the very same motion.
 
     They are of all subsets of so many (`size`) of a method's repetitions (r, p); without more of
-    them there is no band. `reference` (p,) is the estimate whose distance from `truth` is 1.
+    them there is no range. `reference` (p,) is the estimate whose distance from
+    `truth` is 1.
     """
     if not 1 <= size < len(values):
         return []
@@ -235,7 +208,7 @@ def bands_of(
         known = np.array([one for one in distances if one is not None])
         figures += [("parameter_error", None, known)] if len(known) else []
     return [
-        AblationBand(
+        ChanceRange(
             method=method,
             repetitions=size,
             quantity=quantity,

@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import combinations
 from math import pi
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +18,15 @@ from hil.version import software
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
 from .campaigns import AP, SINES, A, B, noise_key, variant_key
-from .records import CLASSES, ClassErrors, ClassForms, FitRecord, Fitted, ScoreRecord
+from .records import CLASSES, PLANTED, ClassForms, FitRecord, Fitted, ScoreRecord
 from .results import (
-    AblationBand,
     AblationPoint,
     AblationResult,
+    ChanceRange,
     ClassResult,
     ClosenessResult,
     ComparisonResult,
     ConditionResult,
-    CrossCell,
     EqualDataResult,
     MethodResult,
     MotionRow,
@@ -36,7 +35,7 @@ from .results import (
     conclusions,
 )
 from .settings import StudySettings
-from .statistics import bands_of, compared_on, corrected, parameter_error
+from .statistics import compared_on, corrected, parameter_error, ranges_of
 
 Array = NDArray[np.float64]
 
@@ -163,53 +162,47 @@ def condition_result(
     fits: Mapping[str, FitRecord],
     scores: Mapping[str, ScoreRecord],
     parameters: Sequence[StudyParameter],
-    joint_names: Sequence[str],
 ) -> ConditionResult:
     """All tables of one condition.
 
     `fits` of the methods are in the order of the tables, `scores` by class of motion.
     """
-    keys, equal, estimates = list(fits), equal_data(fits), repetitions_of(fits)
-    classes = [_class_result(name, one, condition) for name, one in scores.items()]
+    keys, equal, repetitions = list(fits), equal_data(fits), repetitions_of(fits)
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
     truth = None
-    if not condition.effects and all(one.truth is not None for one in parameters):
+    if all(one.truth is not None for one in parameters):
         truth = np.array([one.truth for one in parameters], dtype=np.float64)
+    rigid = None if condition.effects else truth
 
-    def pair(
-        name: str, some: Sequence[str], joint: int | None = None, *, own: bool = False
-    ) -> ComparisonResult:
-        """Two estimates by the torque they miss, of one joint or all, or by their own error."""
+    def pair(name: str, two: tuple[str, str], *, own: bool = False) -> ComparisonResult:
+        """Two estimates by the torque they miss, or by their own error."""
         first, second = (
-            forms[name].own_kernels(estimates[key], truth)
-            if own and truth is not None
-            else forms[name].torque_kernels(estimates[key], joint)
-            for key in some
+            forms[name].own_kernels(repetitions[key], rigid)
+            if own and rigid is not None
+            else forms[name].torque_kernels(repetitions[key])
+            for key in two
         )
-        named, two = None if joint is None else joint_names[joint], (some[0], some[1])
-        return compared_on(name, two, (first, second), joint=named, drifts=condition.drifts)
+        return compared_on(name, two, (first, second), drifts=condition.drifts)
 
-    two = keys[:2] if len(keys) > 1 else None
-    own = [pair(name, two, own=True) for name in forms if two and truth is not None]
-    numbered = range(len(joint_names) if "fly-by" in forms else 0)
-    joints = [pair("fly-by", two, j) for j in numbered if two]
+    compared = compared_pairs(keys)
+    two = compared[:1] if rigid is not None else []
     if equal is not None:
         cut = [equal.name if key == equal.cut else key for key in keys[:2]]
-        rows = corrected([pair(name, cut) for name in forms])
+        rows = corrected([pair(name, (cut[0], cut[1])) for name in forms])
         equal = equal.model_copy(update={"comparisons": rows})
+    estimates = {key: values.mean(axis=0) for key, values in repetitions.items()}
     example = scores.get("fly-by") or next(iter(scores.values()), None)
     return ConditionResult(
         key=condition.key,
         words=condition.words,
         effects=list(condition.effects),
         methods=[_method(key, labels[key], fits[key]) for key in keys],
-        classes=classes,
-        cross=[_cell(one, key) for one in classes for key in one.overall],
-        comparisons=corrected(
-            [pair(name, some) for name in forms for some in compared_pairs(keys)]
-        ),
-        own_comparisons=corrected(own),
-        joint_comparisons=corrected(joints),
+        classes=[
+            _class_result(name, one, forms[name], estimates, truth, rigid)
+            for name, one in scores.items()
+        ],
+        comparisons=corrected([pair(name, some) for name in forms for some in compared]),
+        own_comparisons=corrected([pair(name, some, own=True) for name in forms for some in two]),
         equal_data=equal,
         closeness=_closeness(fits, keys, parameters),
         examples=[] if example is None else example.examples,
@@ -229,28 +222,27 @@ def _method(key: str, label: str, record: FitRecord) -> MethodResult:
     )
 
 
-def _class_result(name: str, record: ScoreRecord, condition: Condition) -> ClassResult:
-    left_out, samples = np.sum(record.left_out, axis=0), sum(record.samples)
-    errors = record.model_dump(include=set(ClassErrors.model_fields))
+def _class_result(
+    name: str,
+    record: ScoreRecord,
+    forms: ClassForms,
+    estimates: Mapping[str, Array],
+    truth: Array | None,
+    rigid: Array | None,
+) -> ClassResult:
+    every = dict(estimates) | ({} if truth is None else {PLANTED: truth})
+    own = {} if rigid is None else {key: forms.own(one, rigid) for key, one in estimates.items()}
     return ClassResult(
         motion_class=name,
         archives=[one.archive for one in record.forms],
-        left_out=(left_out / samples).tolist(),
-        left_out_share=float(left_out.sum() / (samples * left_out.size)),
-        **errors | ({"own": {}} if condition.effects else {}),
-    )
-
-
-def _cell(result: ClassResult, key: str) -> CrossCell:
-    lower, middle, upper = np.percentile(result.overall[key], (25.0, 50.0, 75.0)).tolist()
-    return CrossCell(
-        method=key,
-        motion_class=result.motion_class,
-        median=middle,
-        lower=lower,
-        upper=upper,
-        all_rows_median=float(np.median(result.all_rows[key])),
-        own_median=float(np.median(own)) if (own := result.own.get(key)) else None,
+        durations=record.durations,
+        overall={
+            key: forms.overall(one).tolist() for key, one in every.items() if key in record.all_rows
+        },
+        own={key: one.tolist() for key, one in own.items()},
+        mean_abs=record.mean_abs,
+        all_rows=record.all_rows,
+        left_out=(np.sum(record.left_out, axis=0) / sum(record.samples)).tolist(),
     )
 
 
@@ -357,10 +349,6 @@ class Evidence:
         }
         return {name: ClassForms.of(forms) for name, forms in every.items() if forms}
 
-    def executed(self, key: str) -> Array:
-        """Estimates (r, p) of the repetitions of an ablation's own campaign."""
-        return np.array(self.fits[key].values)
-
     def point(
         self, value: float, record: FitRecord, values: Array, reference: Array, **named: Any
     ) -> AblationPoint:
@@ -381,57 +369,34 @@ class Evidence:
             **named,
         )
 
-    def bands(self, methods: Sequence[str], size: int, reference: Array) -> list[AblationBand]:
-        """Where the figures lie for other repetitions of the study's own motions."""
-        return [
-            band
-            for method in methods
-            for band in bands_of(
-                method, np.array(self.main[method].values), size, self.forms, self.truth, reference
-            )
-        ]
 
-
-def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResult]:
-    """All of a simulated study."""
-    of_b, fits = evidence.executed(B), evidence.fits
-    reference = of_b.mean(axis=0)
+def ablations(
+    settings: StudySettings, evidence: Evidence
+) -> tuple[list[AblationResult], list[ChanceRange]]:
+    """All of a simulated study, and where A and B lie by chance."""
+    fits = evidence.fits
+    values = {key: np.array(one.values) for key, one in fits.items()}
+    reference = values[B].mean(axis=0)
     sines = [key for key in SINES if key in fits]
-    fly_by = evidence.forms["fly-by"]
-    inner = {key: fly_by.torque_kernels(evidence.executed(key)) for key in (*sines, B)}
+    inner = {key: evidence.forms["fly-by"].torque_kernels(values[key]) for key in (*sines, B)}
     beside_b = [
         compared_on("fly-by", (key, B), (inner[key], inner[B]), drifts=False) for key in sines
     ]
-
-    def varied(
-        name: Literal["via", "weight", "fly"], values: Sequence[float]
-    ) -> list[tuple[float, str, str]]:
-        return [(value, B, variant_key(name, value)) for value in values]
-
-    # By ablation: value, method and key of the fit of each setting; the setting of the study
-    # itself, by value or key; and the methods that have bands.
-    wanted: dict[str, tuple[list[tuple[float, str, str]], object, tuple[str, ...]]] = {
-        "sines": ([(k, A, key) for k, key in enumerate(sines)], evidence.sines, ()),
-        "fly": (varied("fly", settings.fly), B, (B,)),
-        "n_via": (varied("via", settings.n_via), B, (B,)),
-        "weight": (varied("weight", settings.coupling_weight), B, (B,)),
-        "repetitions": ([], None, ()),
-        "noise": (
-            [(f, method, noise_key(method, f)) for method in (A, B) for f in settings.noise],
-            1.0,
-            (A, B),
-        ),
+    # By ablation: value, method and key of the fit of each setting, and that of the study itself.
+    wanted: dict[str, tuple[list[tuple[float, str, str]], object]] = {
+        "sines": ([(float(k), A, key) for k, key in enumerate(sines)], evidence.sines),
+        "fly": ([(one, B, variant_key("fly", one)) for one in settings.fly], B),
+        "n_via": ([(float(one), B, variant_key("via", one)) for one in settings.n_via], B),
+        "weight": ([(one, B, variant_key("weight", one)) for one in settings.coupling_weight], B),
+        "noise": ([(f, m, noise_key(m, f)) for m in (A, B) for f in settings.noise], 1.0),
     }
     found = []
-    for name, (rows, base, methods) in wanted.items():
-        if name == "repetitions":
-            found.append(repetition_ablation(evidence, settings.subsets, (A, B)))
-            continue
+    for name, (rows, base) in wanted.items():
         points = [
             evidence.point(
-                float(value),
+                value,
                 fits[key],
-                evidence.executed(key),
+                values[key],
                 reference,
                 method=method,
                 base=base in (value, key),
@@ -440,34 +405,49 @@ def ablations(settings: StudySettings, evidence: Evidence) -> list[AblationResul
             for value, method, key in rows
             if key in fits
         ]
-        more = {"comparisons": corrected(beside_b)} if name == "sines" else {}
-        bands = evidence.bands(methods, len(of_b), reference)
-        found.append(_result(name, points, bands).model_copy(update=more))
-    return found
+        found.append(_result(name, points, corrected(beside_b) if name == "sines" else ()))
+    found.insert(-1, repetition_ablation(evidence, settings.subsets, (A, B)))
+    ranges = [
+        one
+        for method in (A, B)
+        for one in ranges_of(
+            method,
+            np.array(evidence.main[method].values),
+            len(values[B]),
+            evidence.forms,
+            evidence.truth,
+            reference,
+        )
+    ]
+    return found, ranges
 
 
 def repetition_ablation(
     evidence: Evidence, sizes: Sequence[int], methods: Sequence[str]
 ) -> AblationResult:
     """Estimates from the first repetitions only, each size beside the last method's."""
-    last = np.array(evidence.main[methods[-1]].values)
-    points, bands = [], []
+    last, points = np.array(evidence.main[methods[-1]].values), []
     for method in methods:
         record = evidence.main[method]
         values = np.array(record.values)
         for size in (one for one in sizes if one <= len(values)):
             reference, base = last[:size].mean(axis=0), size == len(values)
-            points.append(
-                evidence.point(
-                    float(size), record, values[:size], reference, method=method, base=base
-                )
+            point = evidence.point(
+                float(size), record, values[:size], reference, method=method, base=base
             )
-            bands += evidence.bands((method,), size, reference)
-    return _result("repetitions", points, bands)
+            points.append(point)
+    return _result("repetitions", points)
 
 
-def _result(key: str, points: list[AblationPoint], bands: list[AblationBand]) -> AblationResult:
+def _result(
+    key: str, points: list[AblationPoint], comparisons: Sequence[ComparisonResult] = ()
+) -> AblationResult:
     title, variable, words = _TEXTS[key]
     return AblationResult(
-        key=key, title=title, variable=variable, words=words, points=points, bands=bands
+        key=key,
+        title=title,
+        variable=variable,
+        words=words,
+        points=points,
+        comparisons=list(comparisons),
     )

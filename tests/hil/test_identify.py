@@ -44,8 +44,8 @@ from hil.identify.surroundings import (
 from hil.importers import ColumnMap, Robot, import_log
 from hil.outcome import _load_series, _series_bytes, rewrite_report, write_outcome
 from hil.progress import Silent
-from hil.report import ReportSeries, render_report
-from hil.report.page import judgement_context
+from hil.report import ReportSeries, report_bytes
+from hil.report.figures import residual_panels
 from hil.results import SCHEMA_VERSION, JudgementResult, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
@@ -412,16 +412,15 @@ class TestJudgement:
     def test_shows_the_worst_first_and_a_figure_per_joint(
         self, found: Identification, judgement: JudgementResult
     ) -> None:
-        context = judgement_context(found.results)
+        context = residual_panels(found.results)
         levels = [finding.level for finding in judgement.worst_first]
         assert levels == sorted(levels, key=["wrong", "doubtful", "information", "good"].index)
         for kind in ("speed_panels", "position_panels", "autocorrelation_panels"):
             assert [panel.title for panel in context[kind]] == found.results.joint_names
-        panels = [context[name] for name in context if name.endswith("panels")]
-        identifiers = [panel.svg for some in panels for panel in some]
+        identifiers = [panel.svg for some in context.values() for panel in some]
         assert len(set(identifiers)) == len(identifiers)
         old = found.results.model_copy(update={"judgement": None})
-        assert judgement_context(old) == {}
+        assert residual_panels(old) == {}
         assert table(old) == []
 
 
@@ -674,7 +673,7 @@ class TestCalibration:
         with suppress(typer.Exit):
             finish(results, json=False)
         assert line in " ".join(capsys.readouterr().err.split())
-        assert line in render_report(results, split.series)
+        assert line in report_bytes(results, split.series).decode()
         assert json.loads(as_json(results))["calibration"]["means"] == results.calibration.means
         shares = [1.0, 0.5, None, 1.0, 0.9, 1.0]
         changed = {"joint_inside": shares, "inside": 0.88}

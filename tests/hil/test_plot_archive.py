@@ -20,8 +20,7 @@ from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
-from hil.plots.archive_panels import BINS, archive_page, even
-from hil.plots.archive_picture import draw_archive
+from hil.plots.archive_picture import PAGE_BINS, archive_page, draw_archive, even
 from hil.plots.archive_view import ArchiveView, Trace, view_of
 
 
@@ -68,7 +67,7 @@ class TestFrame:
             assert np.nanmin(trace.value) == shown.min()
 
     def test_it_is_named(self, excitation: Path) -> None:
-        view = view_of(excitation, bins=BINS)
+        view = view_of(excitation, bins=PAGE_BINS)
         frame = "angles, speeds and torques as on the teach pendant"
         assert view.frame == frame
         assert frame in html.unescape(archive_page(view).decode("utf-8"))
@@ -145,7 +144,7 @@ def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path
 
 
 def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
-    view = view_of(excitation, joints=("2",), bins=BINS)
+    view = view_of(excitation, joints=("2",), bins=PAGE_BINS)
     page = archive_page(view).decode("utf-8")
     (text,) = re.findall(r'data-traces="([^"]*)"', page)
     content = json.loads(html.unescape(text))
@@ -153,7 +152,7 @@ def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
     (line,) = content["plots"][2]["lines"]
     counts = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
     current = open_archive(excitation).columns["target_current"][:, 1]
-    kept = current if len(current) <= 2 * BINS else view.quantities[2].traces[0].value
+    kept = current if len(current) <= 2 * PAGE_BINS else view.quantities[2].traces[0].value
     values = line["low"] + line["step"] * counts
     assert values.max() == pytest.approx(kept.max(), abs=line["step"])
     assert values.min() == pytest.approx(kept.min(), abs=line["step"])
@@ -187,8 +186,8 @@ def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:
     def header(view: ArchiveView) -> str:
         return " ".join(text.get_text() for text in draw_archive(view).texts)
 
-    assert "no packet missed" in header(view)
-    assert "packets missed at 1 place " in header(replace(view, gaps=np.array([1.0])))
+    assert "packets: none missed" in header(view)
+    assert "packets: missed at 1 place " in header(replace(view, gaps=np.array([1.0])))
     assert "missed" not in header(replace(view, states=(), events=()))
 
 

@@ -12,8 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 from typer.testing import CliRunner
@@ -45,9 +43,9 @@ from hil.study.campaigns import (
 from hil.study.page import study_page
 from hil.study.records import ClassForms, FitRecord, MotionForm, Run, ScoreRecord, classes_of
 from hil.study.results import (
-    AblationBand,
     AblationPoint,
     AblationResult,
+    ChanceRange,
     ConditionResult,
     EqualDataResult,
     StudyParameter,
@@ -58,11 +56,10 @@ from hil.study.run import homes, recorded_runs
 from hil.study.settings import Effort
 from hil.study.statistics import (
     FEWEST,
-    bands_of,
-    compare,
     compared_on,
     corrected,
     parameter_error,
+    ranges_of,
     spread,
     verdict_of,
 )
@@ -94,7 +91,6 @@ def fitted(values: Array, duration: float = 8.0) -> FitRecord:
         pooled=values.mean(axis=0).tolist(),
         pooled_std=[0.1] * n,
         undetermined=[],
-        noise_std=[1.0, 1.0],
         log10_det=50.0,
         coupling_index=3.0,
         n_samples=100,
@@ -102,7 +98,6 @@ def fitted(values: Array, duration: float = 8.0) -> FitRecord:
         duration=duration,
         time=[0.0, 1.0],
         position=[[0.0, 1.0]] * 2,
-        velocity=[[0.0, 1.0]] * 2,
     )
 
 
@@ -122,24 +117,16 @@ def scored(errors: Mapping[str, Array]) -> ScoreRecord:
         samples=[100] * motions,
         left_out=[[10, 30]] * motions,
         forms=[form(np.diag([*column, 0.0]) ** 2) for column in table.T],
-        overall={name: values.tolist() for name, values in errors.items()},
         all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
-        own={},
         mean_abs={name: np.outer(values, [1.0, 2.0]).tolist() for name, values in errors.items()},
         examples=[],
     )
 
 
-def form(gram: Array, joints: int = 2) -> MotionForm:
-    """A motion whose Gram of [Phi | tau] (p + 1, p + 1) is shared equally by the joints."""
-    n = len(gram) - 1
-    return MotionForm(
-        archive="validation_000_a1.mcap",
-        torque_squared=[1.0 / joints] * joints,
-        columns=[list(range(n))] * joints,
-        slow=[(gram / joints).tolist()] * joints,
-        whole=gram[:n, :n].tolist(),
-    )
+def form(gram: Array) -> MotionForm:
+    """A motion with this Gram of [Phi | tau] (p + 1, p + 1)."""
+    whole = gram[:-1, :-1].tolist()
+    return MotionForm(archive="v.mcap", torque_squared=1.0, slow=gram.tolist(), whole=whole)
 
 
 def forms_of(*grams: Array) -> ClassForms:
@@ -152,11 +139,6 @@ def random_forms(motions: int, n: int) -> ClassForms:
     random = np.random.default_rng(0)
     tables = random.standard_normal((motions, 40, n)) * random.uniform(1, 3, (motions, 1, 1))
     return forms_of(*(np.pad(table.T @ table, (0, 1)) for table in tables))
-
-
-errors = st.lists(
-    st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_size=1, max_size=30
-).map(lambda pairs: tuple(np.array(column) for column in zip(*pairs, strict=True)))
 
 
 class TestErrors:
@@ -172,8 +154,6 @@ class TestErrors:
         left = np.linalg.norm(tau - phi @ mean)  # over torque of 1
         assert forms.overall(mean) == pytest.approx([left])
         assert np.sqrt(forms.torque_kernels(values).mean()) == pytest.approx(left)
-        one_joint = np.sqrt(forms.torque_kernels(values, 0).mean())
-        assert one_joint == pytest.approx(left / np.sqrt(2.0))
         away = np.linalg.norm(phi @ (mean - 1.0))
         assert forms.own(mean, np.ones(3)) == pytest.approx([away])
         assert np.sqrt(forms.own_kernels(values, np.ones(3)).mean()) == pytest.approx(away)
@@ -197,7 +177,7 @@ class TestErrors:
 
     def test_the_band_holds_what_other_repetitions_give(self) -> None:
         forms, values = {"fly-by": random_forms(5, 4)}, flagged(0, 4, 6, 0.1)
-        found = bands_of("b", values, 1, forms, np.zeros(4), values[0])
+        found = ranges_of("b", values, 1, forms, np.zeros(4), values[0])
         bands = {one.quantity: one for one in found}
         singles = [float(np.median(forms["fly-by"].overall(one))) for one in values]
         error = bands["error"]
@@ -205,8 +185,8 @@ class TestErrors:
         assert error.subsets == 6
         assert bands["own"].low == pytest.approx(error.low)
         assert bands["parameter_error"].low <= 1.0 <= bands["parameter_error"].high
-        assert bands_of("b", values, 6, forms, np.zeros(4), values[0]) == []
-        some = bands_of("b", values, 3, forms, None, values[0])
+        assert ranges_of("b", values, 6, forms, np.zeros(4), values[0]) == []
+        some = ranges_of("b", values, 3, forms, None, values[0])
         assert {one.quantity for one in some} == {"error"}
 
     def test_planted_values_in_printed_units_are_the_manufacturers(self) -> None:
@@ -291,15 +271,6 @@ class TestSpread:
 class TestVerdict:
     """Tests of ratios, and tables of them."""
 
-    @settings(max_examples=8)
-    @given(errors)
-    def test_comparing_in_reverse_inverts_the_ratio(self, pair: tuple[Array, Array]) -> None:
-        there, back = compare(*pair), compare(*reversed(pair))
-        assert there[0] * back[0] == pytest.approx(1.0)
-        assert there[2] == pytest.approx(back[2])
-        assert there[1] + back[1] + int(np.sum(pair[0] == pair[1])) == len(pair[0])
-        assert compare(pair[0], pair[0]) == (1, 0, 1)
-
     @pytest.mark.parametrize(
         ("ratio", "low", "high", "verdict"),
         [
@@ -320,14 +291,13 @@ class TestVerdict:
         error = 0.1 / stats.t.ppf(0.985, 8.0)  # leaves out 1 at 97 %
         inner = np.ones((4, 3, 3)), np.ones((4, 3, 3))
         one = compared_on("fly-by", ("a", "b"), inner, drifts=False)
-        own = {"ratio": np.exp(0.1), "error": error, "freedom": 8.0, "p_value": 0.01}
+        own = {"ratio": np.exp(0.1), "error": error, "freedom": 8.0}
         (alone,) = corrected([one.model_copy(update=own)])
         among = corrected([one.model_copy(update=own)] * 4)
         assert (alone.level, alone.verdict) == (0.95, "worse")
         assert (among[0].level, among[0].verdict) == (0.9875, "none")
         assert alone.low is not None and alone.low > 1.0
         assert among[0].low is not None and among[0].low < 1.0
-        assert [one.p_corrected for one in among] == pytest.approx([0.04] * 4)
 
     def test_the_printed_sines_are_compared_with_b_alone(self) -> None:
         assert compared_pairs([A, B, B0]) == [(A, B), (A, B0), (B, B0)]
@@ -361,15 +331,19 @@ def condition(
         {key: fitted(flagged(k, 2, repetitions, noise)) for k, key in enumerate(keys)},
         {name: scored(dict(zip(keys, (a, b), strict=True))) for name in classes},
         parameters,
-        ("hip", "knee"),
     )
 
 
-def study(*conditions: ConditionResult, ablations: Sequence[AblationResult] = ()) -> StudyResults:
+def study(
+    *conditions: ConditionResult,
+    ablations: Sequence[AblationResult] = (),
+    ranges: Sequence[ChanceRange] = (),
+) -> StudyResults:
     results = StudyResults(
         name="made up", cell="arm", simulated=True, quick=False, settings=None, software={},
         joint_names=["hip", "knee"], n_base=2, parameters=PARAMETERS, searches=[], table1=[],
-        conditions=list(conditions), ablations=list(ablations), reading=[], missing=[], times={},
+        conditions=list(conditions), ablations=list(ablations), ranges=list(ranges), reading=[],
+        missing=[], times={},
     )  # fmt: skip
     return results.model_copy(update={"reading": conclusions(results)})
 
@@ -474,14 +448,12 @@ class TestConclusion:
             )
             for value, own in ((0.0, 1.5e-3), (0.5, 5e-3), (1.0, 2.5e-3))
         ]  # fmt: skip
-        band = AblationBand(
+        band = ChanceRange(
             method="b", repetitions=3, quantity="own", motion_class="fly-by", low=1e-3, high=2e-3,
             subsets=400,
         )  # fmt: skip
-        fly = AblationResult(
-            key="fly", title="Fly-by", variable="share", words="", points=points, bands=[band]
-        )
-        found = study(condition(1.0), ablations=[fly]).reading[-1]
+        fly = AblationResult(key="fly", title="Fly-by", variable="share", words="", points=points)
+        found = study(condition(1.0), ablations=[fly], ranges=[band]).reading[-1]
         assert found.key == "ablation-fly"
         assert found.sentences[0].endswith("0.100 % to 0.200 %; outside: 1.")
 
@@ -616,25 +588,17 @@ class TestWhole:
         assert texts[0] == texts[1]
 
     def test_every_estimate_predicts_every_class(self, whole: Whole) -> None:
-        """And the forms in the records give the errors that the archives gave."""
-        root, found = whole
+        _, found = whole
         (plain,) = found.conditions
-        cells = {(one.method, one.motion_class) for one in plain.cross}
-        methods = ["a", "b", "b0", "planted"]
-        methods += [plain.equal_data.name] if plain.equal_data is not None else []
-        classes = ("fly-by", "stop-to-stop", "sinusoid")
-        assert cells == {(m, c) for m in methods for c in classes}
+        methods = {"a", "b", "b0"}
+        methods |= {plain.equal_data.name} if plain.equal_data is not None else set()
         assert len(plain.comparisons) == 9
-        truth = np.array([one.truth for one in found.parameters], dtype=np.float64)
+        classes = [one.motion_class for one in plain.classes]
+        assert classes == ["fly-by", "stop-to-stop", "sinusoid"]
         for one in plain.classes:
             assert len(one.archives) == 3
-            assert set(one.own) >= {"a", "b", "b0"} and "planted" not in one.own
-            (path,) = (root / "fits" / "plain").glob(f"*-{one.motion_class}.json")
-            forms = ClassForms.of(ScoreRecord.model_validate_json(path.read_bytes()).forms)
-            for method in plain.methods:
-                mean = np.array(method.mean)
-                assert forms.overall(mean) == pytest.approx(one.overall[method.key], rel=1e-6)
-                assert forms.own(mean, truth) == pytest.approx(one.own[method.key], rel=1e-6)
+            assert set(one.overall) == set(one.all_rows) == methods | {"planted"}
+            assert set(one.own) == methods
         names = ["sines", "fly", "n_via", "weight", "repetitions", "noise"]
         assert [one.key for one in found.ablations] == names
         assert all(point.own for one in found.ablations for point in one.points)
@@ -695,10 +659,7 @@ class TestWhole:
         assert effects.effects and not effects.own_comparisons
         assert all(one.repetitions == [4, 4] for one in effects.comparisons)
         assert "too few" not in {one.verdict for one in effects.comparisons}
-        medians = [
-            {(one.method, one.motion_class): one.median for one in some.cross}[("b", "fly-by")]
-            for some in (plain, effects)
-        ]
+        medians = [np.median(some.classes[0].overall["b"]) for some in (plain, effects)]
         assert medians[1] > medians[0]
 
     def test_other_settings_are_refused_in_the_same_folder(
