@@ -126,8 +126,10 @@ def draw_archive(view: ArchiveView) -> Figure:
                 axes = figure.add_subplot(grid[j, k])
                 _draw(axes, view, trace, [(trace.time, trace.value)], colours)
                 if share := _share(trace):
-                    small = {"fontsize": style.SMALL - 0.5, "color": style.MUTED, "pad": 2.0}
-                    axes.set_title(f"{share} % of limit", loc="right", **small)
+                    axes.set_title(
+                        f"{share} % of limit", loc="right", pad=2.0,
+                        fontsize=style.SMALL - 0.5, color=style.MUTED,
+                    )  # fmt: skip
                 axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
                 axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
                 axes.tick_params(labelbottom=j == rows - 1)
