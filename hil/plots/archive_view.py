@@ -126,8 +126,7 @@ def view_of(
 
     Args:
         path: of the archive.
-        start: s since its first sample; the beginning if left out.
-        stop: s, likewise; the end.
+        start, stop: s since its first sample; its beginning and its end if left out.
         joints: names or numbers from 1 of the joints wanted; all if empty.
         bins: stretches of the time shown, of which the lowest and the highest sample are shown.
 
@@ -143,11 +142,8 @@ def view_of(
     begin = 0.0 if start is None else max(start, 0.0)
     end = last if stop is None else min(stop, last)
     if not begin <= end:
-        raise ArchiveError(
-            path,
-            f"lasts {last:.6g} s; nothing lies in the time asked for",
-            remedy="correct --start and --stop",
-        )
+        problem = f"lasts {last:.6g} s; nothing lies in the time asked for"
+        raise ArchiveError(path, problem, remedy="correct --start and --stop")
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
     lines: dict[str, list[list[tuple[Array, Array]]]] = {
@@ -163,22 +159,15 @@ def view_of(
         if "state" in columns:
             _add_states(states, time, columns["state"])
             gaps += time[columns["gap"] > 0].tolist()
-    events = tuple(
-        (event.time - origin, event.name, event.text, event.level >= 30)
-        for event in head.events
-        if begin <= event.time - origin <= end
-    )
+    events = [(one.time - origin, one.name, one.text, one.level >= 30) for one in head.events]
     return ArchiveView(
         facts=overview(path),
-        joint_names=tuple(
-            f"{head.joint_names[j]} [mm]" if scales.slides[j] else head.joint_names[j]
-            for j in shown
-        ),
+        joint_names=tuple(head.joint_names[j] + " [mm]" * bool(scales.slides[j]) for j in shown),
         start=begin,
         stop=end,
         quantities=tuple(_quantities(lines, scales, shown)),
         states=tuple(states),
-        events=events,
+        events=tuple(one for one in events if begin <= one[0] <= end),
         gaps=np.array(gaps),
         frame=scales.words,
     )

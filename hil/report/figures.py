@@ -314,11 +314,7 @@ def _in_order(
 
 
 def residual_panels(results: Results) -> dict[str, list[Panel]]:
-    """By name: what the residual of each joint follows; {} where nothing was judged.
-
-    Mean residual over speed and over position, its autocorrelation, and friction beside the
-    estimate, recording by recording.
-    """
+    """By name: what the residual of each joint follows; {} where nothing was judged."""
     judgement = results.judgement
     if judgement is None:
         return {}
@@ -340,7 +336,6 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
             caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
             heading, foot = f"mean residual [{joint.unit}]", f"{what} [{unit}]"
             with panel(panels, 170.0, caption, heading, foot) as axes:
-                # The joint's RMS error, so that a pattern is seen beside all that is left over.
                 axes.axhspan(-joint.rms, joint.rms, color=BAND, linewidth=0.0)
                 axes.axhline(0.0, color=MUTED, linewidth=0.9)
                 # No line across a bin that was not seen.

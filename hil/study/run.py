@@ -249,6 +249,11 @@ class Recorded:
             return None
 
     @property
+    def words(self) -> str:
+        """How the excitation was found."""
+        return "not known" if self.excitation is None else f"method {self.excitation.method}"
+
+    @property
     def method(self) -> str:
         """Which of the paper's three excitations it is; "" if that is not known."""
         if self.excitation is None or self.excitation.method not in (A, B):
@@ -270,8 +275,7 @@ def study_campaigns(
         workers: processes at work.
 
     Raises:
-        InputError: a folder is no campaign, holds no whole excitation, or is of another arm, or
-            of one that was simulated otherwise.
+        InputError: see :func:`recorded_runs`.
     """
     begin = time.perf_counter()
     folder, recorded = StudyFolder(root), recorded_runs(campaigns)
@@ -301,15 +305,7 @@ def study_campaigns(
             settings=None,
             searches=[],
             table1=[
-                _row(
-                    one.run.key,
-                    "not known"
-                    if one.excitation is None
-                    else f"found by method {one.excitation.method}",
-                    one.excitation,
-                    fits[one.run.key],
-                )
-                for one in recorded
+                _row(one.run.key, one.words, one.excitation, fits[one.run.key]) for one in recorded
             ]
             + printed_rows(cell),
             conditions=[
