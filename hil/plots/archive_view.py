@@ -126,7 +126,8 @@ def view_of(
 
     Args:
         path: of the archive.
-        start, stop: s since its first sample; its beginning and its end if left out.
+        start: s since its first sample; its beginning if left out.
+        stop: s since its first sample; its end if left out.
         joints: names or numbers from 1 of the joints wanted; all if empty.
         bins: stretches of the time shown, of which the lowest and the highest sample are shown.
 
