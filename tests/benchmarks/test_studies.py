@@ -85,10 +85,11 @@ class TestPayload:
         assert min(*found.covered.values(), found.moment_covered) >= 0.5
 
     @pytest.mark.slow
-    def test_of_200_loads_intervals_hold_90_to_99_percent(self) -> None:
-        found = payload_coverage(range(200))
-        assert found.mass_error < 0.01
-        assert found.within_one_percent > 0.9
+    @pytest.mark.parametrize(("pairs", "within"), [(1, 0.95), (8, 0.99)])
+    def test_of_200_loads_intervals_hold_90_to_99_percent(self, pairs: int, within: float) -> None:
+        """As many pairs as `hil run --payload` would record bring the masses within 1 %."""
+        found = payload_coverage(range(200), pairs)
+        assert found.within_one_percent >= within
         for figure, share in {**found.covered, "moment": found.moment_covered}.items():
             assert 0.90 <= share <= 0.99, figure
 
