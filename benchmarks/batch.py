@@ -29,7 +29,8 @@ from typing import Any, TypeVar
 
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
-from hil.batch.run import Plan, reidentify
+from hil.batch.cache import Where
+from hil.batch.run import reidentify
 from hil.batch.types import BatchResult, Broken
 from hil.batch.workers import ArchiveTask, Done, LocalWorkers, Workers, run_task
 from hil.identify.options import FIXED
@@ -148,9 +149,8 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, workers: Workers) -> BatchResult:
-    return reidentify(
-        places, Plan(replace(FIXED, estimator=estimator), cache=cache), workers, Silent()
-    )
+    options, where = replace(FIXED, estimator=estimator), Where(str(cache))
+    return reidentify(places, options, workers, Silent(), where=where)
 
 
 def _timed(

@@ -46,7 +46,7 @@ from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from planner.checked_data import DAMAGED
 
-from .types import ArchiveRef, CacheError, Fit, Summary
+from .types import ArchiveRef, CacheError, Summary
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
     kind.__name__: kind
     for kind in (
-        *(ArchiveRef, Summary, Fit, Estimate, PhaseFactor),
+        *(ArchiveRef, Summary, Estimate, PhaseFactor),
         *(Settings, Preprocessing, LowPassShape, Shrinkage, Choice),
     )
 }
@@ -82,7 +82,7 @@ class Where:
 
     Attributes:
         root: of the whole cache; None: beside each archive, and below the user's own cache folder
-            where that cannot be written to or something else has its name.
+            (XDG) where that cannot be written to or something else has its name.
         keep: whether anything is cached at all.
     """
 
@@ -100,9 +100,10 @@ class Where:
             usable = beside.is_dir() or not there
             if usable and os.access(beside if there else folder, os.W_OK | os.X_OK):
                 return Store(beside)
-        root = Path(self.root) if self.root is not None else _users_own()
+        xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        own = (xdg if xdg.is_absolute() else Path.home() / ".cache") / "hil"
         name = folder if "://" in location else _resolved(folder)
-        return Store(root / digest(name)[:16])
+        return Store((own if self.root is None else Path(self.root)) / digest(name)[:16])
 
 
 @dataclass(frozen=True)
@@ -235,12 +236,6 @@ def _resolved(folder: str) -> str:
     return str(Path(folder).resolve())
 
 
-def _users_own() -> Path:
-    """The user's cache folder (XDG base directories)."""
-    named = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(named) if Path(named).is_absolute() else Path.home() / ".cache") / "hil"
-
-
 # Keys
 
 
@@ -252,7 +247,7 @@ def code_digest() -> str:
     """
     found: list[Any] = [f"{name} {version(name)}" for name in LIBRARIES]
     for package, patterns in _PROGRAMS:
-        root = Path(os.fspath(package.__path__[0]))
+        root = Path(package.__path__[0])
         for pattern in patterns:
             paths = sorted(root.glob(pattern))
             assert paths, f"{package.__name__} has no {pattern}"
@@ -263,13 +258,8 @@ def code_digest() -> str:
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
     """Digest of what makes a robot the same one: links, joints, friction law, drives.
 
-    Not of a payload or a delay (see :func:`hil.batch.discovery.setup_of`): an arm with another
-    payload is the same arm.
-
-    Args:
-        cell: as it travels in the archive.
-        drive_train: the drive train in force, if the archive has one.
-        simulated: whether it is no arm, but a model of one.
+    Not of a payload or a delay (see :func:`hil.batch.discovery.setup_of`). The drive train in
+    force is that of the archive, if it has one.
     """
     drives = cell.file.drive_train
     parts = {

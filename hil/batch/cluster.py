@@ -1,4 +1,4 @@
-"""Re-identification on a Dask cluster: archives are read, and runs of them added up, on workers.
+"""Re-identification on a Dask cluster: archives are read on its workers.
 
 Workers may join, leave and die: what a dead worker held is made anew, as Dask does from the tasks
 it holds. Dask is imported here, and only when it is called.
@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import cache, partial
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from time import monotonic
 from typing import Any, Final, TypeVar
 
 from hil.errors import HilError, InputError
 from hil.version import install_command
 
-from .cache import LIBRARIES
+from .cache import LIBRARIES, code_digest
 from .types import Broken
 from .workers import (
     TIMEOUT,
@@ -36,14 +36,14 @@ from .workers import (
 )
 
 T = TypeVar("T")
-Identity = Callable[[], str]
 
 _LOOK: Final = 2.0
 """s between looks at the cluster while nothing comes from it."""
 _RETRIES: Final = 3
 """How often a task is given out anew for reasons that are not its own."""
-_AHEAD: Final = 4
+_AHEAD: Final = 8
 """Tasks given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
+
 _LOST: Final = Broken("", "ended every worker that read it")
 
 
@@ -56,7 +56,6 @@ class DaskWorkers(Workers):
 
     Args:
         address: of its scheduler, such as ``tcp://host:8786``.
-        identity: digest of the code that computes; importable on the workers.
         timeout: longest time for one task [s].
         patience: longest time to wait for a scheduler, and for a worker [s].
 
@@ -67,19 +66,19 @@ class DaskWorkers(Workers):
 
     near = False
 
-    def __init__(
-        self, address: str, *, identity: Identity, timeout: float = TIMEOUT, patience: float = 30.0
-    ) -> None:
+    def __init__(self, address: str, *, timeout: float = TIMEOUT, patience: float = 30.0) -> None:
         self._patience = patience
-        self._last_seen, self._last_look, self.count = monotonic(), -_LOOK, 1
-        self._work = partial(
-            perform, timeout=timeout, identity=identity, expected=software(identity)
-        )
         self._client = _connected(address, patience)
+        expected = software()
+        self._work = partial(perform, timeout=timeout, expected=expected)
         try:
             self._client.wait_for_workers(1, timeout=patience)
-            self._require_software(identity)
-            self._ahead()
+            for worker, found in self._on_all(software).items():
+                if apart := differences(expected, found):
+                    raise ClusterError(
+                        f"the worker {worker} has other software than this machine ({apart}); "
+                        "install the same hil and constraints.txt on both, and start it again"
+                    )
         except TimeoutError:
             self._client.close()
             raise ClusterError(
@@ -89,6 +88,7 @@ class DaskWorkers(Workers):
         except BaseException:
             self._client.close()
             raise
+        self.count = self._threads()
 
     @property
     def n_workers(self) -> int:
@@ -124,101 +124,80 @@ class DaskWorkers(Workers):
             ClusterError: all workers, or the scheduler, are gone for longer than the patience.
             WorkerSoftwareError: a worker that joined later runs other software.
         """
-        waiting, found = iter(range(len(tasks))), dict[int, Any]()
-        busy, ended = dict[int, Any](), SimpleQueue[int]()
-        suspects: list[int] = []  # begun when workers died: again one by one, with nothing beside
-
-        def begin(k: int) -> None:
-            busy[k] = self._client.submit(self._work, tasks[k], pure=False, retries=_RETRIES)
-            busy[k].add_done_callback(lambda _: ended.put(k))
-
+        waiting, begun = iter(tasks), deque[tuple[ArchiveTask[T], Any]]()
+        most = 0
         try:
-            for k, task in enumerate(tasks):
-                while k not in found:
-                    for another in islice(waiting, max(0, self._ahead() - len(busy) - len(found))):
-                        begin(another)
-                    alone = not busy
-                    if alone:
-                        begin(suspects.pop(0))
-                    other = self._next(ended)
-                    result = _result(busy.pop(other))
-                    if result is _LOST and not alone:
-                        suspects.append(other)
-                        continue
-                    found[other] = result
-                    if done is not None:
-                        done(1)
-                result = found.pop(k)
+            while True:
+                if len(begun) <= most // 2:  # each look at the cluster takes milliseconds
+                    most = _AHEAD * self._threads()
+                    for task in islice(waiting, max(0, most - len(begun))):
+                        begun.append((task, self._begin(task)))
+                if not begun:
+                    return
+                task, future = begun.popleft()
+                result = self._result(future)
+                if result is _LOST:  # perhaps by another task: again with nothing beside
+                    for other in begun:
+                        self._wait(other[1])
+                    result = self._result(self._begin(task))
+                if done is not None:
+                    done(1)
                 yield Broken(task.path, _LOST.reason) if result is _LOST else result
         finally:
             if self._connected:
-                self._client.cancel(list(busy.values()))
+                self._client.cancel([future for _, future in begun])
 
     @property
     def _connected(self) -> bool:
         return bool(self._client.status == "running")
 
-    def _ahead(self) -> int:
-        """How many tasks to give out to the workers there were a moment ago."""
-        if monotonic() - self._last_look > _LOOK:
-            self._last_look = monotonic()
-            self.count = max(1, sum(self._client.nthreads().values()))
-        return _AHEAD * self.count
+    def _threads(self) -> int:
+        return max(1, int(sum(self._client.nthreads().values())))
 
     def _on_all(self, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
         """What a function returns or raises, by worker."""
         found: dict[str, Any] = self._client.run(function, *arguments, on_error="return")
         return found
 
-    def _next(self, ended: SimpleQueue[int]) -> int:
-        """Wait for a run; see meanwhile that there is somebody to wait for."""
-        self._last_seen = monotonic()
-        while True:
-            try:
-                return ended.get(timeout=_LOOK)
-            except Empty:
-                if self._connected and self.n_workers:
-                    self._last_seen = monotonic()
-                elif monotonic() - self._last_seen > self._patience:
-                    missing = "all workers" if self._connected else "the scheduler"
-                    raise ClusterError(
-                        f"{missing} of the Dask cluster went away and did not come back within "
-                        f"{self._patience:g} s; what was finished is in the cache"
-                    ) from None
+    def _result(self, future: Any) -> Any:
+        """What came of a task; `_LOST` if every worker that took it up died.
 
-    def _require_software(self, identity: Identity) -> None:
-        here = software(identity)
-        for worker, found in self._on_all(software, identity).items():
-            if isinstance(found, ModuleNotFoundError):
-                reason = f"lacks the package {found.name}"
-            elif isinstance(found, Exception):
-                reason = f"cannot be asked what it runs: {found}"
-            else:
-                reason = differences(here, found)
-            if reason:
-                raise ClusterError(
-                    f"the worker {worker} has other software than this machine ({reason}); "
-                    "install the same hil and constraints.txt on both, and start it again"
-                )
+        Raises:
+            ClusterError: it was dropped.
+            Exception: what the call raised.
+        """
+        from distributed import KilledWorker
 
-
-def _result(future: Any) -> Any:
-    """What came of a call; `_LOST` if every worker that took it up died.
-
-    Raises:
-        ClusterError: the call was dropped.
-        Exception: what the call raised.
-    """
-    from distributed import KilledWorker
-
-    if future.status not in ("finished", "error"):
-        raise ClusterError("the Dask scheduler dropped the work: it was ended or started anew")
-    error = future.exception()
-    if error is None:
+        self._wait(future)
+        if future.status not in ("finished", "error"):
+            raise ClusterError("the Dask scheduler dropped the work: it was ended or started anew")
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            return _LOST
+        if error is not None:
+            raise error
         return future.result()
-    if isinstance(error, KilledWorker):
-        return _LOST
-    raise error
+
+    def _begin(self, task: ArchiveTask[Any]) -> Any:
+        return self._client.submit(self._work, task, pure=False, retries=_RETRIES)
+
+    def _wait(self, future: Any) -> None:
+        """Wait for a run; see meanwhile that there is somebody to wait for."""
+        from distributed import client
+
+        wait: Any = client.wait  # its parameters are not annotated
+        last_seen = monotonic()
+        while future.status in ("pending", "lost"):  # lost with a worker: it is made anew
+            with suppress(TimeoutError, CancelledError):
+                wait(future, timeout=_LOOK)
+            if self._connected and self.n_workers:
+                last_seen = monotonic()
+            elif monotonic() - last_seen > self._patience:
+                missing = "all workers" if self._connected else "the scheduler"
+                raise ClusterError(
+                    f"{missing} of the Dask cluster went away and did not come back within "
+                    f"{self._patience:g} s; what was finished is in the cache"
+                )
 
 
 def _connected(address: str, patience: float) -> Any:
@@ -246,17 +225,16 @@ def _connected(address: str, patience: float) -> Any:
 # On a worker
 
 
-def software(identity: Identity) -> dict[str, str]:
+def software() -> dict[str, str]:
     """What decides about the bits of a result here: this code, and what it computes with."""
     python = ".".join(str(part) for part in sys.version_info[:3])
-    return {"hil": identity(), "python": python} | {name: version(name) for name in LIBRARIES}
+    return {"hil": code_digest(), "python": python} | {name: version(name) for name in LIBRARIES}
 
 
-_software_once = cache(software)
-
-
-def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+def differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -> str:
     """What is other there, in words; empty if nothing."""
+    if isinstance(there, Exception):
+        return str(there)
     return ", ".join(
         f"{name} {there.get(name, 'none'):.12} instead of {here[name]:.12}"
         for name in here
@@ -264,32 +242,27 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     )
 
 
-def perform(
-    task: ArchiveTask[T], *, timeout: float, identity: Identity, expected: Mapping[str, str]
-) -> T | Broken:
+def perform(task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]) -> T | Broken:
     """Do a task in a child process.
 
     Args:
         task: the work.
-        timeout: longest time for a task of size 1 [s].
-        identity: digest of the code that runs.
+        timeout: longest time for it [s].
         expected: `software` of whoever asks.
 
     Raises:
         WorkerSoftwareError: other software runs here.
         PlannerNotStarted: no child process can be started here.
     """
-    arguments = task, identity, expected
-    checked = ArchiveTask[T | Broken](task.path, _checked, arguments, task.size)
+    checked = ArchiveTask[T | Broken](task.path, _checked, (task, expected))
     with _borrowed(timeout) as child:
         (found,) = child.results([checked])
         return found
 
 
-def _checked(task: ArchiveTask[T], identity: Identity, expected: Mapping[str, str]) -> T | Broken:
+def _checked(task: ArchiveTask[T], expected: Mapping[str, str]) -> T | Broken:
     """In the child: what comes of a task, by the same code as the caller's."""
-    other = differences(expected, _software_once(identity))
-    if other:
+    if other := differences(expected, software()):
         raise WorkerSoftwareError(f"a worker runs other software: {other}")
     return run_task(task)
 

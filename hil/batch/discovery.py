@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from stat import S_ISREG
@@ -25,10 +25,10 @@ from hil.identify.settings import stated_delay
 from hil.io import digest, json_digest
 from hil.progress import Reporter, Silent
 
-from .cache import BESIDE, Store, Where, arm_digest, code_digest
-from .factors import cell_in, digest_of, stamp_of
+from .cache import BESIDE, Where, arm_digest, code_digest
+from .factors import cell_in, digest_of, require_whole, stamp_of
 from .remote import archives_below, is_url, local_file
-from .types import ArchiveRef, Broken, ChangedError, FileStamp, NothingToFitError, TornError
+from .types import ArchiveRef, Broken, ChangedError, Stamp
 from .workers import ArchiveTask, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
@@ -38,13 +38,9 @@ _SUFFIX: Final = ".mcap"
 _ARCHIVES: Final = "archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
 _LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.weighing`
-_FOR_VIEWERS: Final = "annotated"  # see `hil.annotating`
+_FOR_VIEWERS: Final = "/annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
-_NOT_ENTERED: Final = (
-    "is not named in its campaign's manifest.json: nobody has judged it (a run was killed; the "
-    "next one takes it in)"
-)
 _UNTOUCHED: Final = 2_000_000_000
 """ns that a file must have been left alone before its time stamps are believed to show the next
 change: file systems count in steps, some of them of two seconds."""
@@ -81,8 +77,7 @@ def discover(
         reporter: of progress.
 
     Raises:
-        InputError: a place does not exist, or an address cannot be read.
-        NothingToFitError: there is no archive below any.
+        InputError: a place does not exist, an address cannot be read, or there is no archive.
         CacheError: the cache cannot be written.
     """
     places, refused, left = places_below(roots)
@@ -90,7 +85,7 @@ def discover(
         problem = "there is no archive (*.mcap) in it"
         if refused:
             problem += f", and {refused[0].path} {refused[0].reason}"
-        raise NothingToFitError(roots[0] if roots else None, problem, remedy="name others")
+        raise InputError(roots[0] if roots else None, problem, remedy="name others")
     known: dict[Place, ArchiveRef | Broken] = {}
     with reporter.task("looking into archives", len(places)) as task:
         if workers.near:  # else the cache is where the archives are
@@ -139,7 +134,7 @@ class Place(NamedTuple):
         return above if name == _ARCHIVES and above else self.folder
 
     @property
-    def stamp(self) -> FileStamp | None:
+    def stamp(self) -> Stamp | None:
         """Of the file as it is now; None of a remote one.
 
         Raises:
@@ -169,30 +164,30 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
         where = Path(os.fsdecode(error.filename)).as_posix()
         refused.append(Broken(where, f"cannot be looked into: {error.strerror}"))
 
-    def is_archive(path: Path) -> bool:
-        if path.suffix != _SUFFIX:
-            if path.is_symlink() and not path.exists():
-                left.append(Broken(path.as_posix(), "is a link that leads nowhere"))
-            return False
+    def look_at(path: Path) -> None:
         try:
             regular = S_ISREG(path.stat().st_mode)
-        except OSError as error:  # a link to nothing, or to itself
-            refuse(error)
-            return False
-        if not regular:
+        except OSError as error:
+            if path.suffix == _SUFFIX:
+                refuse(error)
+            elif path.is_symlink():
+                left.append(Broken(path.as_posix(), "is a link that leads nowhere"))
+            return
+        if path.suffix == _SUFFIX and regular:
+            found.add(Place(path.as_posix()))
+        elif path.suffix == _SUFFIX:
             refused.append(Broken(path.as_posix(), "is no file"))
-        return regular
 
-    def walk(root: Path) -> Iterator[Path]:
+    def walk(root: Path) -> None:
         for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
             folder = Path(name).resolve()
             if folder in visited:
                 folders.clear()
                 continue
             visited.add(folder)
-            if BESIDE in folders:
-                folders.remove(BESIDE)
-            yield from (folder / file for file in files if is_archive(folder / file))
+            folders[:] = [one for one in folders if one != BESIDE]
+            for file in files:
+                look_at(folder / file)
 
     for root in roots:
         path = Path(root)
@@ -201,7 +196,7 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
         elif path.is_file():
             found.add(Place(path.resolve().as_posix()))
         elif path.is_dir():
-            found.update(Place(file.as_posix()) for file in walk(path.resolve()))
+            walk(path.resolve())
         else:
             raise InputError(root, "does not exist", remedy="name a folder with archives below it")
     return sorted(found), refused, left
@@ -212,17 +207,17 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
 
 def setup_of(cell: Cell) -> str:
     """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
+
+    def row(figures: Iterable[float]) -> str:
+        return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
+
     delay, payload = stated_delay(cell), cell.file.robot.payload
     words = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
     if payload is not None and (payload.mass or any(payload.inertia)):
         frame = f" in {payload.frame}" if payload.frame else ""
-        words.append(f"carries {payload.mass:.12g} kg at {_row(payload.centre)} m{frame}")
-        words += [f"{_row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
+        words.append(f"carries {payload.mass:.12g} kg at {row(payload.centre)} m{frame}")
+        words += [f"{row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
     return ", ".join(words)
-
-
-def _row(figures: Iterable[float]) -> str:
-    return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
 
 
 def examined(place: Place, where: Where) -> ArchiveRef:
@@ -232,19 +227,18 @@ def examined(place: Place, where: Where) -> ArchiveRef:
         HilError: it cannot be read, is torn, or was changed meanwhile.
         CacheError: the cache cannot be written.
     """
-    known = _known(place, where)
-    if known is not None:
+    if (known := _known(place, where)) is not None:
         return known
     begun, stamp = time.time_ns(), place.stamp
-    store = where.store(place.location)
     with local_file(place.location) as path:
-        ref = _inspected(place, path, store)
+        ref = _inspected(place, path, where)
         if stamp is not None and stamp_of(path) != stamp:
             raise ChangedError(place.location)
-    untouched = stamp is None or begun - max(stamp.mtime_ns, stamp.ctime_ns) > _UNTOUCHED
+    ref = replace(ref, stamp=stamp)
+    untouched = stamp is None or begun - max(stamp[1:3]) > _UNTOUCHED
     if (stamp is not None or place.version) and untouched:
-        store.put(_key(place), {"token": _token(place, stamp), "ref": ref})
-    return replace(ref, stamp=stamp)
+        where.store(place.location).put(_key(place), {"token": _token(place, stamp), "ref": ref})
+    return ref
 
 
 def _known(place: Place, where: Where) -> ArchiveRef | None:
@@ -267,17 +261,16 @@ def _key(place: Place) -> str:
     return digest(f"archive {place.name}".encode("utf-8", "surrogateescape"))
 
 
-def _token(place: Place, stamp: FileStamp | None) -> list[Any]:
+def _token(place: Place, stamp: Stamp | None) -> list[Any]:
     return [code_digest(), place.version, *(stamp or ())]
 
 
-def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
+def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
     """Hash a file, look into it, and cache the texts of its cell."""
     sha256 = digest_of(path)
     # Of a whole file this reads its summary and what stands outside of chunks, and one chunk.
     archive = open_archive(path, fields=(), stop=-1.0)
-    if archive.damage is not None:
-        raise TornError(place.location, str(archive.damage))
+    require_whole(archive, place.location)
     header, plan = archive.header, archive.attachments.get("plan.json")
     index, attempt = header.index, header.attempt
     if index is None or attempt is None:  # else as the archive says, whatever its name is now
@@ -301,7 +294,7 @@ def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
     )
     if ref.use not in USES:
         return ref
-    cell = cell_in(archive)
+    cell, store = cell_in(archive), where.store(place.location)
     key, nominal = json_digest([cell.text, cell.urdf]), cell.file.nominal
     if not store.has(key):
         store.put(key, [cell.text, cell.urdf])
@@ -317,21 +310,23 @@ def _inspected(place: Place, path: Path, store: Store) -> ArchiveRef:
 
 # Which archives are meant to be fitted
 
+_Attempts = dict[tuple[str, str, int], int]
+"""The last attempt by folder, kind and index."""
+
 
 def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery:
     """Tell archives that are meant to be fitted from copies, failures and earlier attempts."""
-    manifests = _Manifests()
+    manifests, broken = _manifests([place for place, _ in found])
     read: list[ArchiveRef] = []
-    harmed: list[tuple[Place, Broken]] = []
+    harmed: list[tuple[Place, str]] = []
     skipped: list[Broken] = []
     for place, one in found:
-        entries = manifests.entries(place)
+        entries = None if place.campaign == place.folder else manifests.get(place.campaign)
         entry = None if entries is None else entries.get(place.name)
         if isinstance(one, Broken):
-            harmed.append((place, one))
+            harmed.append((place, one.reason))
         elif entry is not None and entry.sha256 != one.sha256:
-            reason = "is not what its campaign's manifest.json says"
-            harmed.append((place, Broken(place.location, reason)))
+            harmed.append((place, "is not what its campaign's manifest.json says"))
         elif entry is not None and entry.outcome not in ("", _COMPLETED):
             read.append(replace(one, outcome=entry.outcome))
         elif (
@@ -341,20 +336,23 @@ def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery
             and ArchiveName.parse(place.name)
         ):
             # A run that was killed may have closed it and not lived to judge it.
-            skipped.append(Broken(place.location, _NOT_ENTERED))
+            reason = (
+                "is not named in its campaign's manifest.json: nobody has judged it (a run was "
+                "killed; the next one takes it in)"
+            )
+            skipped.append(Broken(place.location, reason))
         else:
             read.append(one)
-    latest: dict[tuple[str, str, int], int] = {}
+    latest: _Attempts = {}
     for ref in read:
         if ref.attempt and ref.outcome == _COMPLETED:
             key = (Place(ref.location).folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
-    broken = list(manifests.broken)
-    for place, harm in harmed:
-        reason = _replaced(place, latest)
-        (skipped if reason else broken).append(Broken(harm.path, reason or harm.reason))
-    refs: list[ArchiveRef] = []
+    for place, reason in harmed:
+        replaced = _replaced(place, latest)
+        (skipped if replaced else broken).append(Broken(place.location, replaced or reason))
     seen: dict[str, str] = {}
+    refs: list[ArchiveRef] = []
     for ref in read:
         if reason := _objection(ref, latest, seen):
             skipped.append(Broken(ref.location, reason))
@@ -364,42 +362,29 @@ def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery
     return Discovery(tuple(refs), tuple(broken), tuple(skipped))
 
 
-class _Manifests:
-    """The manifests of the campaigns that archives lie in, each read once.
-
-    Attributes:
-        broken: manifests that cannot be read; nothing can be checked against them.
-    """
-
-    def __init__(self) -> None:
-        self.broken: list[Broken] = []
-        self._known: dict[str, dict[str, Entry] | None] = {}
-
-    def entries(self, place: Place) -> dict[str, Entry] | None:
-        """Those of its campaign by name; None where there is no manifest to be read."""
-        if is_url(place.location) or place.campaign == place.folder:
-            return None
-        if place.campaign not in self._known:
-            self._known[place.campaign] = self._read(CampaignFolder(Path(place.campaign)))
-        return self._known[place.campaign]
-
-    def _read(self, folder: CampaignFolder) -> dict[str, Entry] | None:
+def _manifests(places: Iterable[Place]) -> tuple[dict[str, dict[str, Entry]], list[Broken]]:
+    """Entries by name of each campaign that has a manifest; and those that cannot be read."""
+    found: dict[str, dict[str, Entry]] = {}
+    broken = []
+    for campaign in dict.fromkeys(one.campaign for one in places if one.campaign != one.folder):
+        folder = CampaignFolder(Path(campaign))
         try:
-            return {entry.name: entry for entry in folder.manifest()} if folder.sealed else None
+            if not is_url(campaign) and folder.sealed:
+                found[campaign] = {entry.name: entry for entry in folder.manifest()}
         except CampaignFolderError as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
-            self.broken.append(Broken((folder.root / "manifest.json").as_posix(), reason))
-            return None
+            broken.append(Broken(f"{campaign}/manifest.json", reason))
+    return found, broken
 
 
-def _replaced(place: Place, latest: dict[tuple[str, str, int], int]) -> str:
+def _replaced(place: Place, latest: _Attempts) -> str:
     """Why nothing is missing with an archive that cannot be used; "" if something is.
 
     A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
     motion again.
     """
     name = ArchiveName.parse(place.name)
-    if place.folder.endswith(f"/{_FOR_VIEWERS}"):
+    if place.folder.endswith(_FOR_VIEWERS):
         return "is a copy for viewers"
     if name is None:
         return ""
@@ -409,9 +394,7 @@ def _replaced(place: Place, latest: dict[tuple[str, str, int], int]) -> str:
     return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
 
 
-def _objection(
-    ref: ArchiveRef, latest: dict[tuple[str, str, int], int], seen: dict[str, str]
-) -> str:
+def _objection(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
     """Why an archive is not meant to be fitted; "" if it is, and then it was seen."""
     if ref.use not in USES:
         return f"is a {ref.use}"

@@ -38,13 +38,61 @@ from identification.model.friction import Viscous
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
-from .types import ArchiveRef, BatchEstimator, Level, LevelEstimate, Summary
-from .workers import plus
+from .types import ArchiveRef, BatchEstimator, Bundle, Level, LevelEstimate, Summary
 
 Array = NDArray[np.float64]
 
 _NAMED: Final = 12
 """Different warnings that are named; of very many archives there may be very many."""
+
+
+@dataclass(eq=False)
+class Group:
+    """What is fitted together, and what is predicted by it.
+
+    Attributes:
+        refs: archives that were fitted.
+        phase: sum of their factors; None before there is one.
+        repetitions: the estimate of each.
+        unseen: sum of the totals of what is predicted; None if nothing is.
+        products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
+        warned: every archive, with the warnings about it.
+        settings: digests.
+    """
+
+    refs: list[ArchiveRef] = field(default_factory=list)
+    phase: PhaseFactor | None = None
+    repetitions: list[LevelEstimate] = field(default_factory=list)
+    unseen: PhaseFactor | None = None
+    products: Array | None = None
+    warned: list[tuple[ArchiveRef, tuple[str, ...]]] = field(default_factory=list)
+    settings: set[str] = field(default_factory=set)
+
+    def add_bundle(self, bundle: Bundle) -> None:
+        """Add archives; their estimates are added apart."""
+        self.phase = plus(self.phase, bundle.phase)
+        for summary in bundle.summaries:
+            self.warned.append((summary.ref, summary.warnings))
+            if summary.ref.use == "excitation":
+                self.refs.append(summary.ref)
+                self.products = plus(self.products, summary.products)
+            else:
+                self.unseen = plus(self.unseen, summary.total)
+
+    def add(self, other: Group) -> None:
+        """Add what was fitted elsewhere."""
+        self.refs += other.refs
+        self.phase = plus(self.phase, other.phase)
+        self.repetitions += other.repetitions
+        self.unseen = plus(self.unseen, other.unseen)
+        self.products = plus(self.products, other.products)
+        self.warned += other.warned
+        self.settings |= other.settings
+
+
+def plus(one: Any, other: Any) -> Any:
+    """The sum of two terms, each of which may be None, which is nothing."""
+    return one if other is None else other if one is None else one + other
 
 
 class Estimator:
@@ -65,11 +113,6 @@ class Estimator:
         self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
         self._prior = required(cad_prior(cell)) if name == "prior" else None
         self._weighting: Weighting = "ordinary" if name == "ols" else "weighted"
-
-    @property
-    def shrinks(self) -> bool:
-        """Whether the estimate of an archive depends on the centre of all."""
-        return 0.0 < self._shrinkage.strength < math.inf
 
     def centre(self, phase: PhaseFactor) -> Array | None:
         """What estimates from a sum and its archives are shrunk towards (p,); None for nothing.
@@ -99,17 +142,15 @@ class Estimator:
         that of white residuals times the design effect, and of what is shrunk it is that of the
         free estimate, shrunk alike.
         """
-        free, total = summary.fits[self._weighting], summary.total.total
-        own, effect = free.estimate, max(1.0, free.design_effect)
+        own, total = summary.fits[self._weighting], summary.total.total
+        effect, weights = max(1.0, summary.design_effects[self._weighting]), self.weights(total)
         if self._prior is not None:
-            found = with_prior(
-                self.model, total, self._prior, self.weights(total), design_effect=effect
-            )
+            found = with_prior(self.model, total, self._prior, weights, design_effect=effect)
             return replace(found.estimate, interval_factor=own.interval_factor)
-        if centre is None or not self.shrinks:
+        if centre is None or math.isinf(self._shrinkage.strength):
             return own
         shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
-        equations = total.weighted(self.weights(total))
+        equations = total.weighted(weights)
         prior = self._shrinkage.strength * np.diag(equations.A)
         solution = solve(equations._replace(A=equations.A + np.diag(prior)))
         share = solution.inverse @ equations.A
@@ -125,59 +166,28 @@ class Estimator:
             method=f"weighted least squares, {self._shrinkage.describe()}; {words}",
         )
 
-    def of_sum(self, phase: PhaseFactor, centre: Array | None) -> Estimate:
+    def of_group(self, group: Group, centre: Array | None) -> Estimate:
         """The estimate from a sum over archives, shrunk towards its centre.
+
+        Its intervals are no narrower than the repetitions of one motion scatter.
 
         Raises:
             IdentificationError: there is no consistent solution.
         """
+        assert group.phase is not None
         fit = fit_of(self.model, self.name, self._shrinkage, centre, self._prior)
-        return fit((), phase)
+        found = fit((), group.phase)
+        motions = {ref.motion for ref in group.refs}
+        if len(motions) == 1 and "" not in motions:
+            values = np.array([one.values for one in group.repetitions])
+            found = replace(found, covariance=no_narrower(found.covariance, values))
+        if group.products is None:
+            return found
+        return with_uncertain_delay(found, group.phase.total, group.products, self.delay_variance)
 
     def weights(self, total: Factor) -> Array:
         """Weight of each joint's rows (n,)."""
-        if self._weighting == "ordinary":
-            return np.ones(self.model.n_joints)
-        return joint_weights(total)
-
-
-@dataclass(eq=False)
-class Group:
-    """What is fitted together and what is predicted by it, beside the sum of the factors.
-
-    Attributes:
-        refs: archives that were fitted.
-        repetitions: the estimate of each.
-        unseen: sum of the totals of what is predicted; None if nothing is.
-        products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
-        warned: every archive, with the warnings about it.
-        settings: digests.
-    """
-
-    refs: list[ArchiveRef] = field(default_factory=list)
-    repetitions: list[LevelEstimate] = field(default_factory=list)
-    unseen: PhaseFactor | None = None
-    products: Array | None = None
-    warned: list[tuple[ArchiveRef, tuple[str, ...]]] = field(default_factory=list)
-    settings: set[str] = field(default_factory=set)
-
-    def add_archive(self, summary: Summary) -> None:
-        """Add an archive; its estimate is added apart."""
-        self.warned.append((summary.ref, summary.warnings))
-        if summary.ref.use == "excitation":
-            self.refs.append(summary.ref)
-            self.products = plus(self.products, summary.products)
-        else:
-            self.unseen = plus(self.unseen, summary.total)
-
-    def add(self, other: Group) -> None:
-        """Add what is fitted elsewhere."""
-        self.refs += other.refs
-        self.repetitions += other.repetitions
-        self.unseen = plus(self.unseen, other.unseen)
-        self.products = plus(self.products, other.products)
-        self.warned += other.warned
-        self.settings |= other.settings
+        return np.ones(len(total.samples)) if self.name == "ols" else joint_weights(total)
 
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
@@ -208,6 +218,7 @@ def repetition_level(
     ref, model = summary.ref, estimator.model
     found = estimator.of_archive(summary, centre)
     own = {name: getattr(found, name).copy() for name in ("values", "noise_std", "samples")}
+    nothing = np.full(model.n_joints, np.nan)
     return LevelEstimate(
         level="repetition",
         arm=ref.arm,
@@ -218,9 +229,9 @@ def repetition_level(
         repetitions=1,
         **(_figures(found) | own | {"names": model.parameter_names, "units": model.units}),
         covariance=None,
-        torque_rms=_torque_rms(summary.total.total),
-        unseen_rms=np.full(model.n_joints, np.nan),
-        unseen_torque_rms=np.full(model.n_joints, np.nan),
+        torque_rms=_rms(summary.total.total),
+        unseen_rms=nothing,
+        unseen_torque_rms=nothing,
         settings=settings,
         warnings=summary.warnings,
         setup=ref.setup,
@@ -231,38 +242,35 @@ def sum_level(
     level: Level,
     estimator: Estimator,
     group: Group,
-    phase: PhaseFactor,
     centre: Array | None,
     warnings: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
     """The estimate of a campaign, or of all campaigns of an arm.
 
-    Its intervals are no narrower than the repetitions of one motion scatter.
-
     Args:
         level: which.
         estimator: of the arm.
         group: archives that were fitted, and what is known beside them.
-        phase: the sum of their factors.
-        centre: of that sum, see `Estimator.centre`.
+        centre: of their sum, see `Estimator.centre`.
         warnings: about setups.
         payload: that the campaign's cell states.
 
     Raises:
         IdentificationError: there is no estimate.
     """
-    refs, total, model = group.refs, phase.total, estimator.model
-    found = estimator.of_sum(phase, centre)
+    assert group.phase is not None
+    refs, total, model = group.refs, group.phase.total, estimator.model
+    found, setups = estimator.of_group(group, centre), {ref.setup for ref in refs}
     unseen = None if group.unseen is None else group.unseen.total
-    if len({ref.motion for ref in refs}) == 1 and refs[0].motion:
-        values = np.array([one.values for one in group.repetitions])
-        found = replace(found, covariance=no_narrower(found.covariance, values))
-    if group.products is not None:
-        found = with_uncertain_delay(found, total, group.products, estimator.delay_variance)
-    setups = {ref.setup for ref in refs}
-    nothing = np.full(model.n_joints, np.nan)
-    left, torque = (nothing, nothing) if unseen is None else errors(unseen, found.values)
+    left, torque = errors(unseen or Factor.zero(model), found.values)
+    if not found.undetermined and found.condition > QR_CONDITION:
+        conditioning = (
+            f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some"
+            " parameters apart, and sums of squares lose digits there; `hil identify` on these"
+            " archives uses QR"
+        )
+        warnings = (conditioning, *warnings)
     return LevelEstimate(
         level=level,
         arm=refs[0].arm,
@@ -273,11 +281,11 @@ def sum_level(
         repetitions=len(refs),
         **_figures(found),
         covariance=found.covariance,
-        torque_rms=_torque_rms(total),
+        torque_rms=_rms(total),
         unseen_rms=left,
         unseen_torque_rms=torque,
         settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
-        warnings=(*_conditioning(found), *warnings, *warning_lines(group.warned)),
+        warnings=(*warnings, *warning_lines(group.warned)),
         speed_rms=speed_rms(model, total),
         information=total.weighted(estimator.weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
@@ -288,10 +296,13 @@ def sum_level(
 
 def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
     """RMS per joint (n,) of the torque that is left by parameters (p,), and of the torque."""
-    augmented = np.append(-values, 1.0)
-    squares = np.einsum("i,jik,k->j", augmented, factor.gram, augmented)
-    rows = np.where(factor.samples > 0, factor.samples, np.nan)
-    return np.sqrt(np.maximum(squares, 0.0) / rows), _torque_rms(factor)
+    return _rms(factor, factor.squared_errors(values)), _rms(factor)
+
+
+def _rms(factor: Factor, squares: Array | None = None) -> Array:
+    """Root mean square per joint (n,) of sums over rows, by default of the torque; NaN of none."""
+    squares = factor.gram[:, -1, -1] if squares is None else squares
+    return np.asarray(np.sqrt(squares / np.where(factor.samples > 0, factor.samples, np.nan)))
 
 
 def relative_error(
@@ -308,8 +319,6 @@ def relative_error(
     """
     count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
-    if not known.any():
-        return math.nan
     whole = float(count[known] @ torque[known] ** 2)
     return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
 
@@ -324,30 +333,12 @@ def speed_rms(model: RobotModel, factor: Factor) -> Array:
         if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
             column = model.base.rank + k
             squares[term.owner] = factor.gram[term.owner, column, column]
-    rows = factor.samples
-    return np.where(rows > 0, np.sqrt(squares / np.maximum(rows, 1)), np.nan)
-
-
-def _torque_rms(factor: Factor) -> Array:
-    rows = np.where(factor.samples > 0, factor.samples, np.nan)
-    return np.asarray(np.sqrt(factor.gram[:, -1, -1] / rows))
-
-
-_FIGURES: Final = (
-    *("names", "units", "values", "std", "interval_factor", "samples", "noise_std", "condition"),
-    *("undetermined", "method"),
-)
+    return _rms(factor, squares)
 
 
 def _figures(found: Estimate) -> dict[str, Any]:
-    return {name: getattr(found, name) for name in _FIGURES}
-
-
-def _conditioning(found: Estimate) -> list[str]:
-    if found.undetermined or found.condition <= QR_CONDITION:
-        return []
-    return [
-        f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some"
-        " parameters apart, and sums of squares lose digits there; `hil identify` on these"
-        " archives uses QR"
-    ]
+    names = (
+        *("names", "units", "values", "std", "interval_factor", "samples", "noise_std"),
+        *("condition", "undetermined", "method"),
+    )
+    return {name: getattr(found, name) for name in names}

@@ -1,4 +1,4 @@
-"""From archives to factors: one alone, and several of a campaign added up.
+"""What is done on a worker: an archive opened, settings decided, archives reduced to factors.
 
 Everything here is a pure function of the bytes of archives and of settings.
 """
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -18,21 +18,24 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
+from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
+from hil.identify.options import Options
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
-from hil.identify.sources import Source, known_warnings, source_of
+from hil.identify.sources import Source, all_fitted, known_warnings, source_of
 from hil.io import file_digest, json_digest
+from hil.progress import Silent
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import Weighting, fit_least_squares
-from identification.factor.factor import joint_weights
+from identification.factor.factor import Estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-from .cache import Where, settings_digest, sum_key
+from .cache import Where, decision_digest, settings_digest, sum_key
 from .remote import local_file
-from .types import ArchiveRef, Broken, Bundle, ChangedError, FileStamp, Fit, Summary, TornError
+from .types import ArchiveRef, Broken, Bundle, ChangedError, Stamp, Summary
 
 BUNDLE: Final = 16
 """Archives of a campaign that are reduced together. Of each a summary is cached, of all of them one
@@ -51,27 +54,88 @@ _FIELDS: Final = (
 )
 
 
-def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseFactor]:
-    """Reduce one archive: its summary, and its factor block by block of time.
+# An archive
+
+
+@contextmanager
+def opened(ref: ArchiveRef) -> Iterator[Archive]:
+    """The archive with what identification reads, as long as its file is there.
 
     Raises:
-        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
-        IdentificationError: there is not one usable row in it.
+        ChangedError: it is not the file that was found.
+        ArchiveError: it cannot be read, or is not whole.
     """
-    archive, source = source_in(ref)
-    source = signals_of(source, settings)
-    cell, fitted = cell_in(archive, settings), ref.use == "excitation"
-    samples = (samples_of if fitted else judged_samples)(source, cell, settings)
-    model = cell.model
-    phase = PhaseFactor.from_samples(model, samples)
-    summary = Summary(
-        ref=ref,
-        total=phase.merged(max(1, len(phase))),
-        fits={kind: _fit(model, samples, phase, kind) for kind in WEIGHTINGS} if fitted else {},
-        warnings=_warnings(archive, cell, source),
-        products=rate_products(model, samples) if fitted and settings.delay_variance else None,
-    )
-    return summary, phase
+    with local_file(ref.location) as path:
+        _require_same(path, ref)
+        try:
+            archive = open_archive(path, fields=_FIELDS)
+            if archive.header.controllers_own:
+                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        finally:
+            if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
+                _require_same(path, ref)
+        require_whole(archive, ref.location)
+        yield archive
+
+
+def require_whole(archive: Archive, location: str) -> None:
+    """Refuse an archive with damage; a batch uses none in part.
+
+    Raises:
+        ArchiveError: says how it is repaired.
+    """
+    if archive.damage is not None:
+        remedy = f"hil archive repair {location}"
+        raise ArchiveError(location, str(archive.damage), remedy=remedy)
+
+
+def _require_same(path: Path, ref: ArchiveRef) -> None:
+    """Of a fetched copy only the bytes tell whether it is what was found."""
+    if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
+        raise ChangedError(ref.location)
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of all bytes of a file.
+
+    Raises:
+        ArchiveError: it cannot be read.
+    """
+    try:
+        return file_digest(path)
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+
+
+def stamp_of(path: Path) -> Stamp:
+    """What the file system says about a file.
+
+    Raises:
+        ArchiveError: there is none.
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
+
+
+def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
+    """The cell that travels in an archive, with the law of settings if there are any.
+
+    Raises:
+        ArchiveError: the archive carries no cell or no URDF, or one that is no text.
+        CellError: the cell is not right.
+    """
+    friction = {} if settings is None else settings.friction
+    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
+
+
+@lru_cache(maxsize=8)
+def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
+    """The cell of these texts, with a friction law of these entries if there are any."""
+    cell = Cell.from_texts(text, urdf, Path("cell.toml"))
+    return cell.with_friction(**dict(friction)) if friction else cell
 
 
 def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
@@ -89,6 +153,123 @@ def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]
             remedy="find the torque constants with `hil gains` and import it again",
         )
     return archive, source
+
+
+# Settings
+
+
+class Decision(NamedTuple):
+    """Settings of a campaign.
+
+    Attributes:
+        settings: None where there is not one archive to decide them from.
+        broken: archives that could not be read for it.
+    """
+
+    settings: Settings | None
+    broken: tuple[Broken, ...] = ()
+
+
+def consulted(refs: Sequence[ArchiveRef], arms: Settings | None) -> tuple[ArchiveRef, ...]:
+    """The archives of a campaign that its settings depend on, those at standstill first."""
+    ordered = sorted(refs, key=lambda ref: ref.order)
+    rest = [ref for ref in ordered if ref.use == "standstill"]
+    fitted = [ref for ref in ordered if ref.use == "excitation"]
+    return (*rest, *fitted[: 1 if arms is not None and rest else MOST_READ])
+
+
+def known_settings(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+) -> Settings | None:
+    """Settings that were decided from these archives before."""
+    if not refs:
+        return None
+    return where.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
+
+
+def decided(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+) -> Decision:
+    """Decide a campaign's settings from some of its archives, and cache them.
+
+    Args:
+        refs: see `consulted`.
+        options: what is open.
+        arms: settings of the arm; None where this campaign decides on them.
+        where: they are cached.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+        IdentificationError: a delay was asked for and there is not one usable row.
+    """
+    broken: list[Broken] = []
+    rest: Source | None = None
+    fitted: list[tuple[Archive, Source]] = []
+    for ref in refs:
+        try:
+            if ref.use != "standstill":
+                fitted.append(source_in(ref))
+            elif rest is None:
+                rest = source_in(ref, to_fit=False)[1]
+        except (HilError, IdentificationError) as error:
+            broken.append(Broken(ref.location, str(error)))
+    if not fitted:
+        return Decision(None, tuple(broken))
+    sources, _ = with_noise(
+        all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
+    )
+    if arms is None:
+        settings = decide(sources, options, Silent()).settings
+    else:
+        settings = carried_over(arms, sources, options)
+    if not broken:
+        where.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
+    return Decision(settings, tuple(broken))
+
+
+# Factors
+
+
+def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseFactor]:
+    """Reduce one archive: its summary, and its factor block by block of time.
+
+    Raises:
+        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
+        IdentificationError: there is not one usable row in it.
+    """
+    archive, source = source_in(ref)
+    source = signals_of(source, settings)
+    cell, fitted = cell_in(archive, settings), ref.use == "excitation"
+    samples = (samples_of if fitted else judged_samples)(source, cell, settings)
+    model = cell.model
+    phase = PhaseFactor.from_samples(model, samples)
+    fits = {kind: _fit(model, samples, phase, kind) for kind in WEIGHTINGS} if fitted else {}
+    warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
+    if source.merged:
+        warnings.append(source.merged_words)
+    if archive.outcome is not None and archive.outcome.repaired:
+        warnings.append("it was repaired, and something is lost")
+    return Summary(
+        ref=ref,
+        total=phase.merged(max(1, len(phase))),
+        fits={kind: found for kind, (found, _) in fits.items()},
+        design_effects={kind: effect for kind, (_, effect) in fits.items()},
+        warnings=tuple(warnings),
+        products=rate_products(model, samples) if fitted and settings.delay_variance else None,
+    ), phase
+
+
+def _fit(
+    model: RobotModel, samples: Samples, phase: PhaseFactor, weighting: Weighting
+) -> tuple[Estimate, float]:
+    """With the mean ratio of the estimate's variances to those of white residuals."""
+    found = fit_least_squares(model, [samples], weighting, phase=phase)
+    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(phase.total)
+    if found.undetermined:
+        return found, block_covariance(phase, weights, found.values).design_effect
+    information = phase.total.weighted(weights).A
+    trace = np.einsum("ij,ji->", information, found.covariance)
+    return found, float(trace) / phase.n_parameters
 
 
 def bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
@@ -116,37 +297,38 @@ def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bun
     store, used = where.store(refs[0].location), settings_digest(settings)
     counts = range(len(refs), 0, -1)
     begun = next(filter(None, (cached(refs[:count], settings, where) for count in counts)), None)
-    known = 0 if begun is None else len(begun.refs)
-    if begun is not None and known == len(refs):
-        return begun
     found = begun or Bundle(())
-    summaries, broken, phase, lasting = list(found.summaries), list(found.broken), found.phase, True
+    known = len(found.refs)
+    if known == len(refs):
+        return found
+    summaries, broken, phase = list(found.summaries), dict(found.broken), found.phase
+    lasting = True  # whether what is broken will be so again, as long as it stays the same
     for ref in refs[known:]:
         try:
             summary, own = archive_factor(ref, settings)
         except (HilError, IdentificationError) as error:
-            broken.append(Broken(ref.location, str(error)))
-            lasting &= _of_the_bytes(error)
+            broken[ref.location] = str(error)
+            of_the_bytes = isinstance(error, ArchiveError | CellError | IdentificationError)
+            changed = isinstance(error, ChangedError) or isinstance(error.__cause__, OSError)
+            lasting &= of_the_bytes and not changed
         except Exception as error:  # a fault of ours: it costs this archive, not the batch
-            broken.append(Broken(ref.location, f"{type(error).__name__}: {error}"))
+            broken[ref.location] = f"{type(error).__name__}: {error}"
             lasting = False
         else:
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
-    read = len(refs) - known
-    bundle = Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), lasting, read)
     if lasting:
         for one in summaries:
             store.put(_summary_key(one.ref, used), one)
-        reasons = dict(broken)
         for ref in refs:
-            if ref.location in reasons:
-                store.put(_summary_key(ref, used), reasons[ref.location])
+            if ref.location in broken:
+                store.put(_summary_key(ref, used), broken[ref.location])
         store.put(sum_key(refs, used), [phase])
         if known:
             store.remove(sum_key(refs[:known], used))  # part of a longer one now
-    return bundle
+    reasons = tuple(Broken(*one) for one in broken.items())
+    return Bundle(tuple(refs), tuple(summaries), phase, reasons, len(refs) - known)
 
 
 def cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle | None:
@@ -174,105 +356,3 @@ def is_cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> b
 
 def _summary_key(ref: ArchiveRef, settings: str) -> str:
     return json_digest(["summary", ref.sha256, settings])
-
-
-def _of_the_bytes(error: HilError | IdentificationError) -> bool:
-    """Whether an error will be met again as long as the bytes of the archive are the same."""
-    if isinstance(error, ChangedError) or isinstance(error.__cause__, OSError):
-        return False
-    return isinstance(error, ArchiveError | CellError | IdentificationError)
-
-
-@contextmanager
-def opened(ref: ArchiveRef) -> Iterator[Archive]:
-    """The archive with what identification reads, as long as its file is there.
-
-    Raises:
-        TornError: it is not whole.
-        ChangedError: it is not the file that was found.
-        ArchiveError: it cannot be read.
-    """
-    with local_file(ref.location) as path:
-        _require_same(path, ref)
-        try:
-            archive = open_archive(path, fields=_FIELDS)
-            if archive.header.controllers_own:
-                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
-        finally:
-            if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
-                _require_same(path, ref)
-        if archive.damage is not None:
-            raise TornError(ref.location, str(archive.damage))
-        yield archive
-
-
-def _require_same(path: Path, ref: ArchiveRef) -> None:
-    """Of a fetched copy only the bytes tell whether it is what was found."""
-    if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
-        raise ChangedError(ref.location)
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of all bytes of a file.
-
-    Raises:
-        ArchiveError: it cannot be read.
-    """
-    try:
-        return file_digest(path)
-    except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-
-
-def stamp_of(path: Path) -> FileStamp:
-    """What the file system says about a file.
-
-    Raises:
-        ArchiveError: there is none.
-    """
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-    return FileStamp(found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino)
-
-
-def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
-    """The cell that travels in an archive, with the law of settings if there are any.
-
-    Raises:
-        ArchiveError: the archive carries no cell or no URDF, or one that is no text.
-        CellError: the cell is not right.
-    """
-    friction = {} if settings is None else settings.friction
-    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
-
-
-@lru_cache(maxsize=8)
-def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
-    """The cell of these texts, with a friction law of these entries if there are any."""
-    cell = Cell.from_texts(text, urdf, Path("cell.toml"))
-    return cell.with_friction(**dict(friction)) if friction else cell
-
-
-def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor, weighting: Weighting) -> Fit:
-    """With the mean ratio of the estimate's variances to those of white residuals."""
-    found = fit_least_squares(model, [samples], weighting, phase=phase)
-    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(phase.total)
-    if found.undetermined:
-        return Fit(found, block_covariance(phase, weights, found.values).design_effect)
-    information = phase.total.weighted(weights).A
-    trace = np.einsum("ij,ji->", information, found.covariance)
-    return Fit(found, float(trace) / phase.n_parameters)
-
-
-def _warnings(archive: Archive, cell: Cell, source: Source) -> tuple[str, ...]:
-    warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
-    if source.merged:
-        warnings.append(
-            f"{source.merged} samples had the time stamp of the one before and were averaged "
-            "with it"
-        )
-    if archive.outcome is not None and archive.outcome.repaired:
-        warnings.append("it was repaired, and something is lost")
-    return tuple(warnings)

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
-from hil.archive import Archive
 from hil.cell import Cell
-from hil.errors import HilError, InputError
-from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
+from hil.errors import InputError
 from hil.identify.options import Options
 from hil.identify.settings import Settings
-from hil.identify.sources import Source, all_fitted
 from hil.io import json_digest
-from hil.progress import Reporter, Silent, Task
+from hil.progress import Reporter
 from hil.terminal_text import plural
 from identification import IdentificationError
-from identification.factor.phases import PhaseFactor
 
-from .cache import Where, code_digest, decision_digest, settings_digest
+from .cache import Where, code_digest, settings_digest
 from .discovery import discover
 from .estimates import Estimator, Group, repetition_level, sum_level
-from .factors import bundles, cached, cell_from, cell_in, is_cached, opened, reduced, source_in
+from .factors import (
+    bundles,
+    cached,
+    cell_from,
+    cell_in,
+    consulted,
+    decided,
+    is_cached,
+    known_settings,
+    opened,
+    reduced,
+)
 from .types import (
-    ESTIMATORS,
     ArchiveRef,
     Arm,
     BatchEstimator,
@@ -37,57 +42,22 @@ from .types import (
     Bundle,
     GroupKey,
     LevelEstimate,
-    NothingToFitError,
     Summary,
 )
-from .workers import FAN_IN, ArchiveTask, TreeSum, Workers
+from .workers import ArchiveTask, Workers
 
 T = TypeVar("T")
-Run = list[tuple[ArchiveRef, ...]]
-"""Bundles that are reduced and added up together: one, or up to `FAN_IN` far away."""
 
-_ROUNDS: Final = 3
-"""How often archives are reduced again without those that end their process."""
-_MANY: Final = 4
-"""Runs per worker from which on whole runs are added up far away, so that less is sent."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How a batch is run.
-
-    Attributes:
-        options: as of `hil identify`, with an estimator that needs no sample; a single recording is
-            never split.
-        cache: folder of the cache; None: beside the archives.
-        keep: whether anything is cached at all.
-    """
-
-    options: Options = Options()
-    cache: Path | None = None
-    keep: bool = True
-
-    def __post_init__(self) -> None:
-        if self.options.estimator not in ESTIMATORS:
-            raise InputError(
-                None,
-                f"the estimator {self.options.estimator!r} reads samples",
-                field="--estimator",
-                remedy=f"use {', '.join(ESTIMATORS)}",
-            )
-
-    @property
-    def estimator(self) -> BatchEstimator:
-        """By name."""
-        return cast(BatchEstimator, self.options.estimator)
+_TITLE: Final = "reading archives and estimating"
 
 
 def reidentify(
     roots: Sequence[str],
-    plan: Plan,
+    options: Options,
     workers: Workers,
     reporter: Reporter,
     *,
+    where: Where = Where(),  # noqa: B008 - frozen
     check: Callable[[Sequence[ArchiveRef]], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: repetition by repetition, campaign, and pooled.
@@ -97,88 +67,24 @@ def reidentify(
 
     Args:
         roots: folders, archives, or URLs of either.
-        plan: how.
+        options: as of `hil identify`, with a `BatchEstimator`; a single recording is never split.
         workers: who does the work on archives.
         reporter: of progress.
+        where: what archives contribute is cached.
         check: given the archives that were found, before their samples are read; may refuse them.
 
     Raises:
-        NothingToFitError: there is not one archive that can be fitted.
-        InputError: a place does not exist, or the estimator does not suit an arm.
+        InputError: a place does not exist, there is not one archive that can be fitted, or the
+            estimator does not suit an arm.
         CacheError: the cache cannot be written.
     """
-    where = Where(None if plan.cache is None else str(plan.cache.resolve()), plan.keep)
     found = discover(roots, where, workers, reporter)
     check(found.refs)
-    batch = _Batch(plan, workers, where, reporter)
-    batch.broken += found.broken
-    return batch.result(found.refs, found.skipped)
-
-
-# On a worker
-
-
-class Decision(NamedTuple):
-    """Settings of a campaign.
-
-    Attributes:
-        settings: None where there is not one archive to decide them from.
-        broken: archives that could not be read for it.
-    """
-
-    settings: Settings | None
-    broken: tuple[Broken, ...]
-
-
-def decided(
-    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
-) -> Decision:
-    """Decide a campaign's settings from some of its archives, and cache them.
-
-    Args:
-        refs: see `Campaign.consulted`.
-        options: what is open.
-        arms: settings of the arm; None where this campaign decides on them.
-        where: they are cached.
-
-    Raises:
-        RecordingError: a recording cannot be prepared.
-        IdentificationError: a delay was asked for and there is not one usable row.
-    """
-    known = _known_settings(refs, options, arms, where)
-    if known is not None:
-        return Decision(known, ())
-    broken: list[Broken] = []
-    rest: Source | None = None
-    fitted: list[tuple[Archive, Source]] = []
-    for ref in refs:
-        try:
-            if ref.use != "standstill":
-                fitted.append(source_in(ref))
-            elif rest is None:
-                rest = source_in(ref, to_fit=False)[1]
-        except (HilError, IdentificationError) as error:
-            broken.append(Broken(ref.location, str(error)))
-    if not fitted:
-        return Decision(None, tuple(broken))
-    sources, _ = with_noise(
-        all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
+    batch = _Batch(options, workers, where, reporter, [*found.broken])
+    campaigns = batch.with_settings(
+        [_Campaign(key, list(own)) for key, own in groupby(found.refs, lambda ref: ref.key)]
     )
-    if arms is None:
-        settings = decide(sources, options, Silent()).settings
-    else:
-        settings = carried_over(arms, sources, options)
-    if not broken:
-        where.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
-    return Decision(settings, tuple(broken))
-
-
-def _known_settings(
-    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
-) -> Settings | None:
-    if not refs:
-        return None
-    return where.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
+    return batch.result(campaigns, found.skipped)
 
 
 def opened_alone(ref: ArchiveRef) -> None:
@@ -187,43 +93,21 @@ def opened_alone(ref: ArchiveRef) -> None:
         pass
 
 
-def added_up(
-    run: Run, settings: Settings, where: Where
-) -> tuple[PhaseFactor | None, tuple[Bundle, ...]]:
-    """Reduce bundles: their sum, and the rest of each."""
-    found = [reduced(refs, settings, where) for refs in run]
-    total = TreeSum[PhaseFactor](bundle.phase for bundle in found).result()
-    return total, tuple(replace(bundle, phase=None) for bundle in found)
-
-
-# In the process that gives work out
-
-
 @dataclass(eq=False)
-class Campaign:
+class _Campaign:
     """Archives of one group on their way.
 
     Attributes:
         key: of the group.
-        refs: archives, without those found to be broken.
-        arms: settings of its arm; None where it decides on them.
+        refs: archives.
         settings: None until they are decided.
-        runs: what is reduced and added up together, and whether it is in the cache.
+        bundles: what is reduced together, and whether it is in the cache.
     """
 
     key: GroupKey
-    refs: tuple[ArchiveRef, ...]
-    arms: Settings | None = None
+    refs: list[ArchiveRef]
     settings: Settings | None = None
-    runs: list[tuple[Run, bool]] = field(default_factory=list)
-
-    @property
-    def consulted(self) -> tuple[ArchiveRef, ...]:
-        """The archives that its settings depend on."""
-        ordered = sorted(self.refs, key=lambda ref: ref.order)
-        rest = [ref for ref in ordered if ref.use == "standstill"]
-        fitted = [ref for ref in ordered if ref.use == "excitation"]
-        return (*rest, *fitted[: 1 if self.arms is not None and rest else MOST_READ])
+    bundles: list[tuple[tuple[ArchiveRef, ...], bool]] = field(default_factory=list)
 
     @property
     def ready(self) -> Settings:
@@ -231,61 +115,23 @@ class Campaign:
         assert self.settings is not None
         return self.settings
 
-    @property
-    def reduced(self) -> list[ArchiveRef]:
-        """Archives that are reduced: all but those at standstill."""
-        return [ref for ref in self.refs if ref.use != "standstill"]
 
-
+@dataclass(eq=False)
 class _Batch:
     """One run: gives out work, and estimates arm by arm with few bundles in memory at a time."""
 
-    def __init__(self, plan: Plan, workers: Workers, where: Where, reporter: Reporter) -> None:
-        self._plan, self._options, self._where = plan, plan.options, where
-        self._workers, self._reporter = workers, reporter
-        self._task: Task | None = None
-        self._stream: Iterator[Any] = iter(())
-        self.broken: list[Broken] = []
-        self._read = self._cached = 0
-        self._arms: dict[str, Arm] = {}
-        self._repetitions: list[LevelEstimate] = []
-        self._campaigns: list[LevelEstimate] = []
-        self._pooled: list[LevelEstimate] = []
-
-    def result(self, refs: Sequence[ArchiveRef], skipped: tuple[Broken, ...]) -> BatchResult:
-        """Estimate everything."""
-        found = [Campaign(key, tuple(own)) for key, own in groupby(refs, lambda ref: ref.key)]
-        campaigns = self._with_settings(found)
-        archives = sum(len(one.reduced) for one in campaigns)
-        self._begin(campaigns)
-        with self._reporter.task("reading archives and estimating", archives) as self._task:
-            for digest, members in groupby(campaigns, lambda one: one.key.arm):
-                self._arm(digest, list(members))
-        self._task = None
-        # The path stands in the reason of some as well.
-        broken = tuple(
-            dict.fromkeys(
-                Broken(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
-            )
-        )
-        if not self._repetitions:
-            raise _nothing_to_fit(broken)
-        return BatchResult(
-            estimator=self._plan.estimator,
-            arms=self._arms,
-            repetitions=tuple(self._repetitions),
-            campaigns=tuple(self._campaigns),
-            pooled=tuple(self._pooled),
-            broken=broken,
-            skipped=skipped,
-            read=self._read,
-            cached=self._cached,
-            code=code_digest(),
-        )
+    options: Options
+    workers: Workers
+    where: Where
+    reporter: Reporter
+    broken: list[Broken]
+    read: int = 0
+    cached: int = 0
+    stream: Iterator[Any] = field(default_factory=lambda: iter(()))
 
     # Settings
 
-    def _with_settings(self, campaigns: Sequence[Campaign]) -> list[Campaign]:
+    def with_settings(self, campaigns: Sequence[_Campaign]) -> list[_Campaign]:
         """Give each campaign its settings; returns those that have some.
 
         Those of an arm are decided on the first of its campaigns that can be read, and the others
@@ -297,196 +143,173 @@ class _Batch:
         while waiting:
             first = {one.key.arm: one for one in reversed(waiting) if one.key.arm not in arms}
             asked = list(first.values()) or waiting
-            waiting = [one for one in waiting if first and first.get(one.key.arm) is not one]
-            while asked:
-                asked = self._decide(asked, arms)
+            waiting = [one for one in waiting if one not in asked]
+            self._decide(asked, arms)
             arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
         return [one for one in campaigns if one.settings is not None]
 
-    def _decide(
-        self, campaigns: Sequence[Campaign], arms: Mapping[str, Settings]
-    ) -> list[Campaign]:
-        """Decide settings; returns campaigns to be asked again, without what turned out broken."""
+    def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> None:
+        """Decide settings; what turns out broken is left out, and its campaign asked again."""
+        asked: list[tuple[_Campaign, tuple[Any, ...]]] = []
         for one in campaigns:
-            one.arms = arms.get(one.key.arm)
-            one.settings = _known_settings(one.consulted, self._options, one.arms, self._where)
-        left = [one for one in campaigns if one.settings is None]
-        tasks = [
-            ArchiveTask(
-                one.key.campaign, decided, (one.consulted, self._options, one.arms, self._where)
-            )
-            for one in left
-        ]
-        again = []
-        for one, found in zip(left, self._results(tasks, "deciding settings"), strict=True):
-            count = len(one.refs)
+            own = arms.get(one.key.arm)
+            refs = consulted(one.refs, own)
+            one.settings = known_settings(refs, self.options, own, self.where)
+            if one.settings is None:
+                asked.append((one, (refs, self.options, own, self.where)))
+        tasks = [ArchiveTask(one.key.campaign, decided, arguments) for one, arguments in asked]
+        again: list[_Campaign] = []
+        for (one, arguments), found in zip(
+            asked, self._results(tasks, "deciding settings"), strict=True
+        ):
             if isinstance(found, Broken):
-                broken = self._unusable(
-                    one.consulted,
-                    [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in one.consulted],
-                    "opening archives one by one",
-                )
+                alone = [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in arguments[0]]
+                results = self._results(alone, "opening archives one by one")
+                broken = [other for other in results if other is not None]
                 reason = found.reason
             else:
                 one.settings, broken = found.settings, [*found.broken]
-                self.broken += broken
-                reason = "none of its archives says how it is to be read"
-                reason = reason if one.consulted else "it holds no excitation"
-            paths = {each.path for each in broken}
-            one.refs = tuple(ref for ref in one.refs if ref.location not in paths)
-            if one.settings is not None:
-                continue
-            if 0 < len(one.refs) < count:
+                reason = "" if arguments[0] else "it holds no excitation"
+            self.broken += broken
+            paths = {other.path for other in broken}
+            one.refs = [ref for ref in one.refs if ref.location not in paths]
+            if one.settings is None and broken and one.refs:
                 again.append(one)
-            elif one.refs or isinstance(found, Broken):
+            elif one.settings is None and reason:
                 self.broken.append(Broken(one.key.campaign, reason))
-        return again
+        if again:
+            self._decide(again, arms)
 
-    def _unusable(
-        self, refs: Sequence[ArchiveRef], tasks: Sequence[ArchiveTask[Any]], title: str
-    ) -> list[Broken]:
-        """Those of archives with which a task alone fails, or ends its process."""
-        pairs = zip(refs, self._results(tasks, title), strict=True)
-        broken = [Broken(ref.location, one.reason) for ref, one in pairs if _is_broken(one)]
-        self.broken += broken
-        return broken
+    def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> list[T | Broken]:
+        """What comes of tasks."""
+        if not tasks:
+            return []
+        with self.reporter.task(title, len(tasks)) as progress:
+            return list(self.workers.results(tasks, progress.advance))
 
     # Factors
 
-    def _begin(self, campaigns: Sequence[Campaign]) -> None:
-        """Give out the work on archives; what the cache has is read here where that can be seen."""
-        every = [bundles(one.reduced) for one in campaigns]
-        many = sum(map(len, every)) >= FAN_IN * _MANY * self._workers.count
-        size = 1 if self._workers.near or not many else FAN_IN
-        tasks = []
-        for one, own in zip(campaigns, every, strict=True):
-            for k in range(0, len(own), size):
-                run = own[k : k + size]
-                known = self._workers.near and is_cached(run[0], one.ready, self._where)
-                one.runs.append((run, known))
-                tasks += [] if known else [self._reducing(one, run)]
-        archives = sum(len(refs) for task in tasks for refs in task.arguments[0])
-        share = archives / max(1, len(tasks))
-        self._stream = self._workers.results(tasks, lambda count: self._advance(share * count))
+    def _reducing(self, one: _Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Bundle]:
+        return ArchiveTask(refs[0].location, reduced, (refs, one.ready, self.where))
 
-    def _reducing(self, one: Campaign, run: Run) -> ArchiveTask[Any]:
-        arguments = run, one.ready, self._where
-        return ArchiveTask(run[0][0].location, added_up, arguments, len(run))
-
-    def _collected(self, one: Campaign, sums: TreeSum[PhaseFactor]) -> Iterator[Bundle]:
-        """The bundles of a campaign in turn, added up."""
-        for run, in_cache in one.runs:
-            bundle = cached(run[0], one.ready, self._where) if in_cache else None
-            found: tuple[Bundle, ...]
-            if bundle is not None:
-                total, found = bundle.phase, (bundle,)
-            else:  # or damaged
-                again = self._workers.results([self._reducing(one, run)])
-                result = next(again if in_cache else self._stream)
-                total, found = self._without_crashes(one, run, result)
-            if in_cache:
-                self._advance(len(run[0]), one.key.campaign)
-            sums.add(total, 0 if len(run) == 1 else 1)
-            yield from found
-
-    def _without_crashes(
-        self, one: Campaign, run: Run, result: Any
-    ) -> tuple[PhaseFactor | None, tuple[Bundle, ...]]:
-        """The sum of bundles; again without the archives that ended their process."""
-        for _ in range(_ROUNDS):
-            if not isinstance(result, Broken):
-                break
-            refs = [ref for own in run for ref in own]
-            title = f"reading {refs[0].name} and others one by one"
-            alone = [self._reducing(one, [(ref,)]) for ref in refs]
-            paths = {each.path for each in self._unusable(refs, alone, title)}
-            run = [tuple(ref for ref in own if ref.location not in paths) for own in run]
-            run = [own for own in run if own]
-            if not run:
-                return None, ()
-            (result,) = self._workers.results([self._reducing(one, run)])
-        if isinstance(result, Broken):
-            self.broken += [Broken(ref.location, result.reason) for own in run for ref in own]
-            return None, ()
-        total, found = result
-        return total, found
-
-    def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> Iterator[T | Broken]:
-        """What comes of tasks; at most one bar of progress is shown."""
-        if not tasks or self._task is not None:
-            self._advance(0, title)
-            yield from self._workers.results(tasks)
-            return
-        with self._reporter.task(title, len(tasks)) as progress:
-            found = list(self._workers.results(tasks, progress.advance))
-        yield from found
-
-    def _advance(self, units: float, note: str = "") -> None:
-        if self._task is not None:
-            self._task.advance(units, note)
+    def _reduced(self, one: _Campaign) -> Iterator[Bundle]:
+        """The bundles of a campaign in turn; what ends its process is looked for one by one."""
+        for refs, known in one.bundles:
+            found: Any = cached(refs, one.ready, self.where) if known else next(self.stream)
+            if found is None:  # damaged
+                (found,) = self.workers.results([self._reducing(one, refs)])
+            if isinstance(found, Bundle):
+                yield found
+                continue
+            alone = [self._reducing(one, (ref,)) for ref in refs]
+            for own in self.workers.results(alone):
+                yield Bundle((), broken=(own,)) if isinstance(own, Broken) else own
 
     # Estimates
 
-    def _arm(self, digest: str, members: Sequence[Campaign]) -> None:
-        """Campaigns of one arm, and all of them together."""
-        settings = members[0].ready
-        arm = Arm(digest, settings.law(self._cell(members[0].refs[0])))
-        self._arms[digest] = arm
-        if self._plan.estimator == "prior":
-            _require_one_belief(members)
-        estimator = Estimator(self._plan.estimator, arm.cell, settings)
-        everything, sums = Group(), TreeSum[PhaseFactor]()
-        levels: list[LevelEstimate] = []
-        for one in members:
-            group, phase, found = self._campaign(one, estimator)
-            levels += found
-            if phase is not None:
-                sums.add(phase)
-                everything.add(group)
-        self._campaigns += levels
-        whole, keys = sums.result(), {ref.key for ref in everything.refs}
-        if len(keys) == 1:
-            self._pooled += [
-                replace(one, level="pooled", campaign="", payload=None) for one in levels
-            ]
-        elif whole is not None:
-            with self._failing(f"arm {digest[:8]}"):
-                centre, apart = estimator.centre(whole), _setups(keys)
-                self._pooled.append(
-                    sum_level("pooled", estimator, everything, whole, centre, apart)
-                )
+    def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Broken, ...]) -> BatchResult:
+        """Reduce and estimate everything; what the cache has is read here if that can be seen."""
+        tasks = []
+        for one in campaigns:
+            for refs in bundles([ref for ref in one.refs if ref.use != "standstill"]):
+                known = self.workers.near and is_cached(refs, one.ready, self.where)
+                one.bundles.append((refs, known))
+                tasks += [] if known else [self._reducing(one, refs)]
+        self.stream = self.workers.results(tasks)
+        arms: dict[str, Arm] = {}
+        pooled: list[LevelEstimate] = []
+        estimated: list[LevelEstimate] = []
+        repetitions: list[LevelEstimate] = []
+        archives = sum(len(refs) for one in campaigns for refs, _ in one.bundles)
+        with self.reporter.task(_TITLE, archives) as progress:
+            for digest, own in groupby(campaigns, lambda one: one.key.arm):
+                members = list(own)
+                settings = members[0].ready
+                arms[digest] = Arm(digest, settings.law(self._cell(members[0].refs[0])))
+                estimator = self._estimator(members, arms[digest].cell, settings)
+                everything, levels = Group(), list[LevelEstimate]()
+                for one in members:
+                    group, found = self._campaign(one, estimator, progress.advance)
+                    levels += found
+                    if group.phase is not None:
+                        everything.add(group)
+                estimated += levels
+                repetitions += everything.repetitions
+                if len({ref.key for ref in everything.refs}) == 1:
+                    pooled += [
+                        replace(one, level="pooled", campaign="", payload=None) for one in levels
+                    ]
+                elif everything.phase is not None:
+                    with self._failing(f"arm {digest[:8]}"):
+                        centre = estimator.centre(everything.phase)
+                        apart = _setups({ref.key for ref in everything.refs})
+                        pooled.append(sum_level("pooled", estimator, everything, centre, apart))
+        # The path stands in the reason of some as well.
+        broken = tuple(
+            dict.fromkeys(
+                Broken(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
+            )
+        )
+        if not repetitions:
+            raise _nothing_to_fit(broken)
+        return BatchResult(
+            estimator=self.options.estimator,
+            arms=arms,
+            repetitions=tuple(repetitions),
+            campaigns=tuple(estimated),
+            pooled=tuple(pooled),
+            broken=broken,
+            skipped=skipped,
+            read=self.read,
+            cached=self.cached,
+            code=code_digest(),
+        )
+
+    def _estimator(self, members: Sequence[_Campaign], cell: Cell, settings: Settings) -> Estimator:
+        """That of an arm; one prior serves all its campaigns, so their cells must state the same.
+
+        Raises:
+            InputError: they do not.
+        """
+        name = cast(BatchEstimator, self.options.estimator)
+        first, *others = (ref for one in members for ref in one.refs)
+        other = next((ref for ref in others if ref.belief != first.belief), None)
+        if name == "prior" and other is not None:
+            raise InputError(
+                other.location,
+                f"its cell states another [nominal] than that of {first.location}, of the same arm",
+                field="--estimator prior",
+                remedy="name their folders apart, or use --estimator wls",
+            )
+        return Estimator(name, cell, settings)
 
     def _campaign(
-        self, one: Campaign, estimator: Estimator
-    ) -> tuple[Group, PhaseFactor | None, list[LevelEstimate]]:
-        """Archives of one campaign, the sum of those that are fitted, and the estimate if any."""
+        self, one: _Campaign, estimator: Estimator, advance: Callable[[float, str], None]
+    ) -> tuple[Group, list[LevelEstimate]]:
+        """Archives of one campaign, those that are fitted with their sum; and the estimate if any.
+
+        Its repetitions count as such where the campaign is estimated.
+        """
         used = settings_digest(one.ready)
-        group, sums = Group(settings={used}), TreeSum[PhaseFactor]()
-        waiting: list[Summary] = []  # for the centre of all; of very many archives if need be only
-        for bundle in self._collected(one, sums):
+        group, summaries = Group(settings={used}), list[Summary]()
+        for bundle in self._reduced(one):
             self.broken += bundle.broken
-            self._read += bundle.read
-            self._cached += len(bundle.refs) - bundle.read
-            for summary in bundle.summaries:
-                group.add_archive(summary)
-                if summary.ref.use == "excitation" and estimator.shrinks:
-                    waiting.append(summary)
-                elif summary.ref.use == "excitation":
-                    group.repetitions.append(repetition_level(estimator, summary, used))
-        phase = sums.result()
+            self.read += bundle.read
+            self.cached += len(bundle.refs) - bundle.read
+            group.add_bundle(bundle)
+            summaries += [each for each in bundle.summaries if each.ref.use == "excitation"]
+            advance(len(bundle.refs), one.key.campaign)
         levels: list[LevelEstimate] = []
-        if phase is None:
-            return group, None, levels
-        with self._failing(one.key.campaign):
-            centre = estimator.centre(phase)
-            group.repetitions += [
-                repetition_level(estimator, summary, used, centre) for summary in waiting
-            ]
-            payload = self._cell(group.refs[0]).model.payload
-            stated = payload if payload is not None and payload.parameters.any() else None
-            levels.append(sum_level("campaign", estimator, group, phase, centre, (), stated))
-        self._repetitions += group.repetitions
-        return group, phase, levels
+        if group.phase is not None:
+            with self._failing(one.key.campaign):
+                centre = estimator.centre(group.phase)
+                group.repetitions = [
+                    repetition_level(estimator, each, used, centre) for each in summaries
+                ]
+                payload = self._cell(group.refs[0]).model.payload
+                stated = payload if payload is not None and payload.parameters.any() else None
+                levels.append(sum_level("campaign", estimator, group, centre, (), stated))
+        return group, levels
 
     @contextmanager
     def _failing(self, name: str) -> Iterator[None]:
@@ -498,27 +321,21 @@ class _Batch:
 
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""
-        texts = self._where.store(ref.location).get(ref.cell, list)
+        texts = self.where.store(ref.location).get(ref.cell, list)
         if texts is not None and json_digest(texts) == ref.cell:
             return cell_from(*texts)
         with opened(ref) as archive:
             return cell_in(archive)
 
 
-def _is_broken(found: object) -> bool:
-    return isinstance(found, Broken)
-
-
-def _nothing_to_fit(broken: Sequence[Broken]) -> NothingToFitError:
+def _nothing_to_fit(broken: Sequence[Broken]) -> InputError:
     problem = "there is no excitation and no imported recording that can be fitted"
     if broken:
         path, reason = broken[0]
-        problem += (
-            f"; {path} could not be used: {reason}"
-            if len(broken) == 1
-            else f"; {len(broken)} could not be used, the first of them {path}: {reason}"
-        )
-    return NothingToFitError(None, problem)
+        which = f"{len(broken)} could not be used, the first of them " if len(broken) > 1 else ""
+        unused = "" if len(broken) > 1 else " could not be used"
+        problem += f"; {which}{path}{unused}: {reason}"
+    return InputError(None, problem)
 
 
 def _setups(keys: Collection[GroupKey]) -> list[str]:
@@ -533,16 +350,3 @@ def _setups(keys: Collection[GroupKey]) -> list[str]:
     return [
         f"pooled over campaigns whose cells state different things, known and compensated: {stated}"
     ]
-
-
-def _require_one_belief(members: Sequence[Campaign]) -> None:
-    """One prior serves all campaigns of an arm, so their cells must state the same one."""
-    first, *others = (ref for one in members for ref in one.refs)
-    for ref in others:
-        if ref.belief != first.belief:
-            raise InputError(
-                ref.location,
-                f"its cell states another [nominal] than that of {first.location}, of the same arm",
-                field="--estimator prior",
-                remedy="name their folders apart, or use --estimator wls",
-            )

@@ -33,23 +33,11 @@ _PORTION = 20_000
 
 
 class Table(NamedTuple):
-    """A table: its columns and where its rows come from.
-
-    Attributes:
-        name: of the files, without their endings.
-        columns: names, each with its kind behind a colon unless that is text.
-        rows: of a result.
-    """
+    """A table: name of its files without their endings, kind of each column, rows of a result."""
 
     name: str
-    columns: str
+    kinds: dict[str, str]
     rows: Callable[[BatchResult], Iterator[Row]]
-
-    @property
-    def kinds(self) -> dict[str, str]:
-        """Kind of each column by name."""
-        pairs = (one.partition(":") for one in self.columns.split())
-        return {name: kind or "text" for name, _, kind in pairs}
 
     @property
     def csv_columns(self) -> list[str]:
@@ -65,13 +53,14 @@ def write_tables(folder: Path, result: BatchResult) -> list[Path]:
     Raises:
         OSError: a file cannot be written.
     """
-    written = []
+    writers = {".csv": _write_csv} | ({".parquet": _write_parquet} if has_parquet() else {})
+    paths = []
     for table in TABLES:
-        for ending, write in ((".csv", _write_csv), (".parquet", _write_parquet)):
-            if ending == ".csv" or has_parquet():
-                written.append(folder / f"{table.name}{ending}")
-                write(written[-1], table, result)
-    return written
+        for ending, write in writers.items():
+            paths.append(folder / f"{table.name}{ending}")
+            with replacing(paths[-1]) as temporary:
+                write(temporary, table, result)
+    return paths
 
 
 def has_parquet() -> bool:
@@ -114,17 +103,16 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             "code": result.code,
             "software": made_with,
         }
-        friction = {term.name: term for term in model.friction.terms}
-        for k, name in enumerate(level.names):
-            value, std = float(level.values[k]), float(level.std[k])
+        axes = {term.name: model.joint_names[term.owner] for term in model.friction.terms}
+        columns = (level.names, level.units, level.values.tolist(), level.std.tolist())
+        for k, (name, unit, value, std) in enumerate(zip(*columns, strict=True)):
             half = level.interval_factor * std
-            term = friction.get(name)
             yield {
                 **shared,
                 "parameter": name,
-                "kind": "inertial" if term is None else "friction",
-                "axis": "" if term is None else model.joint_names[term.owner],
-                "unit": level.units[k],
+                "kind": "friction" if name in axes else "inertial",
+                "axis": axes.get(name, ""),
+                "unit": unit,
                 "value": value,
                 "std": std,
                 "low": value - half,
@@ -156,41 +144,50 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
             yield {"path": one.path, "kind": kind, "reason": one.reason}
 
 
+def _kinds(columns: str) -> dict[str, str]:
+    """Kind of each column by name: behind a colon unless it is text."""
+    pairs = (one.partition(":") for one in columns.split())
+    return {name: kind or "text" for name, _, kind in pairs}
+
+
 _ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when:time"
 TABLES: Final = (
     Table(
         "parameters",
-        f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
-        "determined:truth archives:count samples:count condition:number relative_error:number "
-        "unseen_relative_error:number method warnings estimator settings code software "
-        "covariance:numbers",
+        _kinds(
+            f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
+            "determined:truth archives:count samples:count condition:number relative_error:number "
+            "unseen_relative_error:number method warnings estimator settings code software "
+            "covariance:numbers"
+        ),
         _parameter_rows,
     ),
     Table(
         "axes",
-        f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
-        "unseen_torque_rms:number unseen_error_rms:number",
+        _kinds(
+            f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
+            "unseen_torque_rms:number unseen_error_rms:number"
+        ),
         _axis_rows,
     ),
-    Table("not_used", "path kind reason", _unused_rows),
+    Table("not_used", _kinds("path kind reason"), _unused_rows),
 )
 
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
-    columns = table.csv_columns
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([_as_text(row[name]) for name in columns] for row in table.rows(result))
-
-
-def _as_text(value: Any) -> Any:
     """Numbers in full precision; time in ISO 8601; nothing for what is not known."""
-    if isinstance(value, datetime):
-        return value.isoformat()
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return "" if value is None else _clean(value)
+
+    def text(value: Any) -> Any:
+        if isinstance(value, datetime):
+            return value.isoformat()
+        return str(value).lower() if isinstance(value, bool) else _clean(value)
+
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table.csv_columns)
+        writer.writerows(
+            [text(row[name]) for name in table.csv_columns] for row in table.rows(result)
+        )
 
 
 def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
@@ -212,10 +209,7 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
         metadata={"hil": json.dumps(facts)},
     )
     rows = ({name: _clean(value) for name, value in row.items()} for row in table.rows(result))
-    with (
-        replacing(path) as temporary,
-        pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd") as writer,
-    ):
+    with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
         while portion := list(islice(rows, _PORTION)):
             writer.write_table(pyarrow.Table.from_pylist(portion, schema=schema))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +19,10 @@ Array = NDArray[np.float64]
 
 Level = Literal["repetition", "campaign", "pooled"]
 BatchEstimator = Literal["auto", "wls", "ols", "prior", "consistent"]
-
-ESTIMATORS: Final[tuple[BatchEstimator, ...]] = get_args(BatchEstimator)
 """The estimators that need factors only, and no sample."""
 
-
-class TornError(ArchiveError):
-    """An archive that is not whole; a batch uses none in part."""
-
-    def __init__(self, location: str, damage: str) -> None:
-        super().__init__(location, damage, remedy=f"hil archive repair {location}")
+Stamp = tuple[int, ...]
+"""What changes when a file is written to: size, times [ns], inode."""
 
 
 class ChangedError(ArchiveError):
@@ -36,14 +30,6 @@ class ChangedError(ArchiveError):
 
     def __init__(self, location: str) -> None:
         super().__init__(location, "was changed while it was read", remedy="run the batch again")
-
-
-class UnavailableError(InputError):
-    """An address that cannot be read now, for reasons that are not those of its content."""
-
-
-class NothingToFitError(InputError):
-    """A batch without one archive that can be fitted."""
 
 
 class CacheError(InputError):
@@ -64,15 +50,6 @@ class GroupKey(NamedTuple):
     setup: str = ""
 
 
-class FileStamp(NamedTuple):
-    """What changes when a file is written to, as the file system says it."""
-
-    size: int
-    mtime_ns: int
-    ctime_ns: int
-    inode: int
-
-
 @dataclass(frozen=True, slots=True)
 class ArchiveRef:
     """One archive: where it lies, and what it is, without its samples.
@@ -81,15 +58,12 @@ class ArchiveRef:
         location: path or URL.
         sha256: of all bytes.
         use: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of
-            an archive that a batch does not use.
-        arm: see :class:`GroupKey`; "" for an archive that a batch does not use, as all that its
-            cell says.
-        campaign: see :class:`GroupKey`.
+            an archive that a batch does not use; of such a one `arm` and `cell` are "".
+        arm, campaign, setup: see :class:`GroupKey`.
         index: of the interval within its kind; 0 for imported ones.
         cell: digest of the texts of cell file and URDF.
         motion: digest of the planned motion, "" where none is known.
         when: time of recording, ISO 8601; "" in simulation.
-        setup: see :class:`GroupKey`.
         belief: digest of what the cell's `[nominal]` says of the arm.
         stamp: of the file when it was hashed; None of a remote one.
         kind: as its metadata say.
@@ -110,7 +84,7 @@ class ArchiveRef:
     when: str = ""
     setup: str = ""
     belief: str = ""
-    stamp: FileStamp | None = None
+    stamp: Stamp | None = None
     kind: str = ""
     attempt: int = 0
     outcome: str = "completed"
@@ -141,26 +115,15 @@ class Broken(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """The estimate from one archive alone.
-
-    Attributes:
-        estimate: with cluster-robust covariance.
-        design_effect: by how much its mean variance is that of white residuals.
-    """
-
-    estimate: Estimate
-    design_effect: float
-
-
-@dataclass(frozen=True, eq=False)
 class Summary:
     """What is cached of each archive beside the sum of all.
 
     Attributes:
         ref: the archive.
         total: its factor as one block.
-        fits: by weighting, "weighted" and "ordinary"; none of a validation run.
+        fits: the estimate from it alone, with cluster-robust covariance, by weighting: "weighted"
+            and "ordinary"; none of a validation run.
+        design_effects: by how much the mean variance of each is that of white residuals.
         warnings: what a reader must know of it.
         products: (n, p, p + 1), see
             :func:`identification.estimators.delay.rate_products`; None where the delay
@@ -169,7 +132,8 @@ class Summary:
 
     ref: ArchiveRef
     total: PhaseFactor
-    fits: Mapping[str, Fit]
+    fits: Mapping[str, Estimate]
+    design_effects: Mapping[str, float]
     warnings: tuple[str, ...] = ()
     products: Array | None = None
 
@@ -183,7 +147,6 @@ class Bundle:
         summaries: of those that could be read, in their order.
         phase: sum of the factors of those that are fitted; None where none is.
         broken: the others.
-        lasting: whether those would be broken another time as well, as long as they stay the same.
         read: archives that were read for it; the rest comes from the cache.
     """
 
@@ -191,18 +154,12 @@ class Bundle:
     summaries: tuple[Summary, ...] = ()
     phase: PhaseFactor | None = None
     broken: tuple[Broken, ...] = ()
-    lasting: bool = True
     read: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A robot that archives belong to.
-
-    Attributes:
-        digest: see :class:`GroupKey`.
-        cell: of one of its archives.
-    """
+    """A robot that archives belong to: its digest, see :class:`GroupKey`, and one of its cells."""
 
     digest: str
     cell: Cell
@@ -217,28 +174,21 @@ class Arm:
 class LevelEstimate:
     """Parameters from one repetition, one campaign, or all campaigns of an arm.
 
+    Names, units, values, noise, samples, condition and method are those of
+    :class:`identification.factor.factor.Estimate`.
+
     Attributes:
         level: which of these.
         arm: digest of the arm, a key of `BatchResult.arms`.
         campaign: folder; "" if pooled.
-        archive: location of the archive of a repetition; "" otherwise.
-        sha256: of the archive of a repetition; "" otherwise.
+        archive, sha256: location and digest of the archive of a repetition; "" otherwise.
         when: time of the (first) recording, ISO 8601, "" if unknown.
         repetitions: archives that were fitted.
-        names: of the parameters (p,).
-        units: (p,).
-        values: (p,).
         std: (p,), infinite where undetermined.
         covariance: (p, p); None for a repetition, of which there may be very many.
-        interval_factor: standard deviations in half a 95 % interval.
-        samples: fitted rows per joint (n,).
-        noise_std: of the torque residual per joint (n,) [N·m or N].
-        torque_rms: of the fitted rows per joint (n,).
+        torque_rms: of the fitted rows per joint (n,) [N·m or N].
         unseen_rms: torque error per joint (n,) on the campaign's validation runs; NaN if none.
         unseen_torque_rms: torque per joint (n,) there; NaN if none.
-        condition: of the scaled regressor.
-        undetermined: names.
-        method: in words.
         settings: digest of the settings; "" where campaigns with different ones are pooled.
         warnings: what a reader must know.
         speed_rms: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition.
@@ -296,7 +246,7 @@ class BatchResult:
         code: digest of the programs.
     """
 
-    estimator: BatchEstimator
+    estimator: str
     arms: Mapping[str, Arm]
     repetitions: tuple[LevelEstimate, ...]
     campaigns: tuple[LevelEstimate, ...]

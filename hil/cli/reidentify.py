@@ -6,7 +6,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -14,11 +13,11 @@ from typing import Annotated, Any, Final
 import typer
 
 from hil.batch import run
-from hil.batch.cache import code_digest
+from hil.batch.cache import Where
 from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
-from hil.batch.types import Arm, BatchEstimator, BatchResult, Broken, LevelEstimate
-from hil.batch.workers import TIMEOUT, LocalWorkers, Workers
+from hil.batch.types import BatchEstimator, BatchResult, Broken, LevelEstimate
+from hil.batch.workers import LocalWorkers, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.cli.identify_options import (
     BandwidthOption,
@@ -31,169 +30,14 @@ from hil.cli.identify_options import (
 )
 from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
 from hil.files import make_folder, write_atomically, writing_to
-from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
 
-_MOST_LINES: Final = 20
-_WIDTH: Final = 42
-
-
-def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
-    """Each arm: its campaigns, what changed, and what to know of the numbers."""
-    by_name = {one.name: one for one in found.arms}
-    above = _above([one.campaign for one in result.campaigns])
-    if above:
-        yield f"below {above}"
-    for digest, arm in result.arms.items():
-        campaigns = [one for one in result.campaigns if one.arm == digest]
-        pooled = [one for one in result.pooled if one.arm == digest]
-        yield from _arm_lines(arm, campaigns, pooled, by_name.get(arm.name), above)
-
-
-def alarm_lines(found: Trends) -> Iterator[str]:
-    """Only what is to be looked into."""
-    for arm in found.arms:
-        for finding in findings(arm):
-            if finding.level == "alarm":
-                yield f"{arm.name}: {finding.words}"
-
-
-def _arm_lines(
-    arm: Arm,
-    campaigns: Sequence[LevelEstimate],
-    pooled: Sequence[LevelEstimate],
-    trend: ArmTrend | None,
-    above: str,
-) -> Iterator[str]:
-    verdict = "no campaign could be estimated" if trend is None else summary(trend)
-    yield f"{arm.name}: {verdict}"
-    if campaigns:
-        yield (
-            f"  {'campaign':<{_WIDTH}}{'recorded':<12}{'repetitions':>11}"
-            f"{'torque error':>14}{'on unseen motion':>18}"
-        )
-    shown = campaigns[-_MOST_LINES:]
-    if len(campaigns) > len(shown):
-        yield f"  … {len(campaigns) - len(shown)} more: see --output and --json"
-    several = len({one.setup for one in campaigns}) > 1
-    for before, one in zip([None, *shown], shown, strict=False):
-        if several and (before is None or before.setup != one.setup):
-            yield f"    stated: {one.setup or 'nothing'}"
-        yield _campaign_line(one, above)
-    for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
-        yield f"  note: {warning}"
-    if trend is not None:
-        for finding in findings(trend):
-            if finding.level == "alarm":
-                yield f"  ! {finding.words} {finding.next_step}".rstrip()
-            elif len(trend.campaigns) > 1:
-                earlier = "earlier: " if finding.level == "past" else ""
-                yield f"  {earlier}{finding.words}"
-
-
-def _campaign_line(one: LevelEstimate, above: str) -> str:
-    room = _WIDTH - 2
-    name = one.campaign.removeprefix(above)
-    name = name if len(name) <= room else "…" + name[1 - room :]
-    fitted = _share(relative_error(one.noise_std, one.torque_rms, one.samples))
-    unseen = _share(relative_error(one.unseen_rms, one.unseen_torque_rms))
-    return (
-        f"  {name:<{_WIDTH}}{one.when[:10] or 'unknown':<12}{one.repetitions:>11}"
-        f"{fitted:>14}{unseen:>18}"
-    )
-
-
-def _above(folders: Sequence[str]) -> str:
-    """The folder that all of them are in, with its slash; "" if there is none or only one."""
-    if len(set(folders)) < 2:
-        return ""
-    parts = zip(*(folder.split("/")[:-1] for folder in folders), strict=False)
-    shared = [same[0] for same in takewhile(lambda same: len(set(same)) == 1, parts)]
-    return "/".join([*shared, ""]) if shared else ""
-
-
-def _share(error: float) -> str:
-    return "-" if math.isnan(error) else f"{error:.1%}"
-
-
-def skipped_line(skipped: Sequence[Broken]) -> str:
-    """How many archives were left alone, by reason; "" for none."""
-    if not skipped:
-        return ""
-    counts = Counter(_kind(one.reason) for one in skipped)
-    reasons = "; ".join(
-        f"{count}: {reason}" if " " in reason else plural(count, reason)
-        for reason, count in counts.most_common()
-    )
-    return f"left alone, as not meant to be fitted: {reasons}"
-
-
-def _kind(reason: str) -> str:
-    """A reason without the archive that it names or the number that it counts."""
-    short = re.sub(r"^is an? (?=\w+$)", "", reason)
-    short = re.sub(r"\S*(/|\.mcap)\S*", "another", short)
-    return re.sub(r"^attempt \d+ ", "a later attempt ", short)
-
-
-def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:
-    """The same for a program."""
-    trends = {one.name: _trend(one) for one in found.arms}
-    return {
-        "estimator": result.estimator,
-        "arms": {
-            arm.name: {
-                "campaigns": _campaigns([one for one in result.campaigns if one.arm == digest]),
-                "pooled": next((_level(o) for o in result.pooled if o.arm == digest), None),
-                "trend": trends.get(arm.name),
-            }
-            for digest, arm in result.arms.items()
-        },
-        "read": result.read,
-        "cached": result.cached,
-        "broken": [one._asdict() for one in result.broken],
-        "skipped": [one._asdict() for one in result.skipped],
-        "written": [str(path) for path in written],
-    }
-
-
-def _campaigns(levels: Sequence[LevelEstimate]) -> dict[str, Any]:
-    """By folder, and where one folder holds several, by what their cells state as well."""
-    folders = Counter(one.campaign for one in levels)
-    return {
-        one.campaign if folders[one.campaign] == 1 else f"{one.campaign} ({one.setup})": _level(one)
-        for one in levels
-    }
-
-
-def _level(one: LevelEstimate) -> dict[str, Any]:
-    return {
-        "when": one.when or None,
-        "setup": one.setup,
-        "repetitions": one.repetitions,
-        "method": one.method,
-        "parameters": {
-            name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
-            for name, value, std in zip(one.names, one.values, one.std, strict=True)
-        },
-        "warnings": list(one.warnings),
-    }
-
-
-def _trend(arm: ArmTrend) -> dict[str, Any]:
-    return {
-        "summary": summary(arm),
-        "dated": arm.dated,
-        "undated": list(arm.undated),
-        "findings": [
-            {"level": one.level, "words": one.words, "next_step": one.next_step}
-            for one in findings(arm)
-        ],
-    }
-
-
 SOME_BROKEN: Final = 5
 """Exit status: done, but some archives could not be used."""
+
+_MOST_LINES: Final = 20
+_WIDTH: Final = 42
 
 
 def reidentify(
@@ -233,22 +77,19 @@ def reidentify(
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
-    keep = cache != "none"
-    plan = run.Plan(
-        options_from(
-            delay=delay,
-            torque_bandwidth=torque_bandwidth,
-            estimator=estimator,
-            bandwidth=bandwidth,
-            velocity=velocity,
-            friction=friction,
-            standstill=standstill,
-        ),
-        cache=Path(cache) if keep and cache is not None else None,
-        keep=keep,
+    options = options_from(
+        delay=delay,
+        torque_bandwidth=torque_bandwidth,
+        estimator=estimator,
+        bandwidth=bandwidth,
+        velocity=velocity,
+        friction=friction,
+        standstill=standstill,
     )
+    keep = cache != "none"
+    where = Where(str(Path(cache).resolve()) if keep and cache else None, keep)
     with _workers(dask, workers, places) as hands:
-        result = run.reidentify(places, plan, hands, reporter)
+        result = run.reidentify(places, options, hands, reporter, where=where)
     found = trends(result)
     written: list[Path] = []
     if output is not None:
@@ -261,19 +102,31 @@ def reidentify(
     if json:
         print_json(as_dict(result, found, written))
     else:
-        _say(result, found, written, reporter, quiet=quiet)
+        for line in alarm_lines(found) if quiet else result_lines(result, found):
+            typer.echo(printable(line))
+        if written:
+            names = ", ".join(path.name for path in written)
+            reporter.say(f"written to {written[0].parent}: {names}")
+        for line in unused_lines(result.broken):
+            typer.echo(printable(line), err=True)
+        if result.skipped and not quiet:
+            typer.echo(printable(skipped_line(result.skipped)))
+        typer.echo(
+            f"{plural(len(result.repetitions), 'repetition')} in "
+            f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
+            f"{plural(result.read, 'archive')} read, {result.cached} known, "
+            f"{len(result.skipped)} left alone, {len(result.broken)} broken"
+        )
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
 
 
-def _workers(
-    address: str | None, count: int | None, places: Sequence[str]
-) -> AbstractContextManager[Workers]:
+def _workers(address: str | None, count: int | None, places: Sequence[str]) -> Workers:
     if address is None:
         return LocalWorkers(count)
     from hil.batch.cluster import DaskWorkers  # an extra
 
-    hands = DaskWorkers(address, identity=code_digest, timeout=TIMEOUT)
+    hands = DaskWorkers(address)
     try:
         hands.require_folders([Path(place) for place in places if "://" not in place])
     except BaseException:
@@ -282,23 +135,141 @@ def _workers(
     return hands
 
 
-def _say(
-    result: BatchResult, found: Trends, written: Sequence[Path], reporter: Reporter, *, quiet: bool
-) -> None:
-    for line in alarm_lines(found) if quiet else result_lines(result, found):
-        typer.echo(printable(line))
-    if written:
-        names = ", ".join(path.name for path in written)
-        reporter.say(f"written to {written[0].parent}: {names}")
-    for one in result.broken[:_MOST_LINES]:
-        typer.echo(printable(f"{one.path} could not be used: {one.reason}"), err=True)
-    if (more := len(result.broken) - _MOST_LINES) > 0:
-        typer.echo(f"and {more} more: see --output and --json", err=True)
-    if result.skipped and not quiet:
-        typer.echo(printable(skipped_line(result.skipped)))
-    typer.echo(
-        f"{plural(len(result.repetitions), 'repetition')} in "
-        f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
-        f"{plural(result.read, 'archive')} read, {result.cached} known, "
-        f"{len(result.skipped)} left alone, {len(result.broken)} broken"
+def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
+    """Each arm: its campaigns, what changed, and what to know of the numbers."""
+    by_name = {one.name: one for one in found.arms}
+    above = _above([one.campaign for one in result.campaigns])
+    if above:
+        yield f"below {above}"
+    for digest, arm in result.arms.items():
+        trend = by_name.get(arm.name)
+        yield f"{arm.name}: {'no campaign could be estimated' if trend is None else summary(trend)}"
+        yield from _campaign_lines([one for one in result.campaigns if one.arm == digest], above)
+        pooled = [one for one in result.pooled if one.arm == digest]
+        for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
+            yield f"  note: {warning}"
+        for finding in [] if trend is None else findings(trend):
+            if finding.level == "alarm":
+                yield f"  ! {finding.words} {finding.next_step}".rstrip()
+            elif trend is not None and len(trend.campaigns) > 1:
+                yield f"  {'earlier: ' if finding.level == 'past' else ''}{finding.words}"
+
+
+def alarm_lines(found: Trends) -> Iterator[str]:
+    """Only what is to be looked into."""
+    for arm in found.arms:
+        for finding in findings(arm):
+            if finding.level == "alarm":
+                yield f"{arm.name}: {finding.words}"
+
+
+def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[str]:
+    """A table of the last ones, with the payload and delay that they state where these differ."""
+
+    def row(name: str, when: str, repetitions: object, fitted: str, unseen: str) -> str:
+        short = name if len(name) <= _WIDTH - 2 else "…" + name[3 - _WIDTH :]
+        return f"  {short:<{_WIDTH}}{when:<12}{repetitions:>11}{fitted:>14}{unseen:>18}"
+
+    def share(error: float) -> str:
+        return "-" if math.isnan(error) else f"{error:.1%}"
+
+    if campaigns:
+        yield row("campaign", "recorded", "repetitions", "torque error", "on unseen motion")
+    if (more := len(campaigns) - _MOST_LINES) > 0:
+        yield f"  … {more} more: see --output and --json"
+    stated = None
+    for one in campaigns[-_MOST_LINES:]:
+        if one.setup != stated and len({other.setup for other in campaigns}) > 1:
+            yield f"    stated: {one.setup or 'nothing'}"
+        stated = one.setup
+        yield row(
+            one.campaign.removeprefix(above),
+            one.when[:10] or "unknown",
+            one.repetitions,
+            share(relative_error(one.noise_std, one.torque_rms, one.samples)),
+            share(relative_error(one.unseen_rms, one.unseen_torque_rms)),
+        )
+
+
+def _above(folders: Sequence[str]) -> str:
+    """The folder that all of them are in, with its slash; "" if there is none or only one."""
+    if len(set(folders)) < 2:
+        return ""
+    parts = zip(*(folder.split("/")[:-1] for folder in folders), strict=False)
+    shared = [same[0] for same in takewhile(lambda same: len(set(same)) == 1, parts)]
+    return "/".join([*shared, ""]) if shared else ""
+
+
+def unused_lines(broken: Sequence[Broken]) -> Iterator[str]:
+    """The first of what could not be used, and why."""
+    for one in broken[:_MOST_LINES]:
+        yield f"{one.path} could not be used: {one.reason}"
+    if (more := len(broken) - _MOST_LINES) > 0:
+        yield f"and {more} more: see --output and --json"
+
+
+def skipped_line(skipped: Sequence[Broken]) -> str:
+    """How many archives were left alone, by reason without the archive or number it names."""
+    counts: Counter[str] = Counter()
+    for one in skipped:
+        short = re.sub(r"^is an? (?=\w+$)", "", one.reason)
+        short = re.sub(r"\S*(/|\.mcap)\S*", "another", short)
+        counts[re.sub(r"^attempt \d+ ", "a later attempt ", short)] += 1
+    reasons = "; ".join(
+        f"{count}: {reason}" if " " in reason else plural(count, reason)
+        for reason, count in counts.most_common()
     )
+    return f"left alone, as not meant to be fitted: {reasons}"
+
+
+def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:
+    """The same for a program; campaigns by folder, and by what is stated where one has several."""
+    trends = {one.name: _trend(one) for one in found.arms}
+    folders = Counter((one.arm, one.campaign) for one in result.campaigns)
+    return {
+        "estimator": result.estimator,
+        "arms": {
+            arm.name: {
+                "campaigns": {
+                    one.campaign
+                    + (f" ({one.setup})" if folders[digest, one.campaign] > 1 else ""): _level(one)
+                    for one in result.campaigns
+                    if one.arm == digest
+                },
+                "pooled": next((_level(o) for o in result.pooled if o.arm == digest), None),
+                "trend": trends.get(arm.name),
+            }
+            for digest, arm in result.arms.items()
+        },
+        "read": result.read,
+        "cached": result.cached,
+        "broken": [one._asdict() for one in result.broken],
+        "skipped": [one._asdict() for one in result.skipped],
+        "written": [str(path) for path in written],
+    }
+
+
+def _level(one: LevelEstimate) -> dict[str, Any]:
+    return {
+        "when": one.when or None,
+        "setup": one.setup,
+        "repetitions": one.repetitions,
+        "method": one.method,
+        "parameters": {
+            name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
+            for name, value, std in zip(one.names, one.values, one.std, strict=True)
+        },
+        "warnings": list(one.warnings),
+    }
+
+
+def _trend(arm: ArmTrend) -> dict[str, Any]:
+    return {
+        "summary": summary(arm),
+        "dated": arm.dated,
+        "undated": list(arm.undated),
+        "findings": [
+            {"level": one.level, "words": one.words, "next_step": one.next_step}
+            for one in findings(arm)
+        ],
+    }

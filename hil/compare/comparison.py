@@ -157,9 +157,7 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
         _require_campaigns_of_one_arm(found)
         refs.extend(found)
 
-    result = run.reidentify(
-        roots, run.Plan(Options(estimator="wls")), workers, reporter, check=check
-    )
+    result = run.reidentify(roots, Options(estimator="wls"), workers, reporter, check=check)
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
         why = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])

@@ -127,10 +127,7 @@ def _time_bases(sources: Sources) -> list[str]:
     notes = []
     for source in (*sources.training, *sources.held_out):
         if source.merged:
-            notes.append(
-                f"{source.name}: {source.merged} samples had the time stamp of the one before and "
-                "were averaged with it"
-            )
+            notes.append(f"{source.name}: {source.merged_words}")
         notes += [f"{source.name}: {line}" for line in source.clock]
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:

@@ -60,6 +60,13 @@ class Source:
     retimed: bool = False
     context: tuple[Recording, int] | None = None
 
+    @property
+    def merged_words(self) -> str:
+        """What was done about repeated time stamps."""
+        return (
+            f"{self.merged} samples had the time stamp of the one before and were averaged with it"
+        )
+
     def changed(self, change: Callable[[Recording], Recording]) -> Source:
         """The source with its recording, and the context of it, changed alike row by row."""
         context = self.context

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive
-from hil.batch.run import Plan, reidentify
+from hil.batch.cache import Where
+from hil.batch.run import reidentify
 from hil.batch.workers import Workers
 from hil.compare import gather
 from hil.errors import HilError, InputError
@@ -200,7 +201,7 @@ def _by_archive(
     root: Path, workers: Workers
 ) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
     """Estimates of a batch by archive or "" for all, and what it says."""
-    result = reidentify([str(root)], Plan(FIXED, keep=False), workers, Silent())
+    result = reidentify([str(root)], FIXED, workers, Silent(), where=Where(keep=False))
     found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
     found[""] = (result.pooled[0].values, result.pooled[0].std)
     said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]

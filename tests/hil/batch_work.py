@@ -11,11 +11,6 @@ from hil.batch.workers import ArchiveTask
 from hil.errors import ArchiveError
 
 
-def identity() -> str:
-    """Digest of the code, of a worker that has other code where its environment says so."""
-    return os.environ.get("TEST_IDENTITY", "the code of the test")
-
-
 def number(k: int) -> int:
     return k
 

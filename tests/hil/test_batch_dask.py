@@ -15,7 +15,7 @@ import pytest
 from hil.archive import container
 from hil.batch import cluster as dask_cluster
 from hil.batch import run
-from hil.batch.cache import code_digest
+from hil.batch.cache import Where
 from hil.batch.cluster import (
     ClusterError,
     DaskWorkers,
@@ -61,7 +61,7 @@ def pair(cluster: Cluster) -> Cluster:
 
 
 def connected(cluster: Cluster, timeout: float = PATIENCE, patience: float = PATIENCE):
-    return DaskWorkers(cluster.address, identity=work.identity, timeout=timeout, patience=patience)
+    return DaskWorkers(cluster.address, timeout=timeout, patience=patience)
 
 
 def tasks_of(function: Any, count: int) -> list[Any]:
@@ -147,21 +147,14 @@ class TestWorkers:
     def test_with_other_code_are_refused(
         self, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setenv("TEST_IDENTITY", "other code")  # here, and not on the workers
-        with pytest.raises(
-            ClusterError, match=r"worker tcp://.* \(hil the code of .* instead of other"
-        ):
+        monkeypatch.setattr(dask_cluster, "code_digest", lambda: "other code")  # here alone
+        with pytest.raises(ClusterError, match=r"worker tcp://.* \(hil \w+ instead of other code"):
             connected(cluster)
 
     def test_with_other_code_that_join_later_compute_nothing(self) -> None:
-        expected = software(work.identity) | {"hil": "other code"}
-        with pytest.raises(WorkerSoftwareError, match=r"hil the code of .* instead of other code"):
-            perform(
-                work.task(work.number, 0),
-                timeout=PATIENCE,
-                identity=work.identity,
-                expected=expected,
-            )
+        expected = software() | {"hil": "other code"}
+        with pytest.raises(WorkerSoftwareError, match=r"hil \w+ instead of other code"):
+            perform(work.task(work.number, 0), timeout=PATIENCE, expected=expected)
         release_children()
 
     @pytest.mark.slow
@@ -175,7 +168,7 @@ class TestWorkers:
 
 def test_nobody_at_the_address_is_an_error_with_the_address() -> None:
     with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"):
-        DaskWorkers("tcp://127.0.0.1:9", identity=work.identity, patience=1.0)
+        DaskWorkers("tcp://127.0.0.1:9", patience=1.0)
 
 
 def test_a_scheduler_without_workers_is_an_error(
@@ -198,14 +191,14 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     """Two campaigns, distinguished by a record that no estimate reads."""
     for number in range(2):
         _copy_with_mark(campaign.folder.root, tmp_path / "data" / f"{number}", f"copy {number}")
-    plan, roots = run.Plan(FIXED, keep=False), [str(tmp_path / "data")]
-    hands = DaskWorkers(pair.address, identity=code_digest, patience=PATIENCE)
+    roots, where = [str(tmp_path / "data")], Where(keep=False)
+    hands = DaskWorkers(pair.address, patience=PATIENCE)
     with _KillsOne(hands, pair.workers[0]) as workers:
-        found = run.reidentify(roots, plan, workers, Silent())
+        found = run.reidentify(roots, FIXED, workers, Silent(), where=where)
     assert pair.workers[0].wait(1.0) == -9
     assert pair.workers[1].poll() is None
     with LocalWorkers(1) as workers:
-        expected = run.reidentify(roots, plan, workers, Silent())
+        expected = run.reidentify(roots, FIXED, workers, Silent(), where=where)
     assert not found.broken
     assert len(found.campaigns) == 2
     assert _figures(found) == _figures(expected)
@@ -215,14 +208,15 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
 def test_archives_behind_a_web_server_are_read_by_the_workers(
     campaign: Campaign, cluster: Cluster
 ) -> None:
-    plan = run.Plan(FIXED, keep=False)
+    where = Where(keep=False)
     with (
         served(campaign.folder.root) as address,
-        DaskWorkers(cluster.address, identity=code_digest, patience=PATIENCE) as workers,
+        DaskWorkers(cluster.address, patience=PATIENCE) as workers,
     ):
-        found = run.reidentify([address], plan, workers, Silent())
+        found = run.reidentify([address], FIXED, workers, Silent(), where=where)
     with LocalWorkers(1) as local:
-        expected = run.reidentify([str(campaign.folder.root)], plan, local, Silent())
+        roots = [str(campaign.folder.root)]
+        expected = run.reidentify(roots, FIXED, local, Silent(), where=where)
     assert not found.broken
     assert [values for _, values in _figures(found)] == [values for _, values in _figures(expected)]
 
@@ -245,7 +239,7 @@ class _KillsOne(Workers):
 
     def results(self, tasks: Sequence[Any], done: Any = None) -> Iterator[Any]:
         """The work on archives."""
-        begun = any(task.function is run.added_up for task in tasks)
+        begun = any(task.function is run.reduced for task in tasks)
 
         def killing(count: int) -> None:
             if begun:
@@ -298,7 +292,7 @@ def test_nothing_of_dask_is_imported_before_it_is_asked_for() -> None:
 def test_without_dask_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
-        DaskWorkers("tcp://127.0.0.1:9", identity=work.identity)
+        DaskWorkers("tcp://127.0.0.1:9")
 
 
 def both(workers: DaskWorkers) -> None:

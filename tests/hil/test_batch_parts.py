@@ -1,22 +1,20 @@
-"""Parts of a batch by themselves: cache, sums, keys, workers, tables, and remote files."""
+"""Parts of a batch by themselves: cache, keys, workers, tables, and remote files."""
 
 from __future__ import annotations
 
 import csv
-import http.server
 import json
 import math
 import os
 import re
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -48,9 +46,8 @@ from hil.batch.types import (
     Broken,
     CacheError,
     LevelEstimate,
-    UnavailableError,
 )
-from hil.batch.workers import ArchiveTask, LocalWorkers, TreeSum
+from hil.batch.workers import ArchiveTask, LocalWorkers
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
 from hil.errors import InputError
@@ -71,28 +68,6 @@ KEY = "0123456789abcdef"
 def a_ref(index: int, campaign: str = "/data/one") -> ArchiveRef:
     name = f"{campaign}/archives/excitation_{index:03d}_a1.mcap"
     return ArchiveRef(name, f"{index:064x}", "excitation", "arm", campaign, index, "cell", "motion")
-
-
-class TestTreeSum:
-    @given(st.lists(st.none() | st.floats(-1e6, 1e6), max_size=600))
-    def test_adds_runs_of_eight_then_their_sums(self, terms: list[float | None]) -> None:
-        """To the last bit, whoever adds which run."""
-        expected = terms
-        while len(expected) > 1:
-            runs = [expected[k : k + 8] for k in range(0, len(expected), 8)]
-            present = [[term for term in run if term is not None] for run in runs]
-            expected = [None if not run else sum(run[1:], run[0]) for run in present]
-        total = expected[0] if terms else None
-        assert TreeSum(terms).result() == total
-        far = TreeSum[float]()
-        for k in range(0, len(terms), 8):
-            far.add(TreeSum(terms[k : k + 8]).result(), 1)
-        assert far.result() == total
-
-    def test_holds_one_sum_per_level(self) -> None:
-        sums = TreeSum(1.0 for _ in range(8**4 + 5))
-        assert len(sums._levels) == 5
-        assert sums.result() == 8**4 + 5
 
 
 @given(st.permutations(range(40)))
@@ -458,11 +433,6 @@ CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.
 ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
 
 
-@pytest.fixture(autouse=True)
-def _patient_for_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote, "_PAUSES", (0.0, 0.0))
-
-
 @pytest.fixture(scope="module")
 def store_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("store")
@@ -541,67 +511,7 @@ def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, mess
         pass
 
 
-class _Busy(http.server.SimpleHTTPRequestHandler):
-    """Refuses the first so many requests for a file."""
-
-    refusals: ClassVar[list[int]] = []
-    asked: ClassVar[list[str]] = []
-
-    def do_GET(self) -> None:
-        self.asked.append(self.path)
-        if self.refusals:
-            self.send_error(self.refusals.pop())
-        else:
-            super().do_GET()
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@pytest.fixture
-def busy(store_folder: Path) -> Iterator[str]:
-    _Busy.asked.clear()
-    handler = partial(_Busy, directory=str(store_folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
-
-
-def test_a_server_that_is_busy_is_asked_again(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_Busy, "refusals", [503, 429])
-    with local_file(f"{busy}/{ARCHIVES[0]}") as path:
-        assert path.read_bytes() == CONTENT[ARCHIVES[0]]
-    assert len(_Busy.asked) == 3
-
-
-def test_a_server_that_stays_busy_is_given_up(busy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_Busy, "refusals", [503] * 10)
-    with pytest.raises(UnavailableError, match="503"), local_file(f"{busy}/{ARCHIVES[0]}"):
-        pass
-    assert len(_Busy.asked) == 3
-
-
-def test_what_a_server_does_not_give_is_asked_for_once(
-    busy: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(_Busy, "refusals", [403])
-    with pytest.raises(UnavailableError, match="403"), local_file(f"{busy}/{ARCHIVES[0]}"):
-        pass
-    with pytest.raises(UnavailableError, match="not there"), local_file(f"{busy}/absent.mcap"):
-        pass
-    assert len(_Busy.asked) == 2
-
-
 def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         archives_below("memory://store")
-
-
-def test_a_path_is_no_address() -> None:
-    assert is_url("s3://bucket/campaign")
-    assert not is_url("/data/campaign")
-    assert not is_url("C:/data")
