@@ -44,11 +44,11 @@ _SPREAD_ROWS: Final = 200
 
 
 class Spread(NamedTuple):
-    """How far variants differ in torque, per joint (n,) [N·m or N], over the recorded motion.
+    """Standard deviation of torque per joint (n,) [N·m or N] over the recorded motion.
 
     Attributes:
-        variants: standard deviation of their torque.
-        covariance: that which the covariance of the parameters predicts.
+        variants: of the variants.
+        covariance: as the covariance of the parameters predicts it.
     """
 
     variants: Array
@@ -57,16 +57,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """What was written.
-
-    Attributes:
-        path: of the file.
-        joint_names: (n,).
-        units: of torque, per joint.
-        comparison: with the model; in words why there is none.
-        spread: of the ensemble; None without one.
-        verdict: on the model, in a sentence.
-    """
+    """What was written, in `units` of torque per joint; in words why there is no comparison."""
 
     path: Path
     joint_names: tuple[str, ...]
@@ -77,42 +68,39 @@ class Exported:
 
     def lines(self) -> list[str]:
         """What a person reads."""
+
+        def row(torque: Array) -> str:
+            unit = " or ".join(sorted(set(self.units)))
+            return f"{', '.join(f'{one:.3g}' for one in torque)} {unit}"
+
         lines = [f"written: {self.path}"]
         if isinstance(self.comparison, str):
             lines.append(f"warning: not read back: {self.comparison}")
         else:
-            lines.append(
+            lines += [
                 f"read back: at {STATES} random states what the format holds differs by"
-                f" {self.comparison.difference:.1e} of a joint's largest torque"
-            )
-            for words, torque in self.comparison.left_out.items():
-                lines.append(f"left out: {words}: {self._row(torque)} rms")
-            lines.append(
-                f"whole torque of the recorded motion: {self._row(self.comparison.torque)}"
-            )
+                f" {self.comparison.difference:.1e} of a joint's largest torque",
+                *(f"left out: {k}: {row(v)} rms" for k, v in self.comparison.left_out.items()),
+                f"whole torque of the recorded motion: {row(self.comparison.torque)}",
+            ]
         if self.spread is not None:
-            lines.append(f"torque of the variants: ± {self._row(self.spread.variants)} (std);")
-            lines.append(f"as the covariance predicts: ± {self._row(self.spread.covariance)}")
+            lines.append(f"torque of the variants: ± {row(self.spread.variants)} (std);")
+            lines.append(f"as the covariance predicts: ± {row(self.spread.covariance)}")
         return [*lines, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
         """The same for JSON."""
-        why = self.comparison if isinstance(self.comparison, str) else None
         compared = None if isinstance(self.comparison, str) else self.comparison
         return {
             "path": str(self.path),
             "joints": [*self.joint_names],
             "read_back": compared and compared.difference,
-            "not_read_back": why,
+            "not_read_back": self.comparison if compared is None else None,
             "left_out": {k: v.tolist() for k, v in compared.left_out.items()} if compared else {},
             "torque": compared and compared.torque.tolist(),
             "spread": self.spread and {k: v.tolist() for k, v in self.spread._asdict().items()},
             "verdict": self.verdict,
         }
-
-    def _row(self, torque: Array) -> str:
-        figures = ", ".join(f"{one:.3g}" for one in torque)
-        return f"{figures} {' or '.join(sorted(set(self.units)))}"
 
 
 def consistent_of(found: Identification) -> ConsistentEstimate:
@@ -132,42 +120,38 @@ def consistent_of(found: Identification) -> ConsistentEstimate:
 
 def arm_of(cell: Cell, consistent: ConsistentEstimate) -> Arm:
     """The identified arm within the limits of its cell, or those of its URDF."""
-    model, stated = cell.model, urdf_limits(cell.urdf, cell.joint_names)
-    limits, efforts = cell.file.limits, cell.torque_limit
+    stated, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
     if efforts is None:
         found = torque_limits(cell)
         efforts = stated.effort if found is None else np.nan_to_num(found, nan=np.inf)
-    own = stated if limits is None else cell.joint_limits
+    own = stated if cell.file.limits is None else cell.joint_limits
     ranges = Ranges(own.lower, own.upper, own.velocity, efforts)
-    return Arm(cell.urdf, model, consistent.standard, consistent.estimate.values, ranges)
+    return Arm(cell.urdf, cell.model, consistent.standard, consistent.estimate.values, ranges)
 
 
 def export_model(
-    found: Identification,
-    output: Path,
-    to: FormatName,
-    *,
-    ensemble: int = 0,
-    seed: int = 0,
+    found: Identification, output: Path, to: FormatName, *, ensemble: int = 0, seed: int = 0
 ) -> Exported:
     """Write an identified arm, read it back and compare; with an ensemble, its variants too.
 
     The variants are `ensemble.npz` and a file each in a folder that has the name of `output`,
     without its suffix, with ``_ensemble`` behind it.
 
-    Args:
-        found: the identification.
-        output: the file.
-        to: the format.
-        ensemble: number of variants; 0 for none.
-        seed: of the variants.
-
     Raises:
         InputError: there are no physically consistent parameters to write.
         IdentificationError: the arm cannot be written, or reads back as another.
     """
     form, arm, motion = FORMATS[to], arm_of(found.cell, consistent_of(found)), _motion(found)
-    remarks = _remarks(found)
+    pooled = found.estimate.pooled
+    unknown = ", ".join(pooled.undetermined)
+    remarks = (
+        "Identified by hil; bodies are physically consistent parameters.",
+        *([f"Not determined by the data: {unknown}."] if unknown else []),
+        *(
+            " ".join(f"{key}: {value}".split())
+            for key, value in provenance_of(found.results, found.paths).items()
+        ),
+    )
     make_folder(output.parent)
     text = form.write(arm, found.cell.name, remarks)
     try:
@@ -177,9 +161,9 @@ def export_model(
     write_together(output.parent, {output.name: text})
     spread = None
     if ensemble:
-        variants = sample_ensemble(arm.model, found.estimate.pooled, ensemble, seed)
+        variants = sample_ensemble(arm.model, pooled, ensemble, seed)
         _write_variants(output, to, arm, variants, (*remarks, f"seed of the ensemble: {seed}"))
-        spread = spread_of(arm, variants, found.estimate.pooled.covariance, motion)
+        spread = spread_of(arm, variants, pooled.covariance, motion)
     units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)
     return Exported(output, arm.model.joint_names, units, comparison, spread, found.verdict.line)
 
@@ -210,11 +194,6 @@ def _write_variants(
     folder, form = output.with_name(f"{output.stem}_ensemble"), FORMATS[to]
     make_folder(folder)
     width = len(str(len(variants.values) - 1))
-    files: dict[str, str | bytes | None] = {}
-    for k, (standard, values) in enumerate(zip(variants.standard, variants.values, strict=True)):
-        variant = Arm(arm.urdf, arm.model, standard, values, arm.ranges)
-        name = f"{k:0{width}d}"
-        files[name + form.suffix] = form.write(variant, f"{output.stem}_{name}", remarks)
     content = BytesIO()
     np.savez_compressed(
         content,
@@ -223,7 +202,12 @@ def _write_variants(
         standard_names=np.array(arm.model.standard_names),
         names=np.array(arm.model.parameter_names),
     )
-    write_together(folder, {**files, ENSEMBLE: content.getvalue()})
+    files: dict[str, str | bytes | None] = {ENSEMBLE: content.getvalue()}
+    for k, (standard, values) in enumerate(zip(variants.standard, variants.values, strict=True)):
+        variant = Arm(arm.urdf, arm.model, standard, values, arm.ranges)
+        name = f"{k:0{width}d}"
+        files[name + form.suffix] = form.write(variant, f"{output.stem}_{name}", remarks)
+    write_together(folder, files)
 
 
 def _motion(found: Identification) -> Motion:
@@ -239,15 +223,3 @@ def _motion(found: Identification) -> Motion:
 
 def _some(count: int, most: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, count - 1, min(count, max(most, 1))).astype(np.intp))
-
-
-def _remarks(found: Identification) -> tuple[str, ...]:
-    """Where the model comes from, a line each."""
-    origin = provenance_of(found.results, found.paths)
-    unknown = ", ".join(found.estimate.pooled.undetermined)
-    lines = [
-        "Identified by hil; bodies are physically consistent parameters.",
-        *([f"Not determined by the data: {unknown}."] if unknown else []),
-        *(f"{key}: {value}" for key, value in origin.items()),
-    ]
-    return tuple(" ".join(line.split()) for line in lines)

@@ -33,15 +33,13 @@ class Replayed:
     """Position errors of models, simulated less recorded.
 
     Attributes:
-        joint_names: (n,).
-        units: of the errors of each joint, degrees or mm.
+        joint_names, units: (n,), degrees or mm.
         time: since the beginning of the first motion, one after the other (m,) [s].
         errors: of each model by name (m, n), in `units`; NaN in gaps.
         spread: standard deviation of the positions of variants of the identified arm (m, n), in
             `units`; None without variants.
         reasons: why the identified model drifts by more than its uncertainty, in sentences.
-        tested_on: which motions, in words.
-        verdict: on the identified model, in a sentence.
+        tested_on, verdict: which motions, and what is said of the identified model, in words.
     """
 
     joint_names: tuple[str, ...]
@@ -110,10 +108,8 @@ class Replayed:
 
     def beside(self, series: ReportSeries) -> ReportSeries:
         """The series of a report with those of the replay."""
-        some, nothing = (
-            slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES)),
-            np.empty((0, 0)),
-        )
+        some = slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES))
+        nothing = np.empty((0, 0))
         return replace(
             series,
             replay_time=self.time[some],
@@ -131,11 +127,7 @@ def _figures(error: Array) -> tuple[Array, Array]:
 def replay_motions(found: Identification, reporter: Reporter, ensemble: int = ENSEMBLE) -> Replayed:
     """Simulate the motions that were predicted, by the identified and by the nominal model.
 
-    Args:
-        found: the identification.
-        reporter: of progress.
-        ensemble: number of variants of the identified arm that are simulated as well, at least two
-            of them or none.
+    An ensemble of two or more variants of the identified arm is simulated as well.
 
     Raises:
         InputError: there are no physically consistent parameters to simulate.
@@ -145,7 +137,10 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
     standard, values = [consistent.standard], [consistent.estimate.values]
     if (nominal := nominal_of(found.cell)) is not None:  # None where no link has a stated mass
         names.append("nominal")
-        standard.append(_nominal_bodies(found))
+        bodies, table = model.nominal, found.cell.file.nominal
+        if table is not None and model.rotor_inertia:
+            bodies[model.layout.rotors] = table.rotor_inertia
+        standard.append(bodies)
         values.append(nominal.values)
     if ensemble > 1:
         variants = sample_ensemble(model, found.estimate.pooled, ensemble, SEED)
@@ -187,25 +182,12 @@ def _reasons(
         share, cause = max(
             (constant, "constant: an offset of the torque, a payload, or gravity"),
             (friction, "in the direction of motion: friction that differs from the fitted one"),
-            (
-                1.0 - constant - friction,
-                "neither constant nor in the direction of motion: it depends on posture or time",
-            ),
+            (1.0 - constant - friction, "neither: it depends on posture or time"),
         )
-        times = strays[joint] / uncertain[joint]
+        unit = "N·m" if arms.model.chain.revolute[joint] else "N"
         sentences.append(
-            f"{found.cell.joint_names[joint]} drifts {times:.1f} times as far as its"
-            f" parameters are uncertain: averaged over {1.0 / FEEDBACK:g} s the model leaves out"
-            f" {left.rms[joint]:.2g} {'N·m' if arms.model.chain.revolute[joint] else 'N'},"
-            f" {share:.0%} of its square {cause}"
+            f"{found.cell.joint_names[joint]} drifts {strays[joint] / uncertain[joint]:.1f} times"
+            f" as far as its parameters are uncertain: averaged over {1.0 / FEEDBACK:g} s the model"
+            f" leaves out {left.rms[joint]:.2g} {unit}, {share:.0%} of its square {cause}"
         )
     return tuple(sentences)
-
-
-def _nominal_bodies(found: Identification) -> Array:
-    """Standard parameters (s,) that URDF and cell file state."""
-    model, table = found.cell.model, found.cell.file.nominal
-    standard = model.nominal
-    if table is not None and model.rotor_inertia:
-        standard[model.layout.rotors] = table.rotor_inertia
-    return standard

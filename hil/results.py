@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, get_args
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -22,11 +22,9 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    model_validator,
 )
 
 from hil.errors import InputError
-from hil.files import write_atomically
 from hil.reading import json_of, text_of
 
 
@@ -619,23 +617,11 @@ class Results(Frozen):
     conduct: ConductResult | None = None
     """How the campaign was run; null of loose archives."""
 
-    @model_validator(mode="after")
-    def _lists_fit(self) -> Self:
-        """There is one figure for each joint, or each parameter."""
-        for name, found, count in _lists(self):
-            if found is not None and len(found) != count:
-                raise ValueError(f"{name} has {len(found)} entries and not {count}")
-        return self
-
     @property
     def not_significant(self) -> list[str]:
         """Labels of parameters whose 95 % interval includes zero."""
         factor = self.uncertainty.interval_factor
         return [p.label for p in self.parameters if not abs(p.estimate) > factor * p.std]
-
-    def save(self, path: Path) -> None:
-        """Write `path` as indented JSON."""
-        write_atomically(path, self.to_json())
 
     @classmethod
     def load(cls, path: Path) -> Results:
@@ -644,56 +630,26 @@ class Results(Frozen):
         Raises:
             InputError: the file is not of this schema.
         """
+
+        def refusal(problem: str, field: str = "") -> InputError:
+            again = "identify again from the archives, which hold all that is needed"
+            return InputError(path, problem, field=field, remedy=again)
+
         try:
             text = text_of(path)
             found = json_of(text)
         except (OSError, ValueError) as error:
-            raise InputError(
-                path, f"cannot be read as a result ({error})", remedy="name a results.json"
-            ) from error
+            raise refusal(f"cannot be read as a result ({error})") from error
         version = found.get("schema_version") if isinstance(found, dict) else None
         if version != SCHEMA_VERSION:
-            raise InputError(
-                path,
-                f"is of version {version!r}; this program reads version {SCHEMA_VERSION}",
-                field="schema_version",
-                remedy="identify again from the archives, which hold all that is needed",
-            )
+            problem = f"is of version {version!r}; this program reads version {SCHEMA_VERSION}"
+            raise refusal(problem, "schema_version")
         try:
             return cls.model_validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
-            raise InputError(
-                path,
-                f"{first['msg'].lower()}; found {str(first['input'])[:80]!r}",
-                field=".".join(str(part) for part in first["loc"]),
-                remedy="identify again from the archives",
-            ) from error
-
-
-def _lists(results: Results) -> Iterator[tuple[str, Sequence[Any] | None, int]]:
-    """Lists per joint and per parameter, by name, and how many there are of those."""
-    n, p = len(results.joint_names), len(results.parameters)
-    yield "noise_std", results.noise_std, n
-    for section, names in _PER_JOINT.items():
-        found = getattr(results, section)
-        for one in found if isinstance(found, list) else filter(None, [found]):
-            for name in names:
-                yield f"{section}.{name}", getattr(one, name), n
-    yield "correlation", results.correlation, p
-    for name in ("correlation", "repetition_values"):
-        for row in getattr(results, name):
-            yield name, row, p
-    for name in get_args(UncertaintyResult.model_fields["reported"].annotation):
-        yield f"uncertainty.{name}", getattr(results.uncertainty, name), p
-
-
-_PER_JOINT: Final = {
-    "validation": ("mean_abs_error", "rms_error", "mean_error", "relative_error"),
-    "fitted": ("relative_error",),
-    "calibration": ("joint_inside", "half_width"),
-    "delays": ("found", "interval", "applied"),
-}
+            problem = f"{first['msg'].lower()}; found {str(first['input'])[:80]!r}"
+            raise refusal(problem, ".".join(str(part) for part in first["loc"])) from error
 
 
 def csv_tables(results: Results) -> dict[str, str]:

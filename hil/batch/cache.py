@@ -64,14 +64,6 @@ _TYPES: Final[dict[str, type[Any]]] = {
     )
 }
 
-# What stands between the bytes of an archive and its cache entries.
-_PROGRAMS: Final = (
-    (drivers, ("**/*.py",)),
-    (identification, ("**/*.py",)),
-    (hil, ("recordings.py", "archive/**/*.py", "cell/**/*.py", "importers/findings.py")),
-    (hil, (*(f"identify/{name}.py" for name in ("deciding", "options", "settings", "sources")),)),
-    (hil, (*(f"batch/{name}.py" for name in ("cache", "discovery", "factors", "types")),)),
-)
 LIBRARIES: Final = ("numpy", "scipy", "pin")
 """Packages that decide about the numbers."""
 
@@ -241,17 +233,15 @@ def _resolved(folder: str) -> str:
 
 @cache
 def code_digest() -> str:
-    """Digest of the programs that examine and reduce archives, and of the libraries they use.
+    """Digest of the programs' own text, and of the libraries that they use.
 
-    The programs' own text is read, so that a change counts even where nobody has raised a version.
+    So a change counts even where nobody has raised a version.
     """
     found: list[Any] = [f"{name} {version(name)}" for name in LIBRARIES]
-    for package, patterns in _PROGRAMS:
+    for package in (drivers, hil, identification):
         root = Path(package.__path__[0])
-        for pattern in patterns:
-            paths = sorted(root.glob(pattern))
-            assert paths, f"{package.__name__} has no {pattern}"
-            found += [(str(path.relative_to(root)), digest(path.read_bytes())) for path in paths]
+        paths = sorted(root.rglob("*.py"))
+        found += [(str(path.relative_to(root)), digest(path.read_bytes())) for path in paths]
     return json_digest(found)
 
 

@@ -10,8 +10,7 @@ import sys
 import threading
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -183,13 +182,11 @@ class DaskWorkers(Workers):
 
     def _wait(self, future: Any) -> None:
         """Wait for a run; see meanwhile that there is somebody to wait for."""
-        from distributed import client
-
-        wait: Any = client.wait  # its parameters are not annotated
         last_seen = monotonic()
         while future.status in ("pending", "lost"):  # lost with a worker: it is made anew
-            with suppress(TimeoutError, CancelledError):
-                wait(future, timeout=_LOOK)
+            ended = threading.Event()
+            future.add_done_callback(lambda _, event=ended: event.set())
+            ended.wait(_LOOK)
             if self._connected and self.n_workers:
                 last_seen = monotonic()
             elif monotonic() - last_seen > self._patience:

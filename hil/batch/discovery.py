@@ -70,12 +70,6 @@ def discover(
 
     An archive that was examined before, and whose file nobody has touched since, is not opened.
 
-    Args:
-        roots: folders, archives, or URLs of either.
-        where: what is known of archives is cached.
-        workers: who does the work on archives.
-        reporter: of progress.
-
     Raises:
         InputError: a place does not exist, an address cannot be read, or there is no archive.
         CacheError: the cache cannot be written.

@@ -96,12 +96,7 @@ def plus(one: Any, other: Any) -> Any:
 
 
 class Estimator:
-    """One of the estimators, for one arm.
-
-    Args:
-        name: of the estimator.
-        cell: says what the arm is, and what is believed of it; with the law of the settings.
-        settings: of the arm.
+    """One of the estimators, for one arm; its cell has the law of its settings.
 
     Raises:
         InputError: the estimator needs a prior, and the cell has none.
@@ -246,15 +241,7 @@ def sum_level(
     warnings: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
-    """The estimate of a campaign, or of all campaigns of an arm.
-
-    Args:
-        level: which.
-        estimator: of the arm.
-        group: archives that were fitted, and what is known beside them.
-        centre: of their sum, see `Estimator.centre`.
-        warnings: about setups.
-        payload: that the campaign's cell states.
+    """The estimate of a campaign, or of all campaigns of an arm; centre see `Estimator.centre`.
 
     Raises:
         IdentificationError: there is no estimate.
@@ -305,17 +292,10 @@ def _rms(factor: Factor, squares: Array | None = None) -> Array:
     return np.asarray(np.sqrt(squares / np.where(factor.samples > 0, factor.samples, np.nan)))
 
 
-def relative_error(
-    error: Array,
-    torque: Array,
-    rows: NDArray[np.intp] | None = None,
-) -> float:
+def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = None) -> float:
     """Error over torque, root of the sums of squares over all joints; NaN where unknown.
 
-    Args:
-        error: RMS or standard deviation per joint (n,).
-        torque: RMS per joint (n,).
-        rows: of each joint (n,); equally many if left out.
+    Each is an RMS per joint (n,), of so many rows (n,), or of equally many.
     """
     count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)

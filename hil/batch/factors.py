@@ -190,13 +190,9 @@ def known_settings(
 def decided(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
 ) -> Decision:
-    """Decide a campaign's settings from some of its archives, and cache them.
+    """Decide a campaign's settings from some of its archives, see `consulted`, and cache them.
 
-    Args:
-        refs: see `consulted`.
-        options: what is open.
-        arms: settings of the arm; None where this campaign decides on them.
-        where: they are cached.
+    They are those of the arm with the campaign's own noise; None where it decides on them.
 
     Raises:
         RecordingError: a recording cannot be prepared.
@@ -281,15 +277,8 @@ def bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
 def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle:
     """Reduce archives of one campaign, or those that are not in the cache, and cache the result.
 
-    The sum goes from first to last, so that one that is known of the first ones can be continued.
-
-    Args:
-        refs: in their canonical order.
-        settings: of the campaign.
-        where: what is known of them is cached.
-
-    Returns:
-        With a reason for each archive that could not be used; nothing of it is in the sum.
+    The sum goes from first to last in canonical order, so that one that is known of the first ones
+    can be continued. Of an archive that could not be used, nothing is in it.
 
     Raises:
         CacheError: the disk refuses.

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json as json_module
 import math
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hil.cli.arguments import JsonOption, QuietOption
-from hil.cli.identify_options import LONGEST_DELAY
+from hil.cli.arguments import JsonOption, QuietOption, print_json
+from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
@@ -25,7 +24,7 @@ def gains(
     centre: str = "0,0,0",
     inertia: str = "0,0,0,0,0,0",
     frame: str | None = None,
-    delay: float | None = None,
+    delay: Annotated[str, typer.Option(metavar="SECONDS")] = "stated",
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,48 +44,38 @@ def gains(
         frame: Link of the URDF whose frame that is; the last joint's if left out.
         delay: Time in s by which currents lag positions; the cell's if left out.
     """
-    if delay is not None and not abs(delay) <= LONGEST_DELAY:
-        raise InputError(
-            None, f"{delay} is no delay", field="--delay", remedy=f"give s, at most {LONGEST_DELAY}"
-        )
     twice = {path.resolve() for path in archives} & {path.resolve() for path in loaded or []}
     if twice:
         raise InputError(twice.pop(), "is named with load and without", remedy="name it once")
-    payload = _payload(mass, centre, inertia, frame, bool(loaded))
-    found = find_gains(
-        archives,
-        dict.fromkeys(loaded or [], payload) if payload is not None else {},
-        make_reporter(quiet=quiet or json),
-        delay=delay,
-    )
-    typer.echo(json_module.dumps(_as_json(found), indent=1) if json else _as_toml(found))
+    if mass is not None and not loaded:
+        raise _refusal("--mass", "which recording was made with it?", "add --loaded")
+    payload = _payload(mass, centre, inertia, frame) if loaded else None
+    carried = {path: payload for path in loaded or [] if payload is not None}
+    lag = delay_from(delay)
+    if lag == "auto":
+        raise _refusal("--delay", "cannot be found from currents", "give seconds")
+    found = find_gains(archives, carried, make_reporter(quiet=quiet or json), delay=lag)
+    if json:
+        print_json(as_dict(found))
+    else:
+        typer.echo(_as_toml(found))
     if not found.gains.determined.all():
         raise typer.Exit(NOT_GOOD)
 
 
-def _payload(
-    mass: float | None, centre: str, inertia: str, frame: str | None, wanted: bool
-) -> Payload | None:
-    if not wanted:
-        if mass is not None:
-            raise InputError(
-                None, "which recording was made with it?", field="--mass", remedy="add --loaded"
-            )
-        return None
+def _refusal(field: str, problem: str, remedy: str) -> InputError:
+    return InputError(None, problem, field=field, remedy=remedy)
+
+
+def _payload(mass: float | None, centre: str, inertia: str, frame: str | None) -> Payload:
     if mass is None or not (math.isfinite(mass) and mass > 0.0):
-        raise InputError(
-            None, "the payload needs a mass above 0", field="--mass", remedy="give it in kg"
-        )
+        raise _refusal("--mass", "the payload needs a mass above 0", "give it in kg")
     x, y, z = _numbers(centre, 3, "--centre")
     xx, xy, xz, yy, yz, zz = _numbers(inertia, 6, "--inertia")
     payload = Payload(mass, (x, y, z), (xx, xy, xz, yy, yz, zz), frame)
     if not payload.possible:
-        raise InputError(
-            None,
-            "no body has this tensor",
-            field="--inertia",
-            remedy="principal moments are not negative, and none exceeds the sum of the others",
-        )
+        remedy = "principal moments are not negative, and none exceeds the sum of the others"
+        raise _refusal("--inertia", "no body has this tensor", remedy)
     return payload
 
 
@@ -96,31 +85,26 @@ def _numbers(text: str, count: int, field: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(
-            None, f"{text!r} is not {count} numbers", field=field, remedy="separate them by commas"
-        )
+        raise _refusal(field, f"{text!r} is not {count} numbers", "separate them by commas")
     return values
 
 
 def _as_toml(found: GainsFound) -> str:
+    """What is not determined has its place in the list; a cell or map refuses it by name."""
     side = "motor side" if found.motor_side else "joint side, gears included"
     lines = [
-        f"# N·m/A ({side}), 95 % intervals, weighted least squares",
-        "torque_constant = [",
-    ]
-    # What is not determined has its place in the list; a cell or map refuses it by name.
-    lines += [
         f"    {one['torque_constant']:.6g},  # {one['name']} ± {one['half_interval']:.2g}"
         if one["not_determined"] is None
         else f"    nan,  # {one['name']}: not determined; {one['not_determined']}"
         for one in _motors(found)
     ]
-    return "\n".join([*lines, "]"])
+    return "\n".join([f"# N·m/A ({side}), 95 % intervals", "torque_constant = [", *lines, "]"])
 
 
 def _motors(found: GainsFound) -> list[dict[str, Any]]:
     """Name, constant, spread and half of the interval [N·m/A], or why there are none."""
     gains = found.gains
+    columns = (gains.motor_names, gains.values, gains.std, gains.determined, gains.reasons)
     return [
         {
             "name": name,
@@ -129,13 +113,12 @@ def _motors(found: GainsFound) -> list[dict[str, Any]]:
             "half_interval": float(gains.interval_factor * std) if determined else None,
             "not_determined": reason,
         }
-        for name, value, std, determined, reason in zip(
-            gains.motor_names, gains.values, gains.std, gains.determined, gains.reasons, strict=True
-        )
+        for name, value, std, determined, reason in zip(*columns, strict=True)
     ]
 
 
-def _as_json(found: GainsFound) -> dict[str, object]:
+def as_dict(found: GainsFound) -> dict[str, object]:
+    """The same for a program."""
     loads = {name: None if load is None else load.mass for name, load in found.loads.items()}
     return {
         "motors": _motors(found),

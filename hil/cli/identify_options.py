@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, Final, Literal
 
 import typer
@@ -64,36 +65,16 @@ TorqueBandwidthOption = Annotated[
 ]
 
 
-def options_from(
-    *,
-    estimator: Estimator = "auto",
-    bandwidth: str = "auto",
-    velocity: Literal["auto", "position", "measured"] = "auto",
-    friction: str = "auto",
-    standstill: Literal["auto", "rests", "slow", "none"] = "auto",
-    delay: str | None = None,
-    torque_bandwidth: str = "auto",
-    **others: Any,
-) -> Options:
-    """The options of an identification as the command line says them.
-
-    What is not text on the command line is given as :class:`hil.identify.options.Options` has it.
+def options_from(**given: Any) -> Options:
+    """The options of an identification, texts as the command line has them.
 
     Raises:
         InputError: one of them cannot be used.
     """
-    return Options(
-        estimator=estimator,
-        bandwidth=bandwidth_from(bandwidth),
-        velocity=velocity,
-        friction="auto" if friction == "auto" else friction_from(friction),
-        standstill=standstill,
-        delay=delay_from(delay),
-        torque_bandwidth=None
-        if torque_bandwidth == "none"
-        else bandwidth_from(torque_bandwidth, "--torque-bandwidth"),
-        **others,
-    )
+    for name, read in _READ.items():
+        if name in given:
+            given[name] = read(given[name])
+    return Options(**given)
 
 
 def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
@@ -108,32 +89,17 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
         return "auto" if text == "auto" else "stated"
     value = _number(text)
     if not abs(value) <= LONGEST_DELAY:
-        raise InputError(
-            None,
-            f"{text!r} is no delay",
-            field="--delay",
-            remedy=f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto",
-        )
+        remedy = f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto"
+        raise InputError(None, f"{text!r} is no delay", field="--delay", remedy=remedy)
     return value
 
 
-def bandwidth_from(text: str, option: str = "--bandwidth") -> float | Literal["auto"]:
-    """Bandwidth in Hz as the option says it.
-
-    Raises:
-        InputError: it is none.
-    """
-    if text == "auto":
-        return "auto"
+def _bandwidth(text: str, option: str = "--bandwidth") -> float | str:
     value = _number(text)
-    if not 0.0 < value < math.inf:
-        raise InputError(
-            None,
-            f"{text!r} is no bandwidth",
-            field=option,
-            remedy='give a frequency above 0 Hz, or "auto"',
-        )
-    return value
+    if text != "auto" and not 0.0 < value < math.inf:
+        remedy = 'give a frequency above 0 Hz, or "auto"'
+        raise InputError(None, f"{text!r} is no bandwidth", field=option, remedy=remedy)
+    return text if text == "auto" else value
 
 
 def _number(text: str) -> float:
@@ -141,3 +107,13 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+_READ: Final[dict[str, Callable[[Any], Any]]] = {
+    "delay": delay_from,
+    "bandwidth": _bandwidth,
+    "friction": lambda text: text if text == "auto" else friction_from(text),
+    "torque_bandwidth": lambda text: (
+        None if text == "none" else _bandwidth(text, "--torque-bandwidth")
+    ),
+}

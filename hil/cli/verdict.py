@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import typer
@@ -45,16 +45,15 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
 
 def as_json(results: Results) -> str:
     """Verdict, what it rests on, and the figures per joint."""
-    found = results.verdict.model_dump(mode="json")
-    if results.judgement is not None:
-        figures = results.judgement.model_dump(mode="json")
-        found |= {key: figures[key] for key in ("next_steps", "findings", "joints", "in_sample")}
+    fields = results.model_dump(mode="json")
+    judgement = fields["judgement"] or {}
+    found = fields["verdict"] | {
+        key: judgement[key]
+        for key in ("next_steps", "findings", "joints", "in_sample")
+        if key in judgement
+    }
     found["undetermined"] = [one.name for one in results.parameters if one.undetermined]
-    found["delays"] = None if results.delays is None else results.delays.model_dump(mode="json")
-    found["fitted"] = None if results.fitted is None else results.fitted.model_dump(mode="json")
-    calibration = results.calibration
-    found["calibration"] = None if calibration is None else calibration.model_dump(mode="json")
-    found["exports"] = None if results.exports is None else results.exports.model_dump(mode="json")
+    found |= {key: fields[key] for key in ("delays", "fitted", "calibration", "exports")}
     return json_module.dumps(found)
 
 
@@ -75,7 +74,12 @@ def table(results: Results) -> list[str]:
     ]
     cells = [[title, *(text(joint) for joint in joints)] for title, text in columns]
     shown = [column for column in cells if set(column[1:]) != {_MISSING}]
-    return _aligned(list(zip(*shown, strict=True)))
+    padded = [
+        [cell.ljust(width) if column is shown[0] else cell.rjust(width) for cell in column]
+        for column in shown
+        for width in [max(map(len, column))]
+    ]
+    return ["  ".join(row).rstrip() for row in zip(*padded, strict=True)]
 
 
 def sentences(results: Results, *, quiet: bool = False) -> list[str]:
@@ -99,14 +103,3 @@ def _percent(share: float | None) -> str:
     if share is None or math.isnan(share):
         return _MISSING
     return f"{share:.2%}" if abs(share) < 0.1 else f"{share:.1%}"
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if at == 0 else cell.rjust(width)
-            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]

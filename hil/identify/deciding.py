@@ -10,9 +10,6 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.cell import Cell
 from hil.cell.robot import ripples
 from hil.progress import Reporter
@@ -73,12 +70,7 @@ def with_noise(sources: Sources) -> tuple[Sources, str]:
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
-    """Decide on everything that options leave open.
-
-    Args:
-        sources: with torques, and with the noise that was measured.
-        options: what is stated, and what is open.
-        reporter: of progress.
+    """Decide on everything that options leave open, from sources with torques and measured noise.
 
     Raises:
         RecordingError: a recording cannot be prepared.
@@ -100,15 +92,10 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     how = chosen.preprocessing
     lags = how.torque_bandwidth is not None and how.torque_shape.causal
     compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
+    unchanged = f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied"
     if found is not None and lags:
         # It was found without the low-pass, and may be nothing but the lag of that.
-        found, notes = (
-            None,
-            [
-                f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied beside the"
-                " low-pass of the torque"
-            ],
-        )
+        found, notes = None, [f"{unchanged} beside the low-pass of the torque"]
     elif how.torque_delay in suggested:
         notes.append(compensated)
     elif how.torque_delay != assumed:
@@ -133,15 +120,11 @@ def carried_over(settings: Settings, sources: Sources, options: Options) -> Sett
 
 
 def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
-    return replace(
-        settings,
-        noise_variance=_figures(sources.noise_variance),
-        torque_variance=_figures(sources.torque_variance),
+    position, torque = (
+        None if values is None else tuple(values.tolist())
+        for values in (sources.noise_variance, sources.torque_variance)
     )
-
-
-def _figures(values: NDArray[np.float64] | None) -> tuple[float, ...] | None:
-    return None if values is None else tuple(values.tolist())
+    return replace(settings, noise_variance=position, torque_variance=torque)
 
 
 def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:

@@ -105,7 +105,12 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
     """
     cell, name = prepared.sources.cell, options.estimator
     model, variance = cell.model, prepared.settings.delay_variance
-    _require_usable(prepared, model)
+    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
+        if not samples.usable.any():  # such as the beginning of a torn one
+            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
+            raise ArchiveError(
+                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
+            )
     with reporter.task("estimating", 4) as task:
         # The test is of the very samples that least squares reads.
         fitted = widely_smoothed(model, prepared) if name == "iv" else prepared.fitted
@@ -125,7 +130,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             pooled = with_uncertain_delay(result.pooled, result.factor, products, variance)
             result = replace(result, pooled=pooled)
         task.advance(1, "prior")
-        posterior: PosteriorEstimate | str = ""
+        posterior: PosteriorEstimate | str
         try:
             posterior = (
                 prior
@@ -139,26 +144,29 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "held-out motion")
         held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
         task.advance(1)
-    warnings += _conditioning(result.pooled)
+    pooled = result.pooled
+    if not pooled.undetermined and pooled.condition > QR_CONDITION:
+        warnings.append(
+            f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR:"
+            " the motion hardly tells some parameters apart"
+        )
+    endogeneity: EndogeneityTest | str
     if isinstance(instrumental, str):
-        endogeneity: EndogeneityTest | str = (
+        endogeneity = (
             "Whether noise in the positions biases least squares could not be tested:"
             f" {instrumental}."
         )
     else:
         endogeneity = instrumental.test
-        warnings += [] if name == "iv" else _bias(instrumental)
-    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
-
-
-def _require_usable(prepared: Prepared, model: RobotModel) -> None:
-    """Refuse a recording of which nothing can be fitted, such as the beginning of a torn one."""
-    for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
-        if not samples.usable.any():
-            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
-            raise ArchiveError(
-                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
+        # What the motion does not determine differs by any amount.
+        if name != "iv" and endogeneity.matters and not instrumental.pooled.estimate.undetermined:
+            moved = float(np.max(endogeneity.predicted))
+            warnings.append(
+                "noise in the measured positions biases least squares: instrumental variables"
+                f" differ from it by up to {moved:.1%} of an axis's torque; compare with"
+                " --estimator iv, or measure positions with less noise"
             )
+    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
 
 
 # What is believed before any data
@@ -220,12 +228,8 @@ def fit_of(
 ) -> Fit:
     """How an estimator that needs nothing but factors fits.
 
-    Args:
-        model: the robot.
-        name: of the estimator.
-        shrinkage: towards the centre.
-        centre: consistent solution of all that is fitted together (p,); None for least squares.
-        prior: of the estimator of that name.
+    The centre is the consistent solution of all that is fitted together (p,); None for least
+    squares. The prior is for the estimator of that name.
     """
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
@@ -347,17 +351,12 @@ def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...
 def fit_instrumental(
     model: RobotModel, prepared: Prepared, fitted: Sequence[Samples]
 ) -> InstrumentalFit | str:
-    """Fit with the commanded motion as instruments; in words why that cannot be.
-
-    Args:
-        model: the robot.
-        prepared: where the recordings and their commands are.
-        fitted: the samples of these recordings.
-    """
+    """Fit samples with the commanded motion as instruments; in words why that cannot be."""
     factors = []
     plans: list[_Plan] = []
     try:
-        for samples, commanded in zip(fitted, prepared.commanded, strict=True):
+        for samples, source in zip(fitted, prepared.sources.training, strict=True):
+            commanded = source.recording.commanded_position
             if commanded is None:
                 return "the recordings hold no commanded positions"
             plan = samples.motion.time - samples.origin, commanded
@@ -366,9 +365,7 @@ def fit_instrumental(
             if lag is None:
                 plans.append((plan, planned.lag))
             factors.append(instrument_factor(model, samples, planned.motion, planned.usable))
-        total = factors[0]
-        for factor in factors[1:]:
-            total = total + factor
+        total = sum(factors[1:], factors[0])
         pooled = estimate_instrumental(model, total)
         each = tuple(estimate_instrumental(model, factor).estimate for factor in factors)
     except IdentificationError as error:
@@ -391,25 +388,3 @@ def _instrumental(
     )
     weak = found.pooled.weak
     return result, [f"the instruments are too weak for {_first(weak)}"] if weak else []
-
-
-def _conditioning(pooled: Estimate) -> list[str]:
-    if pooled.undetermined or pooled.condition <= QR_CONDITION:
-        return []
-    return [
-        f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR: the "
-        "motion hardly tells some parameters apart"
-    ]
-
-
-def _bias(found: InstrumentalFit) -> list[str]:
-    """That noise in the positions moves the result; figures of the test stand in the report."""
-    # What the motion does not determine differs by any amount.
-    if not found.test.matters or found.pooled.estimate.undetermined:
-        return []
-    moved = float(np.max(found.test.predicted))
-    return [
-        "noise in the measured positions biases least squares: instrumental variables differ from"
-        f" it by up to {moved:.1%} of an axis's torque; compare with --estimator iv, or measure"
-        " positions with less noise"
-    ]

@@ -62,13 +62,8 @@ def exports_of(
 ) -> Exports:
     """Return the identified model as files for other tools.
 
-    Args:
-        cell: whose URDF and model the parameters belong to.
-        estimate: of the model's parameters.
-        consistent: the physically consistent estimate, or why there is none. Without it there is
-            no URDF and no full standard parameters.
-        essential: names of the essential parameters, where they were looked for.
-        provenance: what the parameters come from; see :func:`provenance_of`.
+    Without a physically consistent estimate, but the reason, there is no URDF and no full standard
+    parameters. `essential` are names; `provenance` see :func:`provenance_of`.
 
     Raises:
         IdentificationError: the estimate is not of the cell's model.
@@ -123,15 +118,11 @@ def _friction(
         values, whose = estimate.values[model.friction_part], "least squares"
     else:
         values, whose = consistent.friction, f"the physically consistent parameters of {URDF}"
-    remarks = [f"friction of {whose}", *(f"{key}: {value}" for key, value in origin.items())]
-    unknown = [
-        name for name in model.parameter_names[model.friction_part] if name in estimate.undetermined
-    ]
-    if unknown:
-        remarks.insert(
-            1,
-            f"NOT DETERMINED by the data, what stands for them is no figure: {', '.join(unknown)}",
-        )
+    names = model.parameter_names[model.friction_part]
+    remarks = [f"friction of {whose}"]
+    if unknown := ", ".join(name for name in names if name in estimate.undetermined):
+        remarks.append(f"NOT DETERMINED by the data, what stands for them is no figure: {unknown}")
+    remarks += [f"{key}: {value}" for key, value in origin.items()]
     header = "".join(f"# {line}\n" for line in remarks)
     return {
         FRICTION_TEXT: header + "\n" + friction_in_words(model, values),

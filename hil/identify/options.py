@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 from hil.errors import InputError
 from identification.model.friction import ABSENT, TERMS
@@ -52,9 +52,6 @@ class Options:
 
     What is "auto" is chosen by predicting parts of what is fitted from the rest
     (:mod:`identification.selection.inner_prediction`).
-
-    Raises:
-        InputError: a name is unknown, the split no share or the bandwidth no frequency.
     """
 
     method: Method = "default"
@@ -67,28 +64,6 @@ class Options:
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
     standstill: LeftOut | Literal["auto"] | None = "auto"
     in_sample: bool = False
-
-    def __post_init__(self) -> None:
-        for name, kind in (
-            ("method", Method),
-            ("estimator", Estimator),
-        ):
-            value, known = getattr(self, name), get_args(kind)
-            if value not in known:
-                raise InputError(
-                    None, f"{value!r} is no {name}", field=name, remedy=f"use {', '.join(known)}"
-                )
-        if self.bandwidth != "auto" and not 0.0 < self.bandwidth < math.inf:
-            raise InputError(
-                None,
-                f"{self.bandwidth} is no bandwidth",
-                field="bandwidth",
-                remedy='give a frequency above 0 Hz, or "auto"',
-            )
-        if not 0.0 < self.split < 1.0:
-            raise InputError(
-                None, f"{self.split} is no share", field="split", remedy="give one between 0 and 1"
-            )
 
 
 FRICTION_TERMS: Final = ", ".join(

@@ -59,21 +59,11 @@ class Prepared:
         """What the fit took the delay of each axis to be (n,) [s]."""
         return self.settings.delays(len(self.sources.cell.joint_names))
 
-    @property
-    def commanded(self) -> tuple[Array | None, ...]:
-        """Commanded positions (m, n) in the rows of each of `fitted`, NaN where there are none."""
-        return tuple(source.recording.commanded_position for source in self.sources.training)
-
 
 def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
     """Smooth every recording, after its time base, noise, delay and settings are decided.
 
     Only what is fitted is looked at to decide them.
-
-    Args:
-        sources: the recordings.
-        options: how they are turned into samples.
-        reporter: of progress.
 
     Raises:
         ArchiveError: there are currents only, and nothing that could make torques of them.
@@ -203,10 +193,6 @@ def with_torques(sources: Sources) -> Sources:
 
 def current_warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
     """What a reader must know of torques that were made of currents."""
-
-    def those(chosen: NDArray[np.bool_]) -> str:
-        return ", ".join(name for name, one in zip(names, chosen, strict=True) if one)
-
     figures = ", ".join(
         f"{name} {value:.4g} ± {2.0 * std:.2g}"
         for name, value, std in zip(names, scale.values, scale.std, strict=True)
@@ -217,21 +203,24 @@ def current_warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
         f"the currents with the masses of the URDF ({figures} N·m/A), so every torque and "
         "parameter is as right as those masses; `hil gains` with a known payload does without them"
     ]
-    if turned := those(scale.turned):
-        warnings.append(
-            f"the torque constant of {turned} comes out negative: where the current is "
-            "positive the weight and inertia of the URDF need a negative torque. Either the sign "
-            "of the current or of the axis is turned in the recording, or the URDF's masses are "
-            "wrong there; the sign was used as found. Check it before using the torques"
-        )
-    if inertial := those(scale.inertial):
-        warnings.append(
-            f"weight hardly loads {inertial}: the torque constant there rests on "
-            "inertia and takes the rotor's for that of the links"
-        )
-    if unknown := those(~scale.determined):
-        warnings.append(
-            f"no torque constant could be found for {unknown}: its torque is the "
-            "current in A (times the gears), which predicts the current but no torque"
-        )
+    for chosen, words in (
+        (
+            scale.turned,
+            "the torque constant of {} comes out negative: the sign of the current or of the axis "
+            "is turned in the recording, or the URDF's masses are wrong there; it was used as "
+            "found. Check it before using the torques",
+        ),
+        (
+            scale.inertial,
+            "weight hardly loads {}: the torque constant there rests on inertia and takes the "
+            "rotor's for that of the links",
+        ),
+        (
+            ~scale.determined,
+            "no torque constant could be found for {}: its torque is the current in A (times the "
+            "gears), which predicts the current but no torque",
+        ),
+    ):
+        if found := [name for name, one in zip(names, chosen, strict=True) if one]:
+            warnings.append(words.format(", ".join(found)))
     return warnings

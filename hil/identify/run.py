@@ -53,15 +53,7 @@ _MARGIN: Final = 1.0  # s of rest that is shown before and after the motion
 class Identification:
     """What an identification found, and the series its figures need.
 
-    Attributes:
-        paths: the archives.
-        prepared: their recordings as samples.
-        estimation: the estimate, and what was computed beside it.
-        essential: the essential parameters; in words why there are none.
-        consistency: parameters that a machine can have; in words why there are none.
-        verdict: on the estimate.
-        results: as they go into `results.json`.
-        series: for the figures of the report.
+    Essential parameters, and those that a machine can have, say in words why there are none.
     """
 
     paths: tuple[Path, ...]
@@ -185,15 +177,10 @@ def identify_archives(
     name: str = "",
     warnings: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives.
+    """Identify from archives, which say what is fitted, predicted or rested at.
 
-    Args:
-        paths: what is fitted, predicted or rested at, according to what the archives say.
-        reporter: of progress.
-        options: how.
-        predict: archives that are predicted and not fitted, whatever they say.
-        name: of the result; that of the first archive if left out.
-        warnings: what is known beforehand to be wrong with the archives.
+    Those of `predict` are predicted and not fitted, whatever they say. The result is named by the
+    first archive if nothing is given; `warnings` say what is known to be wrong with the archives.
 
     Raises:
         InputError: the archives cannot be used, or not together, or not by the chosen estimator.
@@ -210,7 +197,7 @@ def identify_archives(
     with reporter.task("validating", 3) as task:
         unseen = sum(estimation.held_out, PhaseFactor.zero(cell.model)).total
         consistency = consistency_of(cell.model, result.phase, unseen)
-        reasons: tuple[str, ...] = ()
+        impossible: list[str] = []
         if isinstance(consistency, str):
             sources = sources.with_warning(
                 f"no physically consistent parameters were found: {consistency}"
@@ -219,9 +206,9 @@ def identify_archives(
             if sources.in_sample:
                 consistency = replace(consistency, judged_on="in-sample")
             if consistency.impossible:  # no machine predicts what the model predicts
-                reasons = (
+                impossible.append(
                     f"{consistency.sentence}: look there for a wrong sign, torque constant,"
-                    " coupling or description",
+                    " coupling or description"
                 )
             elif consistency.costly:
                 sources = sources.with_warning(consistency.sentence)
@@ -247,15 +234,12 @@ def identify_archives(
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
         )
-        impossible = (*evidence.implausible.impossible, *reasons)
-        evidence = replace(
-            evidence, implausible=evidence.implausible._replace(impossible=impossible)
-        )
+        implausible = evidence.implausible
+        reasons = (*implausible.impossible, *impossible)
+        evidence = replace(evidence, implausible=implausible._replace(impossible=reasons))
         verdict = judge(cell.model.joint_names, evidence, tested_on=sources.tested_on)
         task.advance(1)
     prepared = replace(prepared, sources=sources)
-    words = None if nominal is None else nominal.words
-    name = name or paths[0].stem
     return Identification(
         paths=(*paths, *predict),
         prepared=prepared,
@@ -264,12 +248,12 @@ def identify_archives(
         consistency=consistency,
         verdict=verdict,
         results=summarise(
-            name,
+            name or paths[0].stem,
             prepared,
             estimation,
             verdict,
             evidence,
-            words,
+            None if nominal is None else nominal.words,
             essential,
             consistency,
         ),
@@ -343,9 +327,8 @@ def _friction_data(
 ) -> tuple[Array, Array]:
     """Speed and friction torque of fitted rows (FRICTION_POINTS, n), NaN where there are fewer."""
     some = fitted[:: -(-len(fitted) // _RECORDINGS)]
-    speed = np.concatenate([samples.motion.velocity for samples in some])
-    torque = np.concatenate([friction_torque(model, values, samples) for samples in some])
-    usable = np.concatenate([samples.usable for samples in some])
+    parts = [(one.motion.velocity, friction_torque(model, values, one), one.usable) for one in some]
+    speed, torque, usable = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = np.full((2, FRICTION_POINTS, model.n_joints), np.nan)
     for joint in range(model.n_joints):
         rows = np.flatnonzero(usable[:, joint])

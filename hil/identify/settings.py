@@ -103,13 +103,9 @@ def signals_of(source: Source, settings: Settings) -> Source:
 def samples_of(
     source: Source, cell: Cell, settings: Settings, model: RobotModel | None = None
 ) -> Samples:
-    """Samples of a source, as a fit reads them.
+    """Samples of a source, as a fit reads them, once it went through :func:`signals_of`.
 
-    Args:
-        source: its signals, see :func:`signals_of`.
-        cell: with the law of the settings.
-        settings: how it is prepared.
-        model: the robot, by default the cell's.
+    The cell has the law of the settings; the model is by default its own.
 
     Raises:
         RecordingError: the recording cannot be prepared.

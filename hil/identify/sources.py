@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -147,28 +148,30 @@ def gather_sources(
         )
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
-    by_use: dict[str, list[Archive]] = {"excitation": [], "validation": [], "standstill": []}
-    rejected = False
+    by_use: defaultdict[str, list[Archive]] = defaultdict(list)
     for k, archive in enumerate(archives):
-        if archive.outcome is not None and archive.outcome.outcome == REJECTED:
-            rejected = True
-            continue
         use = archive.header.serves_as if k < len(paths) else "validation"
-        if use == "validation" and in_sample:
-            use = "excitation"
-        by_use.setdefault(use, []).append(archive)
+        rejected = archive.outcome is not None and archive.outcome.outcome == REJECTED
+        by_use[REJECTED if rejected else use].append(archive)
     fitted, predicted = by_use["excitation"], by_use["validation"]
-    if in_sample:  # excitations first
-        fitted.sort(key=lambda archive: archive.header.serves_as == "validation")
+    if in_sample:
+        fitted, predicted = [*fitted, *predicted], []
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
             "there is no excitation and no imported recording among the archives"
-            + (" but rejected ones" if rejected else ""),
+            + (" but rejected ones" if by_use[REJECTED] else ""),
             remedy="name archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
-    _refuse_other_arms(archives)
+    for archive in archives[1:]:
+        for name in ("robot.urdf", "cell.toml"):
+            if archive.attachments.get(name) != archives[0].attachments.get(name):
+                raise ArchiveError(
+                    archive.path,
+                    f"carries another {name} than {archives[0].path}",
+                    remedy="identify each cell's archives by themselves",
+                )
     rest = [source_of(archive, cell, to_fit=False) for archive in by_use["standstill"]]
     every = all_fitted(
         cell,
@@ -213,12 +216,7 @@ def gather_sources(
 def all_fitted(
     cell: Cell, fitted: Sequence[tuple[Archive, Source]], rest: Recording | None
 ) -> Sources:
-    """Sources of which nothing is held out.
-
-    Args:
-        cell: whose they are.
-        fitted: archives and what is of use in each.
-        rest: a recording at standstill, if there is one.
+    """Sources of which nothing is held out, with the noise of a recording at standstill.
 
     Raises:
         ArchiveError: the plan in the first archive is none.
@@ -275,19 +273,6 @@ def refuse_duplicates(paths: Sequence[Path]) -> None:
         if digest in seen:
             raise InputError(path, f"holds the same as {seen[digest]}", remedy="name it once")
         seen[digest] = path
-
-
-def _refuse_other_arms(archives: Sequence[Archive]) -> None:
-    """All archives belong to one robot, described in the same words."""
-    first = archives[0]
-    for archive in archives[1:]:
-        for name in ("robot.urdf", "cell.toml"):
-            if archive.attachments.get(name) != first.attachments.get(name):
-                raise ArchiveError(
-                    archive.path,
-                    f"carries another {name} than {first.path}",
-                    remedy="identify each cell's archives by themselves",
-                )
 
 
 def _incomplete(archive: Archive) -> str | None:
@@ -354,19 +339,18 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         single = without_repeats(recording).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    merged = recording.n_samples - single.n_samples
+    merged, timed = recording.n_samples - single.n_samples, single
     words: tuple[str, ...] = ()
-    stamped = single
     if archive.kind == "imported":  # a controller counts its own cycles
-        single, words = true_times(stamped)
+        timed, words = true_times(single)
     return Source(
         archive.path,
         archive.path.name,
-        single,
-        float(single.time[0]),
+        timed,
+        float(timed.time[0]),
         merged,
         words,
-        retimed=single is not stamped,
+        retimed=timed is not single,
     )
 
 
@@ -391,22 +375,16 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
 
 def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
     """The first part of a recording, and the rest; each knows the motion beyond its ends."""
-    count = whole.recording.n_samples
+    recording, count = whole.recording, whole.recording.n_samples
     cut = round(share * count)
 
     def part(words: str, start: int, stop: int) -> Source:
-        recording = whole.recording
-        inside = np.zeros((count, 1), dtype=np.bool_)
-        inside[start:stop] = True
-
-        def silent(values: Array | None) -> Array | None:
-            return None if values is None else np.where(inside, values, 0.0)
-
-        context = replace(
-            recording,
-            torque=silent(recording.torque),
-            motor_current=silent(recording.motor_current),
+        inside = (np.arange(count)[:, None] >= start) & (np.arange(count)[:, None] < stop)
+        torque, current = (
+            None if values is None else np.where(inside, values, 0.0)
+            for values in (recording.torque, recording.motor_current)
         )
+        context = replace(recording, torque=torque, motor_current=current)
         return replace(
             whole,
             name=f"{whole.name} ({words})",

@@ -39,7 +39,6 @@ from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel
 from identification.estimators.consistent import Shrinkage, fitted_values
-from identification.estimators.least_squares import RepeatedEstimate
 from identification.excitation import (
     Criteria,
     Excitation,
@@ -85,27 +84,14 @@ def summarise(
 ) -> Results:
     """Everything that was found, as it goes into `results.json`.
 
-    Args:
-        name: of the result.
-        prepared: the recordings.
-        estimation: the estimate.
-        verdict: on it.
-        evidence: what that rests on.
-        nominal: what the nominal model is, in words.
-        essential: the essential parameters; in words why there are none.
-        consistency: parameters that a machine can have; in words why there are none.
+    `nominal` is what the nominal model is, in words; the last two say in words why there are none.
 
     Raises:
         InputError: the plan in the archives cannot be read.
-        IdentificationError: the residuals were not checked.
     """
-    sources, training, estimate = prepared.sources, prepared.training, estimation.result
+    sources, estimate = prepared.sources, estimation.result
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
-    rows = [
-        executed_rows(source, samples)
-        for source, samples in zip(sources.training, training, strict=True)
-    ]
-    gram = information(_executed(cell.model, training, rows))
+    excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
     truth = planted_in(cell, sources.header) if simulated else None
     posterior, endogeneity = estimation.posterior, estimation.endogeneity
@@ -115,9 +101,9 @@ def summarise(
         simulated=simulated,
         effects=[*sources.header.effects],
         joint_names=list(model.joint_names),
-        period=_period(training[0]),
+        period=_period(prepared.training[0]),
         software=software(),
-        excitation=_excitation(sources, gram, training, rows),
+        excitation=excitation,
         estimator=EstimatorResult(
             name=estimation.estimator,
             words=pooled.method
@@ -141,8 +127,8 @@ def summarise(
         repetition_values=[one.values.tolist() for one in estimate.repetitions],
         noise_std=pooled.noise_std.tolist(),
         correlation=correlation(gram).tolist(),
-        validation=[] if sources.in_sample else _validation(sources, estimate, prepared.held_out),
-        fitted=_fitted(model, pooled.values, prepared),
+        validation=[] if sources.in_sample else _validation(prepared, pooled.values),
+        fitted=_fitted(prepared, pooled.values),
         calibration=_calibration(prepared, estimation),
         delays=_delays(prepared),
         choices=[
@@ -164,8 +150,7 @@ def summarise(
 def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
     """Intervals of held-out torque; None without held-out motion, or too little fitted.
 
-    Folds are fitted by the estimator as far as it works on factors alone: by least squares where it
-    is a robust loss, instruments or a prior from CAD.
+    Folds are fitted by least squares where the estimator works on more than factors.
     """
     if prepared.sources.in_sample:
         return None
@@ -174,16 +159,13 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResul
     if estimation.estimator == "consistent":
         shrinkage = Shrinkage(strength=math.inf)
 
-    def refit(factor: Factor) -> Array:
-        return fitted_values(model, factor, shrinkage)
-
     try:
         found = calibrate(
             result.pooled,
             result.phase,
             TorqueMeans.of(model, prepared.training),
             TorqueMeans.of(model, prepared.held_out),
-            refit,
+            lambda factor: fitted_values(model, factor, shrinkage),
         )
     except IdentificationError:
         return None
@@ -282,28 +264,29 @@ def _period(samples: Samples) -> float:
     return float(np.median(np.diff(samples.motion.time)))
 
 
-def _executed(model: RobotModel, training: Sequence[Samples], rows: Sequence[slice]) -> Factor:
-    """Every sample of the motion, resting joints included, as the criteria of a plan see it."""
+def _excitation(prepared: Prepared) -> tuple[ExcitationResult, Array]:
+    """Criteria of what was executed (all repetitions), and of the plan where one was attached.
+
+    Of every sample of the motion, resting joints included, as the criteria of a plan see it; and
+    their information (p, p).
+    """
+    model, lengths = prepared.sources.cell.model, []
     factor = Factor.zero(model)
-    for samples, part in zip(training, rows, strict=True):
+    for source, samples in zip(prepared.sources.training, prepared.training, strict=True):
+        part = executed_rows(source, samples)
+        lengths.append(part.stop - part.start)
         motion = samples.motion.rows(part)._replace(direction=None)
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
-    return factor
-
-
-def _excitation(
-    sources: Sources, gram: Array, training: Sequence[Samples], rows: Sequence[slice]
-) -> ExcitationResult:
-    """Criteria of what was executed (all repetitions), and of the plan where one was attached."""
-    lengths, most = [part.stop - part.start for part in rows], coupling_index_max(len(gram))
+    gram = information(factor)
+    most = coupling_index_max(len(gram))
     criteria = Criteria.of_gram(gram, sum(lengths))
     executed = CriteriaResult.of(criteria, coupling_index_max=most)
-    planned = _planned(sources)
+    planned = _planned(prepared.sources)
     if planned is None:
-        duration = lengths[0] * _period(training[0])
+        duration = lengths[0] * _period(prepared.training[0])
         return ExcitationResult(
             duration=duration, n_via=None, fly=None, planned=None, executed=executed
-        )
+        ), gram
     trajectory, via_points = planned.trajectory, planned.via_points
     n_via = None
     if via_points is not None:  # without the posture that a closed path begins and ends at
@@ -316,7 +299,7 @@ def _excitation(
         n_sines=trajectory.amplitude.shape[1] if isinstance(trajectory, FourierSeries) else None,
         planned=CriteriaResult.of(planned.criteria, coupling_index_max=most),
         executed=executed,
-    )
+    ), gram
 
 
 def _planned(sources: Sources) -> Excitation | None:
@@ -395,12 +378,10 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _validation(
-    sources: Sources, estimate: RepeatedEstimate, held_out: Sequence[Samples]
-) -> list[ValidationResult]:
-    model, values = sources.cell.model, estimate.pooled.values
-    errors = prediction_error(model, values, held_out)
-    everywhere = prediction_error(model, values, held_out, all_rows=True)
+def _validation(prepared: Prepared, values: Array) -> list[ValidationResult]:
+    sources, model = prepared.sources, prepared.sources.cell.model
+    errors = prediction_error(model, values, prepared.held_out)
+    everywhere = prediction_error(model, values, prepared.held_out, all_rows=True)
     return [
         ValidationResult.of(
             archive=source.name,
@@ -417,17 +398,17 @@ def _validation(
     ]
 
 
-def _fitted(model: RobotModel, values: Array, prepared: Prepared) -> FittedResult:
+def _fitted(prepared: Prepared, values: Array) -> FittedResult:
     """In-sample errors: of the torque as recorded, and as it was fitted where that differs."""
 
-    def error(samples: Sequence[Samples], *, all_rows: bool) -> PredictionError:
+    def error(samples: Sequence[Samples], *, all_rows: bool = True) -> PredictionError:
+        model = prepared.sources.cell.model
         return over_all(prediction_error(model, values, samples, all_rows=all_rows))
 
     moving = error(prepared.training, all_rows=False)
-    everywhere = error(prepared.training, all_rows=True)
-    smoothed = None
-    if prepared.settings.preprocessing.smooth_torque:
-        smoothed = error(prepared.fitted, all_rows=True)
+    everywhere = error(prepared.training)
+    paper = prepared.settings.preprocessing.smooth_torque
+    smoothed = error(prepared.fitted) if paper else None
     return FittedResult.of(
         relative_error=moving.relative,
         overall_relative_error=moving.overall,
@@ -467,8 +448,7 @@ def _judgement(
 ) -> JudgementResult:
     """What the verdict rests on."""
     checks, around, error = evidence.residuals, evidence.surroundings, evidence.held_out
-    if checks is None:
-        raise IdentificationError("the evidence holds no checks of the residuals")
+    assert checks is not None
     colour, drift, inertia = checks.colour, checks.drift, around.controller_inertia
     step = max(1, -(-len(colour.lag) // _LAGS))
     rows = _rows(

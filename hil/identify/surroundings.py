@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -36,16 +37,10 @@ _SAME_TIME = 1e-6  # s
 def controller_error(
     cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
 ) -> PredictionError | None:
-    """Error of the controller's model on the rows that a verdict counts.
+    """Error of the controller's model on the rows of predicted sources that a verdict counts.
 
-    Args:
-        cell: whose drive train turns currents into torques.
-        sources: what is predicted.
-        samples: the same, prepared.
-
-    Returns:
-        None where the controller sent no such current, or something else than a current in it
-        (zeros), in any of the archives.
+    None where the controller sent no such current, or something else than a current in it (zeros),
+    in any of the archives.
     """
     if cell.file.drive_train is None:
         return None
@@ -140,19 +135,17 @@ def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
     )
 
 
+def _condition(check: str, words: str, advice: str) -> Finding:
+    return Finding(check, "doubtful", words, advice, "condition")
+
+
 def _clock(prepared: Prepared) -> Iterator[Finding]:
     """Time stamps that are not those of the samples."""
     retimed = [source for source in prepared.sources.training if source.retimed]
-    if not retimed:
-        return
-    more = f"; likewise in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
-    yield Finding(
-        "clock",
-        "doubtful",
-        f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}",
-        "log the controller's own time beside each sample",
-        "condition",
-    )
+    if retimed:
+        more = f"; likewise in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
+        words = f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}"
+        yield _condition("clock", words, "log the controller's own time beside each sample")
 
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
@@ -160,37 +153,30 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     chosen = [one.name for one in prepared.settings.choices if one.chosen]
     how = prepared.settings.preprocessing
     if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
-        yield Finding(
+        yield _condition(
             "delay",
-            "doubtful",
             f"the fitted part is predicted best with a torque that lags the position by"
             f" {1e3 * how.torque_delay:.3g} ms; that was compensated",
             "state it (`hil identify --delay SECONDS`), or correct it where it arises",
-            "condition",
         )
-    width = how.torque_bandwidth
-    advice = "record the torque unfiltered"
+    width, advice = how.torque_bandwidth, "record the torque unfiltered"
     if LOW_PASS in chosen and width is not None:
         if not how.torque_shape.causal:
             advice += ", or state its low-pass with --torque-bandwidth"
-        yield Finding(
+        yield _condition(
             "torque bandwidth",
-            "doubtful",
             f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz"
             f" ({how.torque_shape}) before it was recorded; the model is filtered alike",
             advice,
-            "condition",
         )
         return
     above = torque_noiseless_above(prepared.sources.training[0].recording)
     if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
-        yield Finding(
+        yield _condition(
             "torque bandwidth",
-            "doubtful",
             f"the recorded torque has nothing above {above:.2g} Hz, not even noise: it came through"
             " a low-pass before it was recorded, or was computed",
             advice,
-            "condition",
         )
 
 
@@ -202,7 +188,7 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
     """
     names, coarse = prepared.sources.cell.joint_names, dict[str, float]()
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
-        recording, motion = source.recording, samples.motion
+        recording = source.recording
         interval = float(np.median(np.diff(recording.time)))
         for j, name in enumerate(names):
             moves = np.abs(np.diff(recording.position[:, j]))
@@ -212,17 +198,15 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
             step = float(np.quantile(moves, _SMALL))
             width = min(samples.position_bandwidth[j], 0.5 / interval)
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
-            if np.sqrt(noise) > _COARSE * motion.acceleration[:, j].std():
+            if np.sqrt(noise) > _COARSE * samples.motion.acceleration[:, j].std():
                 coarse[name] = max(step, coarse.get(name, 0.0))
     if coarse:
         each = joined([f"{name} {step:.2g}" for name, step in coarse.items()])
-        yield Finding(
+        yield _condition(
             "resolution",
-            "doubtful",
             f"the positions are recorded in coarse steps [rad or m]: {each}; more than"
             f" {_COARSE:.0%} of the accelerations is rounding",
             "record positions with more digits, or identify with a lower --bandwidth",
-            "condition",
         )
 
 
@@ -273,13 +257,9 @@ def torque_limits(cell: Cell) -> Array | None:
         for joint in urdf_tree(cell.urdf).iter("joint")
         for limit in joint.iter("limit")
     }
-    limits = np.array([_positive(efforts.get(name, "")) for name in cell.joint_names])
+    limits = np.full(len(cell.joint_names), np.nan)
+    for j, name in enumerate(cell.joint_names):
+        with suppress(ValueError):
+            limits[j] = float(efforts.get(name, ""))
+    limits[~((limits > 0.0) & (limits < np.inf))] = np.nan
     return None if np.isnan(limits).all() else limits
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        return np.nan
-    return value if 0.0 < value < np.inf else np.nan

@@ -23,7 +23,7 @@ from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.batch import discovery, factors
-from hil.batch.cache import Store, Where
+from hil.batch.cache import Where
 from hil.batch.discovery import Discovery, discover
 from hil.batch.estimates import warning_lines
 from hil.batch.factors import cached, opened, reduced
@@ -139,7 +139,9 @@ class TestNumbers:
         """With the options that either has by default, which choose the settings."""
         one = identify_campaign(campaign.folder.root, Silent()).estimate
         found = batch(campaign.folder.root, options=Options())
-        (level,) = found.campaigns
+        (level,), (pooled,) = found.campaigns, found.pooled
+        assert pooled.values.tobytes() == level.values.tobytes()
+        assert (pooled.level, pooled.campaign) == ("pooled", "")
         np.testing.assert_allclose(level.values, one.pooled.values, **EXACT)
         np.testing.assert_allclose(level.covariance, one.pooled.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(level.noise_std, one.pooled.noise_std, **EXACT)
@@ -197,10 +199,6 @@ class TestNumbers:
             squares += np.where(samples.usable, error**2, 0.0).sum(axis=0)
             rows += samples.usable.sum(axis=0)
         np.testing.assert_allclose(level.unseen_rms, np.sqrt(squares / rows), rtol=1e-6)
-
-    def test_pooled_over_one_campaign_is_that_campaign(self, found: BatchResult) -> None:
-        assert found.pooled[0].values.tobytes() == found.campaigns[0].values.tobytes()
-        assert (found.pooled[0].level, found.pooled[0].campaign) == ("pooled", "")
 
     def test_campaigns_of_an_arm_are_pooled(
         self, campaign: Campaign, found: BatchResult, tmp_path: Path
@@ -339,18 +337,6 @@ class TestCache:
             if path.exists():
                 path.write_bytes(path.read_bytes()[:-1])
         assert same_bits(whole, batch(folder, where=Where()))
-
-    def test_of_something_else_counts_as_absent(self, folder: Path) -> None:
-        whole = batch(folder, where=Where())
-        store = Store(folder / "archives" / ".hil-cache")
-        keys = [
-            path.name for path in (folder / "archives" / ".hil-cache").rglob("*") if path.is_file()
-        ]
-        assert len(keys) > 5
-        for content in ({}, {"sum": [], "total": 3, "facts": None}):
-            for key in keys:
-                store.put(key, content)
-            assert same_bits(whole, batch(folder, where=Where()))
 
     def test_of_a_read_only_folder_lies_elsewhere(
         self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -34,7 +34,6 @@ from hil.version import install_command
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
 from tests.hil.mcap_bytes import metadata
-from tests.hil.web_folder import served
 
 PATIENCE = 60.0  # s; the machine may be busy
 
@@ -202,23 +201,6 @@ def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
     assert not found.broken
     assert len(found.campaigns) == 2
     assert _figures(found) == _figures(expected)
-
-
-@pytest.mark.slow
-def test_archives_behind_a_web_server_are_read_by_the_workers(
-    campaign: Campaign, cluster: Cluster
-) -> None:
-    where = Where(keep=False)
-    with (
-        served(campaign.folder.root) as address,
-        DaskWorkers(cluster.address, patience=PATIENCE) as workers,
-    ):
-        found = run.reidentify([address], FIXED, workers, Silent(), where=where)
-    with LocalWorkers(1) as local:
-        roots = [str(campaign.folder.root)]
-        expected = run.reidentify(roots, FIXED, local, Silent(), where=where)
-    assert not found.broken
-    assert [values for _, values in _figures(found)] == [values for _, values in _figures(expected)]
 
 
 class _KillsOne(Workers):

@@ -7,7 +7,6 @@ import shutil
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -134,21 +133,13 @@ def imported_ur5(folder: Path, time: np.ndarray, late: np.ndarray | float, still
 class TestCampaign:
     """What the archives of a campaign give."""
 
-    def test_has_58_parameters_with_their_rows_of_table_2(self, found: Identification) -> None:
+    def test_has_58_parameters_near_the_planted_ones(self, found: Identification) -> None:
+        """Of 58 normal deviates more than 3 outside 3 sigma come once in 10^5 tries."""
         ids = sorted(p.table2_id or 0 for p in found.results.parameters)
         assert ids == list(range(1, 59))
-
-    def test_nearly_all_planted_values_lie_within_3_sigma(self, found: Identification) -> None:
-        """Of 58 normal deviates more than 3 outside 3 sigma come once in 10^5 tries."""
         coverage = found.results.coverage
         assert coverage is not None
         assert coverage.within_3 >= 55
-
-    def test_held_out_torque_lies_inside_its_intervals(self, found: Identification) -> None:
-        calibration = found.results.calibration
-        assert calibration is not None
-        assert calibration.inside >= 0.93
-        assert None not in calibration.joint_inside
 
     def test_planned_criteria_are_those_that_were_executed(self, found: Identification) -> None:
         """At the same instants; stiction and noise of acceleration change columns by per mille."""
@@ -202,7 +193,8 @@ class TestOutcome:
         write_outcome(tmp_path, found, Silent())
         first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
         assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
-        assert Results.load(tmp_path / "results.json").exports is not None
+        written = Results.load(tmp_path / "results.json")
+        assert written == found.results.model_copy(update={"exports": written.exports})
         (tmp_path / "report.html").unlink()
         (tmp_path / "report.html").mkdir()
         other = replace(found, results=found.results.model_copy(update={"name": "other"}))
@@ -222,10 +214,6 @@ class TestOutcome:
         results.write_text(json.dumps(content))
         with pytest.raises(InputError, match=r"results\.json: holds what no page can be drawn"):
             rewrite_report(tmp_path)
-
-    def test_survives_its_file(self, found: Identification, tmp_path: Path) -> None:
-        found.results.save(tmp_path / "results.json")
-        assert Results.load(tmp_path / "results.json") == found.results
 
     @pytest.mark.parametrize(
         ("text", "sentence"),
@@ -462,22 +450,6 @@ class TestEstimators:
         assert 0.0 <= found.endogeneity.p_value <= 1.0
         assert not any("biased" in one for one in found.warnings)
 
-    def test_say_which_is_which(self, estimations: dict[Estimator, Estimation]) -> None:
-        said = {name: found.result.pooled.method for name, found in estimations.items()}
-        said.pop("auto")  # which is one of the others, or between two
-        assert len(set(said.values())) == len(said)
-        for name, word in (
-            ("wls", "weighted"), ("ols", "ordinary"), ("huber", "Huber"), ("tukey", "Tukey"),
-            ("prior", "prior"), ("consistent", "consistent"), ("iv", "instrumental"),
-        ):  # fmt: skip
-            assert word in said[cast(Estimator, name)]
-
-    def test_reduce_held_out_motion_recording_by_recording(
-        self, estimations: dict[Estimator, Estimation], prepared: Prepared
-    ) -> None:
-        rows = [one.samples.sum() for one in estimations["wls"].held_out]
-        assert rows == [int(samples.usable.sum()) for samples in prepared.held_out]
-
     def test_need_commands_as_instruments(self, prepared: Prepared) -> None:
         sources = prepared.sources
         training = tuple(
@@ -587,19 +559,6 @@ class TestCommand:
         assert isinstance(ran.exception, InputError)
         assert "--delay" in str(ran.exception)
         assert "or auto" in str(ran.exception)
-
-    @pytest.mark.parametrize(
-        ("wrong", "sentence"),
-        [
-            ({"estimator": "lms"}, "estimator: 'lms' is no estimator; use auto, wls"),
-            ({"method": "papers"}, "method: 'papers' is no method; use default, paper"),
-            ({"split": 1.5}, "split: 1.5 is no share; give one between 0 and 1"),
-        ],
-    )
-    def test_names_options_that_are_wrong(self, wrong: dict[str, object], sentence: str) -> None:
-        with pytest.raises(InputError) as caught:
-            Options(**wrong)  # type: ignore[arg-type]
-        assert sentence in str(caught.value)
 
 
 # One imported recording: split, or all of it fitted
@@ -768,12 +727,6 @@ class TestSeries:
             assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise
         assert np.isfinite(series.reversal_travel).all()  # dry friction turns round
         assert series.reversal_travel[-1] == pytest.approx(6e-4)
-
-    def test_residual_is_smaller_than_the_torque(self, series: ReportSeries) -> None:
-        """Where it moves."""
-        slow = series.spectrum_frequency < 2.0
-        smaller = series.spectrum_residual[slow] < series.spectrum_torque[slow]
-        assert smaller.mean() > 0.95
 
     def test_survives_the_folder_of_results(self, series: ReportSeries, tmp_path: Path) -> None:
         (tmp_path / "series.npz").write_bytes(_series_bytes(series))
