@@ -144,7 +144,16 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "held-out motion")
         held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
         task.advance(1)
-    pooled = result.pooled
+    endogeneity, more = _beside(name, result.pooled, instrumental)
+    warnings += more
+    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
+
+
+def _beside(
+    name: str, pooled: Estimate, instrumental: InstrumentalFit | str
+) -> tuple[EndogeneityTest | str, list[str]]:
+    """The test of the bias of least squares, or why there is none; and warnings."""
+    warnings: list[str] = []
     if not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
             f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR:"
@@ -166,7 +175,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
                 f" differ from it by up to {moved:.1%} of an axis's torque; compare with"
                 " --estimator iv, or measure positions with less noise"
             )
-    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
+    return endogeneity, warnings
 
 
 # What is believed before any data

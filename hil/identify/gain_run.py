@@ -11,7 +11,7 @@ import numpy as np
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ArchiveError, InputError
+from hil.errors import ArchiveError
 from hil.progress import Reporter
 from identification.estimators.gains import Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
@@ -96,9 +96,6 @@ def find_gains(
             load = loads[path.name] = loaded.get(path, cell.model.payload)
             factors.append(gain_factor(model, samples, current, payload=load, transmission=turns))
             task.advance(1, path.name)
-    if first is None:
-        raise InputError(
-            None, "there is no archive", remedy="name recordings with and without load"
-        )
+    assert first is not None, "the command line asks for an archive"
     gains = identify_gains(joined(factors), model.joint_names)
     return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
