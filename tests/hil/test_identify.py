@@ -285,7 +285,7 @@ class TestSources:
             ({"torque": False}, "no joint torques"),
             (
                 {"names": tuple(f"joint_{j}" for j in (2, 1, 3, 4, 5, 6))},
-                "recorded in the order joint_2, joint_1",
+                "the recorded joints are joint_2, joint_1",
             ),
         ],
     )
