@@ -23,7 +23,8 @@ from identification.model.pseudo_inertia import inertial_parameters, margin
 from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text
-from tests.identification.test_gains import URDF, lively, load_torque, samples_of, two_link
+from tests.identification.test_gains import lively, load_torque
+from tests.identification.two_link import MODEL, URDF, as_samples, truth
 
 TILTED = (2.0, -3.0, -9.0)
 INERTIA = (0.05, 0.01, -0.02, 0.04, 0.005, 0.03)
@@ -149,19 +150,18 @@ def recordings(
     seed: int = 0,
 ) -> tuple[RobotModel, list[Run]]:
     """Recordings of one motion of two links that turn about y, with friction that drifts."""
-    model, truth = two_link()
     rng, motion = np.random.default_rng(seed), lively(2, speed=pace)
     runs = []
     for k, load in enumerate(loads):
-        own = truth.copy()
+        own = truth()
         own[-4:] *= 1.0 + drift * np.tile(rng.standard_normal(2), 2)
-        torque = model.torque(own, *motion[1:])
+        torque = MODEL.torque(own, *motion[1:])
         if load is not None:
-            torque += load_torque(model, load, motion)
+            torque += load_torque(MODEL, load, motion)
         torque += noise * rng.standard_normal(torque.shape)
-        samples = replace(samples_of(model, motion), torque=torque)
-        runs.append(Run.of(f"run {k + 1}", model, samples, None, loaded=load is not None))
-    return model, runs
+        samples = as_samples(MODEL, motion, torque)
+        runs.append(Run.of(f"run {k + 1}", MODEL, samples, None, loaded=load is not None))
+    return MODEL, runs
 
 
 def estimate(loads: list[Payload | None], **options: float) -> PayloadEstimate:
@@ -307,12 +307,10 @@ class TestFrame:
         )
         urdf = URDF.replace("</robot>", tool)
         model, motion = RobotModel.from_urdf(urdf, friction=FrictionLaw(third=None)), lively(2)
-        bare = model.torque(two_link()[1], *motion[1:])
+        bare = model.torque(truth(), *motion[1:])
         loaded = bare + load_torque(model, replace(LOAD, frame="tool"), motion)
         runs = [
-            Run.of(
-                "run", model, replace(samples_of(model, motion), torque=torque), "tool", loaded=kind
-            )
+            Run.of("run", model, as_samples(model, motion, torque), "tool", loaded=kind)
             for kind, torque in ((False, bare), (True, loaded))
         ]
         found = identify_payload(model, runs)
@@ -321,7 +319,7 @@ class TestFrame:
         assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
 
     def test_a_frame_that_is_not_there_is_refused(self) -> None:
-        model, _ = recordings([None, LOAD])
-        samples = samples_of(model, lively(2))
+        motion = lively(2)
+        samples = as_samples(MODEL, motion, np.zeros_like(motion.position))
         with pytest.raises(ModelError, match="'tool9' is no link"):
-            Run.of("a", model, samples, "tool9", loaded=False)
+            Run.of("a", MODEL, samples, "tool9", loaded=False)
