@@ -79,7 +79,7 @@ def move(
     wanted = None
     if to is not None:
         motion = None if campaign is None else campaign.plan.excitation.trajectory
-        wanted = posture(cell, to, None if motion is None else motion.sample(np.zeros(1))[0][0])
+        wanted = posture(cell, to, None if motion is None else motion.sample(np.array([0.0]))[0][0])
     with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
         link.connection.say = partial(say, err=True)
         if yes and not link.only_simulated:

@@ -106,7 +106,7 @@ def test_the_reference_of_the_drivers_has_every_name() -> None:
     assert sorted(documented) == sorted(drivers.__all__)
 
 
-FINDINGS = ROOT / "identification" / "validation" / "findings.py"
+FINDINGS = ROOT / "identification" / "validation" / "verdict.py"
 COMMAND = re.compile(r"`hil ([^`]+)`")
 
 

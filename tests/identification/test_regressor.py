@@ -232,12 +232,8 @@ ESTIMATORS: dict[str, Callable[[Pieces], Estimate]] = {
     "prior": lambda pieces: (
         fit_with_prior(MODEL, recordings(pieces), nominal_prior(MODEL)).estimate
     ),
-    "huber": lambda pieces: (
-        robust_estimate(MODEL, recordings(pieces), Huber(), tolerance=1e-11).estimate
-    ),
-    "tukey": lambda pieces: (
-        robust_estimate(MODEL, recordings(pieces), Tukey(), tolerance=1e-11).estimate
-    ),
+    "huber": lambda pieces: robust_estimate(MODEL, recordings(pieces), Huber()).estimate,
+    "tukey": lambda pieces: robust_estimate(MODEL, recordings(pieces), Tukey()).estimate,
     "instrumental": lambda pieces: estimate_instrumental(MODEL, instruments(pieces)).estimate,
     "consistent": consistent,
 }
