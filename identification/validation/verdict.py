@@ -273,12 +273,14 @@ def _around_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         poor = bool(evidence.estimate.undetermined) or evidence.estimate.condition > limit.condition
         beyond = np.maximum(limit.delay * delays.cycle, SIGMAS * delays.std)
         late = delays.determined & (np.abs(delays.delays - assumed) > beyond)
+        on_time = delays.determined & ~late.any() & (not same) & (not poor)
         facts |= {
             "compensated": same, "common": 1e3 * delays.common, "stated": 1e3 * delays.assumed,
             "common_half": 1e3 * delays.half_interval, "assumed": 1e3 * assumed,
             "delay": 1e3 * delays.delays, "half": 1e3 * delays.interval_factor * delays.std,
             "late": late & (not same) & (not poor),
-            "on_time": delays.determined & ~late.any() & (not same) & (not poor),
+            "on_time": on_time & (not delays.agree),
+            "all_on_time": bool(on_time.any()) and delays.agree,
         }  # fmt: skip
     return facts
 
@@ -614,6 +616,9 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "the torque seems to lag the position by another time than was assumed:"
          " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>",
          "compare with `hil identify --delay auto`, or correct the delay in the cell", "cause"),
+    _Row("delay", {"good": "all_on_time"},
+         "no delay stands out but the assumed one; the torque lags the position by {common:.3g} ±"
+         " {common_half:.2g} ms ({stated:.3g} ms assumed)"),
     _Row("delay", {"good": "on_time"},
          "no delay stands out but the assumed one; the torque lags the position by:"
          " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>"),

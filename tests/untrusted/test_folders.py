@@ -291,7 +291,7 @@ NO_TIME = {
 def test_the_series_of_a_report_are_read_as_they_were_written(folder: Path) -> None:
     (folder / SERIES).write_bytes(series(MEMBERS))
     assert _load_series(folder / SERIES, 2).example_archive == "one.mcap"
-    with pytest.raises(InputError, match=r"\(5, 3\) was expected"):
+    with pytest.raises(InputError, match="2 columns, not 3"):
         _load_series(folder / SERIES, 3)
 
 
