@@ -29,13 +29,13 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 89_500,
-    "product files": 338,
-    "test lines": 84_200,
-    "test files": 350,
+    "product lines": 84_900,
+    "product files": 331,
+    "test lines": 80_700,
+    "test files": 326,
     "import circles": 0,
-    "imports inside functions": 35,
-    "files with one importer": 19,
+    "imports inside functions": 34,
+    "files with one importer": 17,
     "banned names": 0,
     "functions over 60 lines": 34,
 }

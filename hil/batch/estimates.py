@@ -253,8 +253,8 @@ def sum_level(
     left, torque = errors(unseen or Factor.zero(model), found.values)
     if not found.undetermined and found.condition > QR_CONDITION:
         conditioning = (
-            f"the scaled condition number is {found.condition:.2g}: the motion hardly tells some"
-            " parameters apart, and sums of squares lose digits there; `hil identify` on these"
+            f"the scaled condition number is {found.condition:.2g}: the motion separates some"
+            " parameters poorly, and sums of squares lose digits there; `hil identify` on these"
             " archives uses QR"
         )
         warnings = (conditioning, *warnings)

@@ -55,7 +55,7 @@ def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
 
 
 def weakest(objective: Objective, trajectory: Trajectory) -> tuple[str, ...]:
-    """Return the parameters that a motion tells apart least, those concerned most first.
+    """Return the parameters that a motion separates least, those concerned most first.
 
     They are the largest entries of the weakest eigenvector of the Gram matrix with columns of unit
     length, or the parameters that are not excited at all.

@@ -157,7 +157,7 @@ def _beside(
     if not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
             f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR:"
-            " the motion hardly tells some parameters apart"
+            " the motion separates some parameters poorly"
         )
     endogeneity: EndogeneityTest | str
     if isinstance(instrumental, str):

@@ -183,7 +183,7 @@ def _systematic_facts(names: tuple[str, ...], evidence: Evidence, limit: Thresho
             (
                 small & ~weighed,
                 "compare the torque constant of {} with the drive's data sheet: gravity does not"
-                " load it, so that no payload tells it",
+                " load it, so that no payload determines it",
             ),
         )
         if axes.any()
@@ -476,7 +476,7 @@ def _mended(facts: Facts, _: Sequence[str]) -> Iterator[Finding]:
 _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], ...]] = (
     _Row("tested", {"wrong": "everything"},
          "everything was fitted and nothing held out: all errors are in-sample, and no unseen"
-         " motion tells whether the model predicts",
+         " motion shows whether the model predicts",
          "run `hil identify --predict ARCHIVE` with a recording that is not fitted, without"
          " `hil identify --in-sample`"),
     _Row("tested", {"wrong": "still"},
