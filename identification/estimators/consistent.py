@@ -13,7 +13,8 @@ nominal (CAD) bodies (Lee, Wensing and Park 2020), the dots are squares of rotor
 nominal, where there is one) and friction in units that make them small. The data alone leave many
 standard parameters open; there the nominal decides, elsewhere it weighs as much as `prior_weight`
 rows of data: next to nothing. D is infinite at the edge of what is possible, so the result is
-strictly inside, and Newton's method finds it.
+strictly inside: a conic solver comes near it, and Newton's method ends there; where no machine
+fits the data, Newton's method alone on a path of falling prior weights.
 
 Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
 diagonal, has to be positive definite in place of I_im >= 0. What friction needs to take energy says
@@ -32,9 +33,10 @@ few per cent apart); what it hardly determines follows the machine.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +69,8 @@ Array = NDArray[np.float64]
 
 _STEPS: Final = 200
 _HALVINGS: Final = 40
-# Of all weights on the way together. Data that machines fit need some hundred; those that none fits
-# have ended after 1400 steps, or in none of 40 000.
+# Of all weights on the way together: data that no machine fits have ended after 1400 steps, or in
+# none of 40 000.
 _PATH_STEPS: Final = 3000
 # Of a variable whose reference is one: on the bound.
 _ON_BOUND: Final = 1e-6
@@ -80,9 +82,7 @@ _SINGULAR: Final = 1e-7
 _ROUNDING: Final = 1e-12
 _VANISHING: Final = 1e-30
 _ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
-# By which the prior's weight falls at once: quick where some machine fits, and careful.
-_QUICK, _CAREFUL = 1e4, 10.0
-_QUICK_STEPS: Final = 250
+_WEIGHT_STEP: Final = 10.0
 _SAME_WEIGHT: Final = 1e-9
 _N_LINK: Final = len(LINK_SYMBOLS)
 # Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
@@ -95,8 +95,10 @@ _INSIDE: Final = 1e-6
 # Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
 # a pseudo-inertia at the edge is singular to rounding then.
 _MOST_ROWS: Final = 100_000
-# From a near solution: steps in all, and the change of the prior's weight at which they end.
-_NEAR_STEPS: Final = 200
+# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
+# so near the conic solver is quicker; and the change of that weight at which they end.
+_NEAR_STEPS: Final = 10
+_NEAR_NEWTON: Final = 20
 _NEAR_WEIGHT: Final = 0.01
 
 
@@ -263,15 +265,7 @@ def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array 
     return None
 
 
-def follow_path(
-    problem: Smooth,
-    start: Array,
-    weight: Callable[[Array], float],
-    first: float,
-    most_steps: int = _PATH_STEPS,
-    same: float = _SAME_WEIGHT,
-    fall: float = _CAREFUL,
-) -> Minimum:
+def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float]) -> Minimum:
     """Return the minimum from far away: the weight of the prior falls in steps (a barrier method).
 
     With much weight the minimum is near the reference; each of the following is near the one
@@ -281,19 +275,16 @@ def follow_path(
         problem: its own weight does not matter.
         start: inside (v,), as the reference is.
         weight: the weight to end with, from u.
-        first: the weight to begin with.
-        most_steps: of Newton's method, in all.
-        same: relative change of the weight at which it is the one to end with.
-        fall: factor by which the weight falls at once.
     """
-    found, steps, now = Minimum(start, converged=False), 0, first
-    while steps < most_steps:
-        found = polish(problem._replace(weight=now), found.u, min(_STEPS, most_steps))
+    found, steps = Minimum(start, converged=False), 0
+    now = max(problem.excess(start), weight(start))
+    while steps < _PATH_STEPS:
+        found = polish(problem._replace(weight=now), found.u)
         steps += found.steps
         last = weight(found.u)
-        if found.converged and abs(last - now) <= same * now:
+        if found.converged and abs(last - now) <= _SAME_WEIGHT * now:
             return found
-        now = max(last, now / fall)
+        now = max(last, now / _WEIGHT_STEP)
     return found._replace(converged=False)
 
 
@@ -398,7 +389,7 @@ class Program:
                 when the prior's weight has settled to a hundredth; good for comparisons.
 
         Raises:
-            SolverError: Newton's method found no answer.
+            SolverError: neither the conic solver nor Newton's method found one.
         """
         smooth, rows = self.smooth, min(max(n_rows, 1), _MOST_ROWS)
 
@@ -406,27 +397,59 @@ class Program:
             return smooth.weight * max(1.0, smooth.excess(u) / rows)
 
         if near is not None:
-            found = follow_path(smooth, near, weight, weight(near), _NEAR_STEPS, _NEAR_WEIGHT)
-            if found.converged:
-                return found.u, "near optimal"
+            now = weight(near)
+            for _ in range(_NEAR_STEPS):
+                found = polish(smooth._replace(weight=now), near, _NEAR_NEWTON)
+                if not found.converged:
+                    break
+                near, last = found.u, now
+                now = weight(near)
+                if abs(now - last) <= _NEAR_WEIGHT * last:
+                    return near, "near optimal"
+        start, status = _solve_cone(smooth)
+        if start is not None:
+            found = polish(smooth, start)
+            if found.converged and weight(found.u) == smooth.weight:
+                return found.u, "optimal"
         reference = np.zeros(smooth.R.shape[1])
         for cone in smooth.cones:
             reference[cone.places] = cone.unit
-        first = max(smooth.excess(reference), weight(reference))
-        found = follow_path(
-            smooth, reference, lambda _: smooth.weight, first, _QUICK_STEPS, fall=_QUICK
-        )
-        if not (found.converged and weight(found.u) == smooth.weight):
-            found = follow_path(smooth, reference, weight, first)
+        found = follow_path(smooth, reference, weight)
         if found.converged:
-            fits = weight(found.u) == smooth.weight
-            return found.u, "optimal" + (
-                "" if fits else " (no machine fits these data to their noise)"
-            )
+            return found.u, "optimal (no machine fits these data to their noise)"
         raise SolverError(
-            f"no solution was found in {_PATH_STEPS} steps of Newton's method; with a prior weight"
+            f"no solution was found, the conic solver stopped with: {status}; with a prior weight"
             f" above {smooth.weight:g} there may be one"
         )
+
+
+def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
+    """Return the conic solver's solution u, if it has one, and its word for it."""
+    import cvxpy  # a third of a second to import, and only this estimate needs it
+
+    cp: Any = cvxpy  # its names come from star imports, which a type checker does not follow
+    u = cp.Variable(smooth.R.shape[1])
+    prior: Any = cp.sum_squares(u[smooth.R.shape[1] - len(smooth.centre) :] - smooth.centre)
+    constraints: list[Any] = [u[smooth.not_negative] >= 0.0]
+    for cone in smooth.cones:
+        size = cone.entries.shape[1]
+        for places in cone.places:
+            entries = cone.entries.reshape(-1, size * size).T @ u[places]
+            matrix = cp.reshape(entries, (size, size), order="C")
+            prior = prior - cone.barrier * cp.log_det(matrix)
+            if cone.pull:
+                prior = prior + cone.pull * cp.trace(matrix)
+                constraints.append(matrix >> _INSIDE * np.eye(size))
+    error = cp.sum_squares(smooth.R @ u - smooth.z)
+    problem = cp.Problem(cp.Minimize(error + smooth.weight * prior), constraints)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # an inaccurate solution is named by its status
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except cp.error.SolverError as failure:
+            return None, f"failed ({failure})"
+    usable = problem.status in ("optimal", "optimal_inaccurate") and u.value is not None
+    return (np.asarray(u.value, dtype=np.float64) if usable else None), str(problem.status)
 
 
 def _coupled_rotors(model: RobotModel, first: int) -> Cone:

@@ -427,7 +427,7 @@ class TestNewton:
         found = [
             polish(problem, start()),
             polish(problem, start(3.0)),
-            follow_path(problem, start(), lambda _: problem.weight, 1e3),
+            follow_path(problem, start(), lambda _: problem.weight),
         ]
         assert all(one.converged for one in found)
         for one in found[1:]:
