@@ -153,8 +153,8 @@ def measure(paths: Sequence[Path], turns: int) -> dict[str, Any]:
         for name, decode in decoders.items():
             count = min(len(paths), shares.get(name, 3))
             first = turn * count % max(1, len(paths) - count + 1)
-            taken = paths[first : first + count]
-            rounds[name].append(timed(partial(decode_all, decode, taken)) * len(paths) / len(taken))
+            some = paths[first : first + count]
+            rounds[name].append(timed(partial(decode_all, decode, some)) * len(paths) / len(some))
     times = {name: float(np.median(values)) for name, values in rounds.items()}
     mcap = min(times["mcap_seeking"], times["mcap_streaming"])
     return {

@@ -325,10 +325,10 @@ def test_a_run_whose_folder_is_removed_says_so_with_the_arm_at_rest(
     controller = simulated_controller(small.cell, settings=controller_settings(small.cell))
     link = Link.over(SimulatedTransport(controller), small.cell, finish=controller.finish)
     remove_at(monkeypatch, small, "excitation_000_a1.mcap", parts)
-    with pytest.raises(HilError) as told:
+    with pytest.raises(HilError) as raised:
         small.run(link, None, Silent(), accept_dry_run=True, durable=True)
     monkeypatch.undo()
-    assert told.value.exit_code in (1, 2)
-    assert str(root) in str(told.value)
-    assert "see whether it was moved or removed" in str(told.value)
+    assert raised.value.exit_code in (1, 2)
+    assert str(root) in str(raised.value)
+    assert "see whether it was moved or removed" in str(raised.value)
     assert np.abs(controller.plant.velocity).max() < 1e-3

@@ -117,7 +117,7 @@ def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
     except HilError as error:
         told = error
     struck = disk.do_wrong()
-    assert bool(struck) == (told is not None), f"{struck} struck, and it was told: {told}"
+    assert bool(struck) == (told is not None), f"{struck} struck, and it was raised: {told}"
     if told is not None:
         require_told(told, campaign.folder.root)
     after = entered(campaign)
@@ -174,7 +174,7 @@ def test_a_refusal_that_is_swallowed_is_found(
             true(*arguments, **named)
 
     monkeypatch.setattr(Campaign, "run", swallowing)
-    with pytest.raises(AssertionError, match="struck, and it was told: None"):
+    with pytest.raises(AssertionError, match="struck, and it was raised: None"):
         refused_run(disk, campaign, Rule((WRITE,), "*.mcap", error="EIO"))
 
 
@@ -199,10 +199,10 @@ def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(
     for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
         campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
         disk.do_wrong(Rule((operation,), after=after, error="EIO"))
-        with pytest.raises(HilError) as told:
+        with pytest.raises(HilError) as raised:
             campaign.rehearse()
         assert disk.do_wrong()
-        require_told(told.value, campaign.folder.root)
+        require_told(raised.value, campaign.folder.root)
         (campaign.folder.rehearsed / "plain" / "manifest.json").unlink(missing_ok=number == 2)
         assert Campaign.open(campaign.folder.root).rehearse().passed
 

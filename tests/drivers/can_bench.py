@@ -240,7 +240,7 @@ _OK, _BELL = b"\r", b"\a"
 
 
 class _Adapter:
-    """One adapter: its end of the pseudo-terminal and what it was told."""
+    """One adapter: its end of the pseudo-terminal and the commands that it got."""
 
     def __init__(self) -> None:
         self.master, self._slave = pty.openpty()

@@ -90,7 +90,7 @@ def init_packet(**changes) -> InitPacket:
 
 
 class Cruise:
-    """Joint 1 gathers speed, cruises for ever, and stops when told to; the others stand."""
+    """Joint 1 gathers speed, cruises for ever, and stops when asked to; the others stand."""
 
     RAMP = 0.4
     SPEED = 0.3
@@ -190,7 +190,7 @@ class Correction:
 
 
 class GoesOn(Table):
-    """A table of a stop: has the bounds of one from being told to, and plays on to its end."""
+    """A table of a stop: has the bounds of one from the request on, and plays on to its end."""
 
     def stop(self):
         self.bounds = "stop"
@@ -221,7 +221,7 @@ class Unspeakable(BaseException):
 
 
 class Rig:
-    """Session and controller. The arm is where the last answer told it to be."""
+    """Session and controller. The arm is where the last answer commands it to be."""
 
     def __init__(
         self,
@@ -320,12 +320,12 @@ class Rig:
 
     def _obey(self, answer: CyclicPacket) -> None:
         self.exits_asked += answer.status[0] == 1
-        told = answer.axes
-        if np.isin(told["mode"], NOT_SET_POINTS).any():
+        commanded = answer.axes
+        if np.isin(commanded["mode"], NOT_SET_POINTS).any():
             return
-        moved = np.isin(told["mode"], (*POSITION_MODES,))
+        moved = np.isin(commanded["mode"], (*POSITION_MODES,))
         for target, field in ((0, 0), (2, 0), (1, 1), (3, 1)):
-            self.axes["d"][moved, target] = told["d"][moved, field]
+            self.axes["d"][moved, target] = commanded["d"][moved, field]
 
     def close(self) -> CyclicPacket | None:
         """To closed axes, drive on."""

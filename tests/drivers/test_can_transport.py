@@ -267,7 +267,7 @@ def test_cyclic_frames_before_any_init_packet_are_counted(profile):
 
 
 class Failing(can.BusABC):
-    """A bus that raises what it is told to."""
+    """A bus that raises what it is given."""
 
     def __init__(self, error):
         super().__init__("failing")
@@ -497,7 +497,7 @@ def test_a_whole_session_over_two_serial_adapters(profile):
 
 
 class Overflowing(queue.Queue):
-    """The kernel's receive queue: what finds it full is dropped, and nobody is told."""
+    """The kernel's receive queue: what finds it full is dropped, without a notice."""
 
     ROOM = 7
 

@@ -144,10 +144,10 @@ class UdpController:
             return
         if not self.open:
             return
-        told = answer.axes["d"]
-        self.axes["d"][:, 0] = self.axes["d"][:, 2] = told[:, 0]
-        self.axes["d"][:, 1] = self.axes["d"][:, 3] = told[:, 1]
-        self.targets.append(told[:, 0].astype(float))
+        commanded = answer.axes["d"]
+        self.axes["d"][:, 0] = self.axes["d"][:, 2] = commanded[:, 0]
+        self.axes["d"][:, 1] = self.axes["d"][:, 3] = commanded[:, 1]
+        self.targets.append(commanded[:, 0].astype(float))
         if answer.status[0] == 1:
             self.exits += 1
             self.open = False
@@ -161,7 +161,7 @@ class UdpController:
 
     @property
     def path(self) -> np.ndarray:
-        """Joint positions (m, n) the arm was told to go to."""
+        """Joint positions (m, n) the arm was commanded to."""
         return self.train.joint_position(np.array(self.targets))
 
     @property

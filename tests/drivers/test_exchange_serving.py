@@ -170,17 +170,17 @@ class TestEventLog:
     def test_every_event_is_read_in_order_or_counted_as_lost(self, steps, capacity):
         fd = event_log.create(capacity)
         writer, reader = EventWriter(fd), EventReader(fd)
-        written, seen, told = 0, [], 0
+        written, seen, reported = 0, [], 0
         for count in steps:
             for cycle in range(written, written + count):
                 writer.write(PacketRejected("x" * (cycle % 30), cycle))
             written += count
             events = reader.drain()
             seen += [event.count for event in events if isinstance(event, PacketRejected)]
-            told += sum(event.count for event in events if isinstance(event, EventsLost))
+            reported += sum(event.count for event in events if isinstance(event, EventsLost))
         assert seen == sorted(set(seen))
         assert len(seen) + reader.lost == written
-        assert told == reader.lost
+        assert reported == reader.lost
         os.close(fd)
 
     def test_a_torn_frame_is_lost_and_not_believed(self):
@@ -222,17 +222,17 @@ class TestEventLog:
 class TestDigest:
     @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=200))
     def test_nothing_is_lost_and_little_is_told(self, steps):
-        digest, told, now, rejected, missed = Digest(), [], 0.0, 0, 0
+        digest, reported, now, rejected, missed = Digest(), [], 0.0, 0, 0
         for count, kind in steps:
             events = [PacketRejected(f"kind {kind}", count), GapSeen(count, round(now * 1000))]
             rejected += count
             missed += count
-            told += [(now, event) for event in digest.take(events, now)]
+            reported += [(now, event) for event in digest.take(events, now)]
             now += 0.001
-        told += [(now, event) for event in digest.rest()]
-        assert sum(e.count for _, e in told if isinstance(e, PacketRejected)) == rejected
-        assert sum(e.missed for _, e in told if isinstance(e, GapSeen)) == missed
-        assert len(told) <= 5 * (now / 0.1 + 2)
+        reported += [(now, event) for event in digest.rest()]
+        assert sum(e.count for _, e in reported if isinstance(e, PacketRejected)) == rejected
+        assert sum(e.missed for _, e in reported if isinstance(e, GapSeen)) == missed
+        assert len(reported) <= 5 * (now / 0.1 + 2)
 
     def test_the_first_of_a_sort_is_told_at_once_and_the_rest_when_the_time_is_over(self):
         digest = Digest()
@@ -420,7 +420,7 @@ STEP = 0.01
 
 
 class Told:
-    """A session that is in the state it is told to be in, and hears a packet per step."""
+    """A session that is in a given state, and hears a packet per step."""
 
     requested = False
     interval = -1

@@ -703,20 +703,20 @@ class Sent:
     """Set-points of a joint from TURNS on, each `step` further; the other joints stand."""
 
     def __init__(self, step: float, depth: int = 3, count: int = 8, joint: int = 1):
-        self.taken = SentSetPoints(Guard(limits(), PERIOD), depth)
+        self.set_points = SentSetPoints(Guard(limits(), PERIOD), depth)
         self.step = step * np.eye(N)[joint]
         self.last = TURNS
-        self.taken.begin(TURNS)
+        self.set_points.begin(TURNS)
         for _ in range(count):
             self.add(1.0)
 
     def add(self, steps: float) -> None:
         self.last = self.last + steps * self.step
-        self.taken.add(self.last)
+        self.set_points.add(self.last)
 
     def check(self, ahead: float, missed: int = 0, **named) -> int:
         """A target so many steps ahead of the one sent last."""
-        return self.taken.check(self.last + ahead * self.step, missed, 7, **named)
+        return self.set_points.check(self.last + ahead * self.step, missed, 7, **named)
 
     def refuses(self, ahead: float, missed: int = 0) -> bool:
         try:
@@ -774,7 +774,7 @@ class TestWhere:
     def test_a_target_that_is_no_number_is_named_as_such(self, value):
         target = np.where(np.arange(N) == 4, value, TURNS)
         with pytest.raises(NotFinite) as caught:
-            Sent(0.0).taken.check(target, 0, 3)
+            Sent(0.0).set_points.check(target, 0, 3)
         assert (caught.value.joint, caught.value.cycle) == (4, 3)
 
     def test_only_the_joints_asked_for_matter(self):
@@ -799,7 +799,7 @@ class TestHowMany:
         sent.add(1.0)
         sent.add(2.1)
         sent.add(-1.0)  # one more of these steps is a tenth of a step from two set-points ago
-        assert sent.taken.check(sent.last - sent.step, 1, 7) == 0
+        assert sent.set_points.check(sent.last - sent.step, 1, 7) == 0
 
     def test_what_other_joints_do_is_no_excuse_for_one_that_is_behind(self):
         """They stand where they were, which a target carried on is as well."""
@@ -820,7 +820,7 @@ class TestHowMany:
         for _ in range(4):
             sent.add(1.0)
         target = sent.last - sent.step * np.array([0, 1, 0, 0, 2, 0])
-        assert sent.taken.check(target, 0, 1) == 2
+        assert sent.set_points.check(target, 0, 1) == 2
 
     def test_what_a_standing_joint_moves_hides_one(self):
         share = 0.999 * STANDSTILL
@@ -843,43 +843,43 @@ class TestHowMany:
     def test_only_a_step_that_is_not_small_is_sent_again(self, share, again):
         sent = Sent(share * STANDSTILL)
         assert sent.check(-1.0) == 1
-        assert sent.taken.again is again
+        assert sent.set_points.again is again
 
     def test_sent_again_each_cycle_is_one_more_until_it_is_taken(self):
         sent = Sent(SLOW)
         for _ in range(5):
             assert sent.check(-1.0) == 1
-            assert sent.taken.again
-            sent.taken.repeat()
+            assert sent.set_points.again
+            sent.set_points.repeat()
         assert sent.check(0.0) == 0
-        assert not sent.taken.again
+        assert not sent.set_points.again
 
     @pytest.mark.parametrize("stopping", [False, True])
     def test_behind_after_a_repetition_is_lost_or_on_the_way_to_rest_late(self, stopping):
         """Sent again, a set-point looks taken to whoever reports a cycle late."""
         sent = Sent(SLOW)
         sent.check(-1.0)
-        sent.taken.repeat()
+        sent.set_points.repeat()
         sent.check(0.0)
         for _ in range(3):
             sent.add(1.0)
             assert sent.check(-1.0, stopping=stopping) == (not stopping)
-            assert sent.taken.again is not stopping
+            assert sent.set_points.again is not stopping
             if not stopping:
-                sent.taken.repeat()
+                sent.set_points.repeat()
                 sent.check(0.0)
 
     def test_a_controller_that_never_takes_it_is_refused(self):
         sent = Sent(SLOW)
         for _ in range(REPETITIONS):
             sent.check(-1.0)
-            sent.taken.repeat()
+            sent.set_points.repeat()
         assert sent.refuses(-1.0)
 
     def test_the_next_time_in_open_mode_begins_anew(self):
         sent = Sent(SLOW)
         assert sent.check(-1.0) == 1
-        sent.taken.begin(TURNS)
+        sent.set_points.begin(TURNS)
         sent.last = TURNS
         sent.add(1.0)
         assert sent.check(-1.0) == 1

@@ -955,10 +955,10 @@ class TestReopenedWhileLeaving:
         rig.axes["mode"][2] = Mode.POSITION
         answer = rig.cycle()
         assert rig.state is State.EXITING
-        told = answer.axes["d"]
-        assert told[2, 0] == np.float32(end[2] + 0.5)
-        np.testing.assert_array_equal(np.delete(told[:, 0], 2), np.delete(end, 2))
-        assert not told[:, 1].any()
+        commanded = answer.axes["d"]
+        assert commanded[2, 0] == np.float32(end[2] + 0.5)
+        np.testing.assert_array_equal(np.delete(commanded[:, 0], 2), np.delete(end, 2))
+        assert not commanded[:, 1].any()
         rig.axes["d"][2, 2] += 2.01
         assert rig.cycle().axes["mode"].tolist() == [4, 4, 508, 4, 4, 4]
 

@@ -68,9 +68,9 @@ def test_a_plan_whose_moves_are_none_is_told_with_its_archive(tmp_path: Path) ->
     forged = SimpleNamespace(path=path, attachments={"plan.json": plan})
     forged.table = MethodType(Archive.table, forged)
     archive = cast("Archive", forged)
-    with pytest.raises(ArchiveError, match="its plan cannot be read") as told:
+    with pytest.raises(ArchiveError, match="its plan cannot be read") as raised:
         class_in(archive)
-    assert str(path) in str(told.value)
+    assert str(path) in str(raised.value)
 
 
 # What a search keeps
