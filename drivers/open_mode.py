@@ -393,9 +393,9 @@ class PositionMode(_OpenMode):
         ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
-        step = self._still if moved and not moves else step
+        # What counts as standstill does not say whether a slow motion was held; its target does.
+        step = self._still if not moves and (moved or steps == 0) else step
         self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
-        # What counts as standstill does not say how fast a slow motion is.
         step = velocity[0] if moves else step
         position = self.held + self._wire.joint_difference(target - self._sent)
         speed = self._wire.joint_difference(step) / self._guard.period

@@ -261,20 +261,20 @@ class TrajectoryPlayer:
             StartMismatch: a joint is farther from the planned start than the tolerance.
             LimitExceeded: with the difference carried along, a joint would leave its range.
         """
-        offset = self._near(position, self._start)
+        offset = self._near(position, self._start, self._tolerance)
         self._check_range(offset)
         # The table stays as it is: to copy it would cost the cycle of the first set-point.
         self._offset = offset
         self._begun = True
         self._rewind()
 
-    def _near(self, position: Array, point: Array) -> Array:
+    def _near(self, position: Array, point: Array, tolerance: float) -> Array:
         """Return how far (n,) [rad] a position is from a point of the path, if that is near."""
         offset = np.asarray(position, dtype=np.float64) - point
-        off = ~(np.abs(offset) <= self._tolerance)  # written so that NaN is off
+        off = ~(np.abs(offset) <= tolerance)  # written so that NaN is off
         if np.any(off):
             joint = int(np.argmax(off))
-            raise StartMismatch(joint, float(position[joint]), float(point[joint]), self._tolerance)
+            raise StartMismatch(joint, float(position[joint]), float(point[joint]), tolerance)
         return offset
 
     def _check_range(self, offset: Array) -> None:
@@ -314,7 +314,9 @@ class TrajectoryPlayer:
             before, s = s, min(max(s + float((here - point) @ speed) / square, 0.0), self._duration)
             if abs(s - before) <= _ROUNDING * self._period:
                 break
-        self._offset = self._offset + self._near(here, point)
+        self._near(here, point, self._tolerance)
+        # However many gaps there are: once the tolerance for the start, once for all of them.
+        self._offset = self._near(position, point, 2.0 * self._tolerance)
         self._last = position
         self._tabled = False
         rate, stopping = max(0.0, float(velocity @ speed) / square), self._allowed["stop"]

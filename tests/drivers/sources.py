@@ -41,7 +41,10 @@ class Scripted:
             return False
         return self.index + 1 >= len(self.motion)
 
+    asked = 0
+
     def advance(self):
+        self.asked += 1
         if self._breaks("raises"):
             raise ZeroDivisionError("advance")
         self.index = min(self.index + 1, len(self.motion) - 1)

@@ -557,6 +557,20 @@ class TestLongGaps:
         assert rig.state is State.OPEN
         assert (source.advances, source.stops) == (301, 0)
 
+    def test_a_motion_that_was_held_as_it_began_stays_where_it_is(self):
+        """Slower than what counts as standstill, only its target shows that it was held."""
+        path = plan([START, START + MOVE * 6.0], JointLimits(**PLANNED))
+        rig = running(TrajectoryPlayer(path, PERIOD, JointLimits(**PLANNED)))
+        target = rig.axes["d"][:, 0].copy()
+        while np.abs(rig.axes["d"][:, 0] - target).max() < 0.5 * limits().standstill:
+            target = rig.axes["d"][:, 0].copy()
+            rig.cycle()
+        target = rig.axes["d"][:, 0].copy()
+        self.held(rig.axes["d"])
+        rig.miss(8)
+        np.testing.assert_allclose(rig.cycle().axes["d"][:, 0], target, rtol=0, atol=1e-6)
+        rig.run_to("stopped")
+
     def test_a_motion_that_creeps_below_standstill_may_be_stopped(self):
         rig, source, _ = self.after_gap(3, self.held, cycles=5)
         assert rig.state is State.OPEN

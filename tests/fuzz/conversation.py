@@ -242,6 +242,7 @@ class Conversation(Judged):
         assert self.conduct.usable or self.session.init is None
         self.conduct.entitled = True
         self.conduct.stopping = self.conduct.overridden = False
+        self.source = source
 
     def _motion(self, *, other_kind: bool) -> ScriptedMotion | ScriptedCorrection:
         draw, n = self._draw, self.arm.n

@@ -285,6 +285,19 @@ class TestCarriedOn:
 
         assert set_points_to_rest(True) <= 2 * set_points_to_rest(False)
 
+    def test_however_many_gaps_it_stays_within_twice_the_tolerance(self, motions, six_axis_limits):
+        """A controller that leads it 0.4 mrad aside at each gap is not followed without end."""
+        player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+        player.begin(player.start)
+        aside = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-4])
+        before, last = ([player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))])[
+            -2:
+        ]
+        with pytest.raises(StartMismatch, match=r"at most 0\.002 rad"):
+            for _ in range(30):
+                player.go_on_from(last + aside, (last - before) / PERIOD, 2)
+                before, last = last + aside, player.advance()[0]
+
     def test_brought_to_rest_it_stays_there(self, carried):
         player, last, step = carried
         player.go_on_from(last + step, 0.0 * step, 2)

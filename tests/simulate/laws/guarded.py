@@ -68,13 +68,17 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
     moved = np.append(False, (stretch.step[:-1] != 0.0).any(axis=1))
     gaps = stretch.talk.records["gap"][stretch.rows].astype(np.intp)
     # Those that were heard and are in the gap, as of a pile, count once; twice if the session saw
-    # them with a corrupted number, which only a set-point that goes on from the target shows; one
-    # that is sent again begins there, too.
+    # them with a corrupted number, which only a set-point that goes on from the target, or rests
+    # there, shows; one that is sent again begins there, too.
     twice = _unanswered_before(stretch)
     once = np.maximum(gaps, twice - gaps)
     before = np.concatenate((stretch.sent[:1], stretch.sent[:-1]))
     begun = stretch.sent - stretch.step  # where each step begins, by its own account
-    led = np.abs(begun - stretch.received[0]).max(axis=1) < np.abs(begun - before).max(axis=1)
+    off_target = np.abs(begun - stretch.received[0]).max(axis=1)
+    off_before = np.abs(begun - before).max(axis=1)
+    rounding = np.spacing(np.abs(begun).max(axis=1).astype(np.float32))
+    rests = (np.abs(stretch.step).max(axis=1) <= rounding) & (off_target <= rounding)
+    led = rests | (off_target < off_before)
     missed = np.where((once <= most) & led & ~stretch.again, twice, once)
     cuts = np.flatnonzero((missed > most) & moved)
     cuts = cuts[cuts < stretch.leading]
@@ -351,6 +355,8 @@ def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]
     first = stretch.received[0, :1] if stretch.carried else motor[:1]
     step = np.diff(motor, axis=0, prepend=first)
     slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
+    if stretch.carried:  # a motion that rests already goes on from its own set-point
+        slack[0] += np.spacing(np.abs(first[0]).astype(np.float32))
     if np.any(np.abs(told - step) > slack):
         yield "D2 is not the step from one set-point to the next"
 

@@ -83,7 +83,7 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         record, one = talk.records[row], talk.life.exchanged[index]
         unanswered = int(record["gap"]) + index - last - 1
         last = index
-        conduct.judge(one.packet, one.replies[0], record, unanswered > conduct.max_gap)
+        conduct.judge(one.packet, one.replies[0], record, unanswered)
 
 
 def _note(conduct: Conduct, what: str) -> None:

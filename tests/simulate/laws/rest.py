@@ -41,7 +41,8 @@ def rest(observed: Observed) -> Iterator[Broken]:
         if _ends_at_rest(life) and life.exchanged:
             at = min(life.last_cycle, len(arm.open_axes) - 1)
             speed = np.abs(arm.velocity[at])
-            if not disturbed and (speed > observed.cell.model.friction.standstill).any():
+            swings = disturbed or _held_up(life)
+            if not swings and (speed > observed.cell.model.friction.standstill).any():
                 yield Broken(LAW, f"life {number} ends on a moving arm: {speed.max():.2g} rad/s")
             if arm.open_axes[at]:
                 yield Broken(LAW, f"life {number} ends with open axes, phase {arm.phase[at]}")
@@ -50,6 +51,12 @@ def rest(observed: Observed) -> Iterator[Broken]:
 def _speed(velocity: Array, gears: Gears, period: float) -> float:
     """The fastest motor, revolutions per cycle, of joint velocities (k, n) [rad/s]."""
     return float(np.abs(velocity @ gears.matrix.T).max(initial=0.0) * period)
+
+
+def _held_up(life: Life) -> bool:
+    """Whether the controller may have stopped the last motion at once, so that the servo swings."""
+    ends = [event.reason for _, event in life.events if isinstance(event, MotionEnded)]
+    return any("missed in a row" in reason for reason in ends[-1:])
 
 
 def _ends_at_rest(life: Life) -> bool:
