@@ -135,11 +135,7 @@ def _reasons(
 
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Noise of each current (n,) and inverse gain (n,), each motor with parameters of its own.
-
-    The current is then linear in [W | t], with the inverse gain as the coefficient of t. What one
-    motor alone does not determine is given the others' typical value, to start from.
-    """
+    """Noise of each current (n,) and inverse gain (n,), each motor with parameters of its own."""
     n, p = len(total), total.shape[1] - 2
     noise, inverses = np.full((2, n), np.nan)
     for m in np.flatnonzero(rows):

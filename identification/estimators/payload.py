@@ -312,23 +312,14 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
 
 
 class _Fit(NamedTuple):
-    """Solution of the joint problem.
+    """Solution of the joint problem."""
 
-    Attributes:
-        values: of all unknowns.
-        bodies: places of each body's parameters among them.
-        root: of the inverse of the information, on what is determined.
-        scale: length of each column.
-        clustered: covariance.
-        weights: inverse variances of the joints (n,), of white noise.
-    """
-
-    values: Array
-    bodies: list[NDArray[np.intp]]
-    root: Array
-    scale: Array
-    clustered: Clustered
-    weights: Array
+    values: Array  # of all unknowns
+    bodies: list[NDArray[np.intp]]  # places of each body's parameters among them
+    root: Array  # of the inverse of the information, on what is determined
+    scale: Array  # length of each column
+    clustered: Clustered  # covariance
+    weights: Array  # inverse variances of the joints (n,), of white noise
 
     def determined(self, part: NDArray[np.intp]) -> Array:
         """Combinations (r, k) of k unknowns that are determined, in comparable units."""
@@ -351,14 +342,7 @@ class _Rows(NamedTuple):
 def _fit(
     model: RobotModel, runs: Sequence[Run], carried: list[list[bool]], shapes: list[Array]
 ) -> _Fit:
-    """Solve the joint problem.
-
-    Args:
-        model: the arm.
-        runs: bare and loaded.
-        carried: for each body, in which runs it acts.
-        shapes: for each body its ten parameters by those of its unknowns (10, r).
-    """
+    """Solve the joint problem."""
     if not any(run.loaded for run in runs) or all(run.loaded for run in runs):
         raise PayloadError("a payload is a difference: name recordings without it and with it")
     rows = np.sum([run.phase.samples.sum(axis=0) for run in runs], axis=0)
@@ -398,21 +382,13 @@ def _fit(
 
 
 class _Layout(NamedTuple):
-    """Where the unknowns stand: the arm's, each body's, then offsets and friction by run.
+    """Where the unknowns stand: the arm's, each body's, then offsets and friction by run."""
 
-    Attributes:
-        width: number of unknowns.
-        bodies: places of each body's.
-        shapes: the ten parameters of each by its unknowns (10, r).
-        carried: in which runs each acts.
-        drifts: places of offsets and friction scales (R, 2, n).
-    """
-
-    width: int
-    bodies: list[NDArray[np.intp]]
-    shapes: list[Array]
-    carried: list[list[bool]]
-    drifts: NDArray[np.intp]
+    width: int  # number of unknowns
+    bodies: list[NDArray[np.intp]]  # places of each body's
+    shapes: list[Array]  # the ten parameters of each by its unknowns (10, r)
+    carried: list[list[bool]]  # in which runs each acts
+    drifts: NDArray[np.intp]  # places of offsets and friction scales (R, 2, n)
 
     def rows(
         self, model: RobotModel, phases: Sequence[PhaseFactor], friction: Array
@@ -482,23 +458,14 @@ def _weights(problem: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) ->
 
 
 class _BodyEstimate(NamedTuple):
-    """Ten parameters of a body, as far as they are determined.
+    """Ten parameters of a body, as far as they are determined."""
 
-    Attributes:
-        values: (10,).
-        determined: combinations of them that are (r, 10).
-        spread: covariance of those (r, r).
-        factor: standard deviations in half a 95 % interval.
-        blocks: of time that the covariance is made of.
-        words: how.
-    """
-
-    values: Array
-    determined: Array
-    spread: Array
-    factor: float
-    blocks: int
-    words: str
+    values: Array  # (10,)
+    determined: Array  # combinations of them that are (r, 10)
+    spread: Array  # covariance of those (r, r)
+    factor: float  # standard deviations in half a 95 % interval
+    blocks: int  # of time that the covariance is made of
+    words: str  # how
 
     def covariance(self, rows: Array) -> Array:
         """Covariance of linear functions (k, 10) of the parameters, without what is lost (k, k)."""
@@ -588,17 +555,11 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
 
 
 class _Reference(NamedTuple):
-    """Where figures come from that the motion does not determine.
+    """Where figures come from that the motion does not determine."""
 
-    Attributes:
-        tensor: about its centre, per kg (6,).
-        inertia: what counts as large [kg m²].
-        length: likewise [m].
-    """
-
-    tensor: Array
-    inertia: float
-    length: float
+    tensor: Array  # about its centre, per kg (6,)
+    inertia: float  # what counts as large [kg m²]
+    length: float  # likewise [m]
 
 
 def _reference(mass: float, box: tuple[float, float, float] | None) -> _Reference:
@@ -612,15 +573,7 @@ def _reference(mass: float, box: tuple[float, float, float] | None) -> _Referenc
 
 
 def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, float]:
-    """The possible body closest to an estimate, and how far away it is, squared.
-
-    Args:
-        found: the estimate.
-        reference: at which the tensor about the centre of mass has its prior.
-
-    Raises:
-        PayloadError: the solver finds none.
-    """
+    """The possible body closest to an estimate, and how far away it is, squared."""
     import cvxpy  # a third of a second to import
 
     cp: Any = cvxpy

@@ -78,26 +78,15 @@ class RobustEstimate:
 
 
 class _State(NamedTuple):
-    """Where the iteration is.
+    """Where the iteration is."""
 
-    Attributes:
-        factor: of the rows as weighted last.
-        solution: from it.
-        scale: standard deviation of each joint's good residuals (n,), NaN without rows; infinite
-            at the start.
-        residuals: per recording (m, n), of the values before the solution's.
-        passes: over the samples so far.
-        held: whether the scale is not looked for again.
-        converged: whether the last pass changed nothing.
-    """
-
-    factor: Factor
-    solution: Solution
-    scale: Array
-    residuals: tuple[Array, ...] = ()
-    passes: int = 1
-    held: bool = False
-    converged: bool = False
+    factor: Factor  # of the rows as weighted last
+    solution: Solution  # from it
+    scale: Array  # standard deviation of each joint's good residuals (n,), NaN without rows
+    residuals: tuple[Array, ...] = ()  # per recording (m, n), of the values before the solution's
+    passes: int = 1  # over the samples so far
+    held: bool = False  # whether the scale is not looked for again
+    converged: bool = False  # whether the last pass changed nothing
 
 
 def robust_estimate(
@@ -160,10 +149,7 @@ def robust_estimate(
 def _pass(
     model: RobotModel, recordings: Sequence[Samples], state: _State, loss: Loss, tolerance: float
 ) -> _State:
-    """Weight all rows by their residuals, solve, and find the scale of those, unless held.
-
-    The first pass finds the residuals of the start; only then there is a scale.
-    """
+    """Weight all rows by their residuals, solve, and find the scale of those, unless held."""
     residuals = tuple(np.full(samples.torque.shape, np.nan) for samples in recordings)
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
     factor = state.factor.from_blocks(model, rows, state.factor.samples)
@@ -207,10 +193,7 @@ def _weighted_rows(
 
 
 def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution: Solution) -> Array:
-    """Standard deviation per joint (n,) from the median of |residual|, NaN without rows.
-
-    Corrected, all joints alike, for the degrees of freedom that the parameters take.
-    """
+    """Standard deviation per joint (n,) from the median of |residual|, NaN without rows."""
     usable = np.concatenate([samples.usable for samples in recordings])
     torque = np.concatenate([samples.torque for samples in recordings])
     left, rows = np.concatenate(residuals), np.count_nonzero(usable)

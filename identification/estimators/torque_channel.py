@@ -93,23 +93,15 @@ def possible_low_passes(
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
-    """Rows of each joint before any low-pass, averaged to a rate of some 250 Hz.
+    """Rows of each joint before any low-pass, averaged to a rate of some 250 Hz."""
 
-    Attributes:
-        model: the robot.
-        time: (m,) [s].
-        segments: stretches without a gap.
-        blocks: per joint the columns of its row and, last, the torque of known loads (m, c + 1).
-        torque: recorded (m, n).
-        usable: (m, n).
-    """
-
-    model: RobotModel
-    time: Array
-    segments: tuple[slice, ...]
+    model: RobotModel  # the robot
+    time: Array  # (m,) [s]
+    segments: tuple[slice, ...]  # stretches without a gap
+    # per joint the columns of its row and, last, the torque of known loads (m, c + 1)
     blocks: tuple[Array, ...]
-    torque: Array
-    usable: NDArray[np.bool_]
+    torque: Array  # recorded (m, n)
+    usable: NDArray[np.bool_]  # (m, n)
 
     @classmethod
     def of(

@@ -147,11 +147,7 @@ class ViaPointGenome:
         before: Array | None,
         after: Array | None,
     ) -> Array:
-        """Draw points anew, in place (m, n), until the ways before and after them are free.
-
-        Returns the points [rad]. Where patience ends the last draw stays: that individual is
-        infeasible, and the search will find out.
-        """
+        """Draw points anew, in place (m, n), until the ways before and after them are free."""
         blocked = np.arange(len(coordinates))
         for draw in range(_DRAWS):
             if draw > 0:

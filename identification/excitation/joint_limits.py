@@ -113,10 +113,7 @@ def _attained(motion: Motion) -> Extrema:
 
 
 def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
-    """Return samples within ramps that are too short for the motion's own samples to show them.
-
-    What such ramps break is seen there at once; looking at it exactly would cost seconds.
-    """
+    """Return samples within ramps that are too short for the motion's own samples to show them."""
     step = float(np.max(np.diff(motion.time)))
     if not 0.0 < series.ramp < 3.0 * step:
         return []

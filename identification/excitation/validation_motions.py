@@ -109,11 +109,7 @@ def random_validation_motions(
                 return blocked
 
     def draw(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
-        """Return a feasible motion, or why there is none.
-
-        Points are drawn one after the other, each within free straight reach of the one before,
-        the last one of home. Corners are rounded later: the whole motion is checked then.
-        """
+        """Return a feasible motion, or why there is none."""
         speed = random.uniform(*_SPEED, limits.n_joints)
         points = [home]
         while len(points) <= n_via:

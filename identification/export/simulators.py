@@ -329,10 +329,7 @@ _REVERSALS: Final = "dry friction between the two directions (velocity reversals
 
 
 def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array, bool]]:
-    """Yield words, torque (m, n) and whether the format has room for it, of each part.
-
-    Dry friction that the format has room for is left to :func:`_dry`.
-    """
+    """Yield words, torque (m, n) and whether the format has room for it, of each part."""
     model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
     yield "the links", _rigid(arm, motion), True
     for kind in model.friction.kinds:
@@ -374,11 +371,7 @@ def _said(form: Format, arm: Arm, motion: Motion) -> Array:
 
 
 def _rigid(arm: Arm, motion: Motion) -> Array:
-    """Return the torque (m, n) of the links.
-
-    Of the links themselves: the base parameters leave out what rounded angles of a URDF make of
-    columns that depend on others but for the rounding.
-    """
+    """Return the torque (m, n) of the links."""
     model = arm.model
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     return plan.torque(arm.standard[model.layout.links].reshape(-1), *motion[1:4])
@@ -442,12 +435,7 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
 
 
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
-    """MuJoCo's inverse dynamics; without the constraints that are its dry friction, if not asked.
-
-    Raises:
-        MissingMujocoError: it is not installed.
-        WriteBackError: it does not read the text.
-    """
+    """MuJoCo's inverse dynamics."""
     mujoco = load_mujoco()
     try:
         model = mujoco.MjModel.from_xml_string(text)

@@ -274,13 +274,7 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
 
 
 def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Array, frozenset[str]]:
-    """Subtract what locked joints carry from the links (n, 10), where a possible body is left.
-
-    Nominal inertia, at the positions where they are locked.
-
-    Returns:
-        The links (n, 10), and the locked joints that keep what they carry: those of the base too.
-    """
+    """Subtract what locked joints carry from the links (n, 10), where a possible body is left."""
     if not model.locked:
         return inertial, frozenset()
     arm = pin.buildModelFromXML(urdf)

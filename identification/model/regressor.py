@@ -308,13 +308,7 @@ class _OwnRows(NamedTuple):
 
 
 class _Workspace:
-    """Arrays for one block of samples, and the views of them that the work needs.
-
-    Attributes:
-        size: samples in a block.
-        rows: per joint all columns, shape (n, columns, size); what a joint does not feel is not
-            written and means nothing.
-    """
+    """Arrays for one block of samples, and the views of them that the work needs."""
 
     def __init__(self, plan: RegressorPlan, size: int) -> None:
         n = plan.chain.n_joints
@@ -703,10 +697,7 @@ def _cos_sin(angle: Array, cosine: Array, sine: Array) -> None:
 
 
 def _blend(axis: Array, fixed: Array, revolute: bool) -> Array:
-    """Return the rotation into the child's axes as sums of 1, cos q and sin q, shape (9, 3).
-
-    Rodrigues: R(q)^T = a a^T + cos q (1 - a a^T) - sin q [a]x, behind the fixed rotation.
-    """
+    """Return the rotation into the child's axes as sums of 1, cos q and sin q, shape (9, 3)."""
     if not revolute:
         parts = [np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))]
     else:

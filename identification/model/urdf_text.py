@@ -128,13 +128,7 @@ class _Reading:
         self._parser.StartDoctypeDeclHandler = self._doctype
 
     def read(self, text: str) -> None:
-        """Go through all of it.
-
-        Raises:
-            _RefusedError: it is none that may be read.
-            expat.ExpatError: it is no XML.
-            UnicodeEncodeError: it is no text.
-        """
+        """Go through all of it."""
         self._data = text.encode()
         try:
             self._parser.Parse(self._data, True)

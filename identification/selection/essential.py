@@ -269,14 +269,7 @@ class _Subset(NamedTuple):
 
 
 class _Path:
-    """Elimination in progress.
-
-    Attributes:
-        steps: so far.
-        current: the model after the last of them.
-        best: the model of the least weighted held-out error so far.
-        refused: indices that must not go.
-    """
+    """Elimination in progress."""
 
     def __init__(self, total: Factor, held_out: PhaseFactor, weights: Array, rule: CutRule) -> None:
         self._total, self._unseen, self._rule = total, held_out.total, rule
@@ -316,11 +309,7 @@ class _Path:
         return ~np.isin(self.current.left, self.refused)
 
     def _worst(self) -> tuple[int, float]:
-        """Index and relative standard deviation of what to take out next.
-
-        Of a combination that the data do not determine the parameter with the largest share in
-        it goes, and of equal ones the last: as base parameters are chosen.
-        """
+        """Index and relative standard deviation of what to take out next."""
         solution, left = self.current.solution, self.current.left
         if not solution.determined.all():
             own = self._equations.part(left).A

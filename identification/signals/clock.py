@@ -148,11 +148,7 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
 
 
 def _usual_step(time: Array, steps: Array, median: float) -> float:
-    """Step of the clock [s], to more digits than stamps that were rounded to a few.
-
-    The median over a few steps is known better than that of one step, and the mean of the steps
-    around it better still: as many are left out above it as below.
-    """
+    """Step of the clock [s], to more digits than stamps that were rounded to a few."""
     lag = min(_LAG, len(time) - 1)
     usual = float(np.median(time[lag:] - time[:-lag])) / lag
     if not 0.5 * median < usual < 2.0 * median:
@@ -162,14 +158,7 @@ def _usual_step(time: Array, steps: Array, median: float) -> float:
 
 
 def _steps_by_phase(time: Array, step: float) -> Array:
-    """Steps of an even clock between stamps (m,) [s] that are off by less than half a step.
-
-    The stamps' mean phase in the clock does not move with one of them, nor with samples that are
-    missing; it follows a slow drift.
-
-    Returns:
-        Whole numbers of `step` (m - 1,), at least one.
-    """
+    """Steps of an even clock between stamps (m,) [s] that are off by less than half a step."""
     turns = (time - time[0]) / step
     phasor = scipy.ndimage.uniform_filter1d(
         np.exp(2j * np.pi * turns).view(np.float64).reshape(-1, 2), _PHASE, axis=0, mode="nearest"
@@ -258,11 +247,7 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
 
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:
-    """Number of each sample (m,) in an even clock, the first zero.
-
-    Where the motion says clearly how many steps passed, and not by one signal alone, they are
-    counted from it, and elsewhere by the phase of the stamps.
-    """
+    """Number of each sample (m,) in an even clock, the first zero."""
     phased = _steps_by_phase(time, step)
     moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))
@@ -393,10 +378,7 @@ def _share(
 
 
 def _level(values: Array) -> Array:
-    """Root mean square (k,) of what is not zero in each column, outliers limited; infinite without.
-
-    A joint at rest has no noise, and none of its rows is evidence.
-    """
+    """Root mean square (k,) of what is not zero in each column, outliers limited."""
     levels = []
     for column in np.abs(values).T:
         some = column[column > 0.0]

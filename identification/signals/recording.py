@@ -188,14 +188,7 @@ class Recording:
             )
 
     def _check_stuck(self) -> None:
-        """Refuse a position reading that stays the same to the last bit when it should not.
-
-        With a commanded position: a stretch of identical readings during which the command
-        moves by more than `STUCK_MOVEMENT`. A joint commanded to stand still may do so. Without
-        one: a reading that never changes in a recording in which another joint moves; whether
-        that joint was held or its reading is dead cannot be determined, so a joint that was held
-        has to be declared.
-        """
+        """Refuse a position reading that stays the same to the last bit when it should not."""
         ranges = np.ptp(self.position, axis=0)
         for j, name in enumerate(self.joint_names):
             if name in self.held_joints:

@@ -295,11 +295,7 @@ def prepare(
 def _noise_bandwidth(
     recording: Recording, variance: Array | None, segments: tuple[slice, ...]
 ) -> Array:
-    """Bandwidth per joint (n,) [Hz] that takes the noise variance (n,) out of the torque.
-
-    One bandwidth per joint, from the longest segment, so that the smoother is one and the same
-    linear filter everywhere.
-    """
+    """Bandwidth per joint (n,) [Hz] that takes the noise variance (n,) out of the torque."""
     assert recording.torque is not None
     longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
     time, measured = recording.time[longest], recording.torque[longest]
@@ -307,10 +303,7 @@ def _noise_bandwidth(
 
 
 def _attainable(time: Array, measured: Array, variance: Array | None) -> Array:
-    """Noise variance (c,), by default from differences; at least that of rounding.
-
-    Closer a spline cannot follow (m, c).
-    """
+    """Noise variance (c,), by default from differences; at least that of rounding."""
     if variance is None:
         variance = difference_variance(time, measured)
     rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2

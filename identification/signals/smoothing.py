@@ -110,11 +110,7 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Normal equations of one set of samples, in knot units, and their least smoothed solution.
-
-    Every other solution is computed as a difference from that one. The difference has the size
-    of the noise, so nothing is lost to cancellation against positions of many radians.
-    """
+    """Normal equations of one set of samples, in knot units, and their least smoothed solution."""
 
     spacing: float  # [s]
     density: float  # samples per knot interval
@@ -156,10 +152,7 @@ class _Problem:
         return float(self.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
-        """Penalty at which the channel's mean squared residual equals the tolerance.
-
-        Never less than gives the widest bandwidth [Hz].
-        """
+        """Penalty at which the channel's mean squared residual equals the tolerance."""
 
         def excess(log_penalty: float) -> float:
             correction = self.correction(channel, float(np.exp(log_penalty)))
@@ -177,10 +170,7 @@ class _Problem:
 
 @cache
 def _pieces(degree: int, derivative: int = 0) -> Array:
-    """Cardinal B-spline on one knot interval: powers of u by its degree + 1 basis functions.
-
-    From B(x) = sum_j (-1)^j C(d + 1, j) (x - j)_+^d / d!; basis function k sees x = u + d - k.
-    """
+    """Cardinal B-spline on one knot interval: powers of u by its degree + 1 basis functions."""
     pieces = np.zeros((degree + 1, degree + 1))
     for k in range(degree + 1):
         for j in range(degree + 1 - k):

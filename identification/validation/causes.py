@@ -159,19 +159,12 @@ def find_causes(
 
 
 class _Trial(NamedTuple):
-    """A fault mended.
+    """A fault mended."""
 
-    Attributes:
-        cause: the fault.
-        highest: upper end of its ratio.
-        coefficients: how many it has.
-        left: error that remains on the worst of its joints, as a share of their torque.
-    """
-
-    cause: Cause
-    highest: float
-    coefficients: int
-    left: float
+    cause: Cause  # the fault
+    highest: float  # upper end of its ratio
+    coefficients: int  # how many it has
+    left: float  # error that remains on the worst of its joints, as a share of their torque
 
     @property
     def better(self) -> bool:
@@ -180,11 +173,7 @@ class _Trial(NamedTuple):
         return explained and self.cause.ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
 
     def rivalled_by(self, other: _Trial) -> bool:
-        """Whether another order, or an order in place of a sign, explains nearly as much.
-
-        Then neither is sure: of a wrist that is predicted badly many nonsensical orders predict a
-        little more. Signs of two joints may well be the same arm mirrored.
-        """
+        """Whether another order, or an order in place of a sign, explains nearly as much."""
         mine, its = self.cause.fault, other.cause.fault
         return (
             mine.discrete
@@ -205,11 +194,7 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
 
 
 class _Search:
-    """Recordings with the faults mended that were found so far.
-
-    Faults of signs and orders are mended in the recordings; those of the other kinds have columns
-    that stay in the fit.
-    """
+    """Recordings with the faults mended that were found so far."""
 
     def __init__(
         self, model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str]
@@ -276,10 +261,7 @@ class _Search:
                 yield fault._replace(part=self._other_recordings(tables, fault))
 
     def _other_recordings(self, tables: _Tables, fault: Fault) -> Part:
-        """The recordings in which a fault is largest, if each has its own size of it.
-
-        They are those beyond the widest gap between the sizes, the fewer ones.
-        """
+        """The recordings in which a fault is largest, if each has its own size of it."""
         model, alike, columns = self._model, fault, []
         if fault.kind == "changed arm":
             alike = Fault("payload")
@@ -374,10 +356,7 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
 
 
 def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
-    """Rate of the predicted torque (k, n) in some rows, from their neighbours.
-
-    Without the jumps of dry friction: it has the direction that it has in between.
-    """
+    """Rate of the predicted torque (k, n) in some rows, from their neighbours."""
     after, before = np.minimum(some + 1, len(samples.torque) - 1), np.maximum(some - 1, 0)
     now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
     direction = now.direction
@@ -413,14 +392,7 @@ class _Score(NamedTuple):
 
 
 def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
-    """Predict each fifth block from the others.
-
-    Args:
-        tables: of the recordings.
-        p: parameters.
-        added: columns beside the regressor, as combinations of a table's (B, n, q, r).
-        target: what is predicted of each joint, likewise (n, q).
-    """
+    """Predict each fifth block from the others."""
     blocks, n = tables.rows.shape
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
     wide = np.concatenate([added, column], axis=3)

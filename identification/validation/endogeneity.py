@@ -152,10 +152,7 @@ def _share(factor: PhaseFactor, combination: Array) -> Array:
 def _wald(
     information: Array, moments: Array, k: int
 ) -> tuple[float, tuple[int, int], Array, Array]:
-    """F of the hypothesis that the last k coefficients are zero, and its degrees of freedom.
-
-    Also the coefficients and their standard deviations (k,).
-    """
+    """F of the hypothesis that the last k coefficients are zero, and its degrees of freedom."""
     p = information.shape[1] - k
     solution = solve(NormalEquations(information.sum(axis=0), moments.sum(axis=0), 0.0, 0))
     # Merged until the scores of neighbours hardly correlate.
@@ -173,10 +170,7 @@ def _wald(
 
 
 def _shift(blocks: Array) -> tuple[Array, Array, int]:
-    """Least squares less instrumental variables (p,), its standard deviation, and the blocks.
-
-    Both estimates leave out the same block of time, so what they have in common cancels.
-    """
+    """Least squares less instrumental variables (p,), its standard deviation, and the blocks."""
     p = blocks.shape[-1] // 2
     least, cross = blocks[:, p : 2 * p, p:], blocks[:, :p, p:]
     total = blocks.sum(axis=0)

@@ -445,11 +445,7 @@ def gather(
 def _noise_floor(
     model: RobotModel, values: Array, recordings: Sequence[Samples], repeated: Array | None
 ) -> Array | None:
-    """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows.
-
-    White noise of the power that the residual has above the bandwidth, and what differs between
-    repetitions below it. None where a low-pass has left no noise to measure.
-    """
+    """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows."""
     first = recordings[0]
     if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
         return None

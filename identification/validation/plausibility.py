@@ -82,11 +82,7 @@ def _is_negative(estimate: Estimate, direction: Array, sigmas: float = _SIGMAS) 
 def _offences(
     model: RobotModel, estimate: Estimate, speed: Array
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Wrong signs in words, and the parameters (p,) whose torque they are.
-
-    Friction may fall with speed (Stribeck) before it rises, by a quarter perhaps; at top speed
-    that is over, and less than half of Coulomb's is a viscous coefficient with the wrong sign.
-    """
+    """Wrong signs in words, and the parameters (p,) whose torque they are."""
     values, first, count = estimate.values, model.base.rank, len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         one = speed[joint : joint + 1]

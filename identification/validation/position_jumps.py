@@ -90,10 +90,7 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
 
 
 def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
-    """By how much each step departs from the speed beside it (m - 1, n), and that speed.
-
-    Last what a change of speed from before it to after it explains: a stop is no jump.
-    """
+    """By how much each step departs from the speed beside it (m - 1, n), and that speed."""
     steps = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / steps
     padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
@@ -106,12 +103,7 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
 
 
 def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Departures (m, n) without the error of the time that the other joints show.
-
-    Returns:
-        Whichever is less, with that error or without it; and where the others move fast enough
-        to show an error of one step (m, n).
-    """
+    """Departures (m, n) without the error of the time that the other joints show."""
     # A joint at rest shows nothing: what does not depart is no measure of its noise.
     size = np.abs(departure)
     noise = np.array(

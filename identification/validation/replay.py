@@ -174,11 +174,7 @@ class _Dynamics:
         return q + duration * moved, moved
 
     def _slowed(self, before: Array, free: Array, response: Array, most: Array) -> Array:
-        """Return what dry friction leaves of the speeds `free` (V, n) after a step.
-
-        It has impulses up to `most` (V, n + k) of joints and coupled motors; `response` (V, n, n)
-        is the speed of an impulse.
-        """
+        """Return what dry friction leaves of the speeds `free` (V, n) after a step."""
         turns = self._turns
         directions = np.sign(before @ turns.T)
         columns = response @ turns.T

@@ -202,11 +202,7 @@ class Ripple(NamedTuple):
 
 
 def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
-    """Sums of a residual (m, n) times cosine and sine, and of their squares (2, B, n, H, 2).
-
-    The phase is that of the motor's angle about its zero joint angles; the same in every
-    recording, as long as nobody takes the gear apart.
-    """
+    """Sums of a residual (m, n) times cosine and sine, and of their squares (2, B, n, H, 2)."""
     block, motor = block_index(samples), samples.motion.position @ motor_from_joint.T
     count = int(block[-1]) + 1
     found = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
@@ -242,14 +238,7 @@ class FrictionDrift(NamedTuple):
 
 
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
-    """Trend over all pieces in order; None where they are too few.
-
-    The line is common to all parts of a motion. Of several recordings its level is each part's own:
-    what the friction law gets wrong in one part of a motion is no change of friction.
-
-    Args:
-        sums: of each recording, of friction times residual and of friction squared (2, parts, n).
-    """
+    """Trend over all pieces in order; None where they are too few."""
     if sum(one.shape[1] for one in sums) < _FEWEST_PIECES:
         return None
     product, power = np.concatenate(sums, axis=1)

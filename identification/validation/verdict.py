@@ -120,10 +120,7 @@ def _measure(names: Sequence[str], evidence: Evidence) -> str:
 
 
 def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Facts:
-    """Numbers and conditions of all findings by name; what is not known is left out.
-
-    Conditions are booleans, texts that are empty where they do not hold, or masks of joints (n,).
-    """
+    """Numbers and conditions of all findings by name; what is not known is left out."""
     error, training, estimate = evidence.held_out, evidence.training, evidence.estimate
     checks, relative, explained = evidence.residuals, error.relative, error.explained
     times = relative / np.maximum(training.relative, 1e-12)

@@ -211,11 +211,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
 
 
 def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
-    """The shape itself, or the convex hull of a mesh.
-
-    Raises:
-        CollisionModelError: it is no body (turned inside out, flat), or larger than any.
-    """
+    """The shape itself, or the convex hull of a mesh."""
     if isinstance(shape, coal.BVHModelBase):
         if np.all(np.abs(shape.vertices()) <= FARTHEST):
             with suppress(ValueError, RuntimeError):

@@ -268,10 +268,7 @@ def _looked_at(scene: Scene, trajectory: PiecewiseCubic | FourierSeries, motion:
 
 
 def _deepest(scene: Scene, path: Path, near: Near) -> Touch | None:
-    """Return the deepest contact at the samples by branch and bound.
-
-    A signed distance of convex bodies changes no faster than they travel.
-    """
+    """Return the deepest contact at the samples by branch and bound."""
     candidates = np.flatnonzero(~(near.lower >= scene.margin))
     if len(candidates) == 0:
         return None
@@ -305,15 +302,7 @@ def _deepest(scene: Scene, path: Path, near: Near) -> Touch | None:
 
 
 def _bulges_of(scene: Scene, trajectory: PiecewiseCubic | FourierSeries, motion: Motion) -> Array:
-    """Bound how far pairs leave straight lines in rows of `_BLOCK` samples, (2, p, rows) [m].
-
-    As seen from the base and from the frame that carries both bodies.
-
-    Args:
-        scene: the bodies.
-        trajectory: the motion.
-        motion: samples of it.
-    """
+    """Bound how far pairs leave straight lines in rows of `_BLOCK` samples, (2, p, rows) [m]."""
     starts = _starts(motion.n_samples)
     step = float(np.max(np.diff(motion.time), initial=0.0))
     ends = np.append(starts[1:], motion.n_samples - 1)
@@ -375,8 +364,8 @@ class _Stretch(NamedTuple):
     pair: int
     start: int
     stop: int
-    bulge: float
-    own_bulge: float
+    bulge: float  # seen from the base
+    own_bulge: float  # seen from the frame that carries both
 
     def joined(self, other: _Stretch) -> _Stretch | None:
         """Return both together if the other one follows immediately."""
@@ -397,15 +386,7 @@ def _touch_between(
     path: Path,
     near: Near,
 ) -> tuple[Touch, Motion] | None:
-    """Return a touch between the samples, which are clear, and the samples that show it.
-
-    Args:
-        scene: the bodies.
-        trajectory: the motion.
-        motion: samples of it, both ends included.
-        path: where the bodies are there.
-        near: what may touch.
-    """
+    """Return a touch between the samples, which are clear, and the samples that show it."""
     distances = max(_MOST_DISTANCES, _MOST_PER_SAMPLE * motion.n_samples)
     for division in range(_DIVISIONS + 1):
         gaps: list[_Stretch] = []
@@ -474,10 +455,7 @@ def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
 def _slab(
     scene: Scene, path: Path, pair: Indices, here: Indices, there: Indices, normal: Array
 ) -> Array:
-    """Return how thick slabs (k,) of samples `here` are `there`, [m].
-
-    A slab's direction (3, k) goes with the frame that carries both bodies.
-    """
+    """Return how thick slabs (k,) of samples `here` are `there`, [m]."""
     carrier = scene.carrier[pair] + 1
     local = np.einsum("kij,ik->jk", path.frames.rotation[carrier, :, :, here], normal)
     turned = np.einsum("kij,jk->ik", path.frames.rotation[carrier, :, :, there], local)
@@ -485,11 +463,7 @@ def _slab(
 
 
 def _open_gaps(scene: Scene, path: Path, stretch: _Stretch, seen: _Seen) -> list[_Stretch] | Touch:
-    """Return where one pair may touch between neighbouring samples, or a touch at one.
-
-    Divides the stretch until the bodies cannot meet for the way they go, or for the slab
-    that lies between them at both ends. Every distance it computes is left in `seen`.
-    """
+    """Return where one pair may touch between neighbouring samples, or a touch at one."""
     a, b = scene.indices(stretch.pair)
     margin = scene.margin
     gaps, stack = [], [(stretch.start, stretch.stop)]

@@ -266,15 +266,7 @@ class Separation:
 
 
 def _shortest_way(between: Array, u: Array, half_u: Array, v: Array, half_v: Array) -> Array:
-    """Return the shortest way (3, k) from segments along v to segments along u.
-
-    Args:
-        between: from the middle of the second to the middle of the first (3, k).
-        u: unit vectors (3, k).
-        half_u: half lengths along them (k,).
-        v: unit vectors (3, k).
-        half_v: half lengths along them (k,).
-    """
+    """Return the shortest way (3, k) from segments along v to segments along u."""
     cosine, along_u, along_v = _dot(u, v), _dot(u, between), _dot(v, between)
     across = 1.0 - cosine * cosine
     with np.errstate(divide="ignore", invalid="ignore"):
