@@ -1,11 +1,4 @@
-"""Errors of the identification package.
-
-```
-IdentificationError
-├── ModelError      a robot description that cannot be turned into a linear dynamic model
-└── ShapeError      an array whose shape does not fit the model (also a ValueError)
-```
-"""
+"""Errors of the identification package: `ModelError` and `ShapeError`, both `ValueError`."""
 
 from __future__ import annotations
 

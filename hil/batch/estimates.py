@@ -34,7 +34,7 @@ from identification.factor.factor import (
     solve,
 )
 from identification.factor.phases import PhaseFactor
-from identification.model.friction import Viscous
+from identification.model.friction import VISCOUS
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
@@ -310,7 +310,7 @@ def speed_rms(model: RobotModel, factor: Factor) -> Array:
     """
     squares = np.full(model.n_joints, np.nan)
     for k, term in enumerate(model.friction.terms):
-        if isinstance(term.term, Viscous) and (not term.motor or np.isnan(squares[term.owner])):
+        if term.term == VISCOUS and (not term.motor or np.isnan(squares[term.owner])):
             column = model.base.rank + k
             squares[term.owner] = factor.gram[term.owner, column, column]
     return _rms(factor, squares)

@@ -1,18 +1,12 @@
-r"""Current-to-torque gains of all drives at once, from a payload whose torque is known.
+r"""Current-to-torque gains of all drives, from a payload whose torque is known or nominal masses.
 
-Without a payload, parameters and gains can all be scaled by one number. A recording with a known
-payload fixes it (Gautier and Briot 2014, "Global identification of joint drive gains and dynamic
-parameters of robots"). Weighted least squares of what was measured, the current, on one
-:func:`identification.factor.phases.gain_factor`:
+Weighted least squares of the measured currents on one
+:func:`identification.factor.phases.gain_factor` (after Gautier and Briot 2014),
 
 .. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
 
-which is bilinear and solved by Gauss-Newton, each motor weighted by its inverse noise variance.
-Least squares of :math:`K_m i_m - W_m \pi = t_m` would shrink all gains, the more the noisier the
-currents.
-
-A motor's gain is determined only if the payload loads it, or if its torque shares parameters with
-motors that the payload does load. What is not determined is named, and has no number.
+bilinear and solved by Gauss-Newton: least squares of :math:`K_m i_m - W_m \pi = t_m` would shrink
+all gains with the noise of the currents. What is not determined is named, and has no number.
 """
 
 from __future__ import annotations

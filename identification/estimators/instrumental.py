@@ -1,20 +1,14 @@
 r"""Instrumental variables: an estimate that noise in the measured positions does not bias.
 
-The regressor W is computed from measured positions and their second derivatives. Its noise makes
-least squares shrink what stands in front of the noisiest columns, the inertias, and no number of
-samples helps. With instruments Z that correlate with the motion and not with its noise,
+With instruments Z that correlate with the motion and not with its noise, here the regressor of the
+planned motion column by column, and one weight per joint in Omega,
 
 .. math:: \hat\pi = (Z^T \Omega W)^{-1} Z^T \Omega y
 
-is consistent whatever that noise is (IDIM-IV: Janot, Vandanjon and Gautier 2014). Z is here the
-regressor of the planned or simulated motion, column by column, so there are as many instruments
-as parameters; Omega holds one weight per joint. The price is variance: the standard deviation of a
-parameter grows by 1/sqrt(R²), R² being the share of its column that the instruments explain apart
-from the other columns (Shea 1997).
-
-What instruments cannot mend: a smoother that is too narrow takes part of the motion itself out of
-W, and noise that turns the sign of a slow speed is no error that averages to zero. So smooth less
-than for least squares, and leave slow rows out.
+is consistent whatever that noise is (IDIM-IV: Janot, Vandanjon and Gautier 2014); the standard
+deviation grows by 1/sqrt(R²), the share of a column that instruments alone explain (Shea 1997).
+Instruments cannot mend a smoother that is too narrow, nor noise that turns the sign of a slow
+speed.
 """
 
 from __future__ import annotations

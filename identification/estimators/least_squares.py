@@ -1,9 +1,4 @@
-"""Ordinary and weighted least squares by name, on either kind of factor.
-
-Both fit the same rows. Ordinary least squares counts every joint's residual alike, in N·m: the
-joints that carry the arm decide. Weighted least squares (eq. 4) counts it in that joint's own
-noise. The covariance of either is that of joints with different noise.
-"""
+"""Ordinary (joints alike, in N·m) and weighted (in each joint's own noise, eq. 4) least squares."""
 
 from __future__ import annotations
 

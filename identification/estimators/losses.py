@@ -1,7 +1,7 @@
 r"""What a residual costs: the square, or less for those that are too large to be noise.
 
-A loss enters an iteratively reweighted fit by its weight :math:`u(x) = \psi(x)/x` and its
-covariance by the slope :math:`\psi'(x)`, with x the residual in standard deviations.
+A fit reads the weight :math:`u(x) = \psi(x)/x`, a covariance the slope :math:`\psi'(x)`, of
+residuals x in standard deviations.
 """
 
 from __future__ import annotations

@@ -7,14 +7,9 @@ offset and a scale of the friction of every joint, for friction drifts between r
 .. math:: \tau = W \pi + [\text{loaded}]\, L \beta + \delta_k + \varphi_k \odot f, \qquad
           f = W_f \hat\pi_f
 
-The friction f is that of the solution before. Weak priors (:data:`DRIFT`) keep drifts apart from
-the friction that all recordings share. The covariance is cluster-robust: blocks at equal times of
-the motion form one, so what the model gets wrong in every repetition does not count as noise.
-
-The body that comes out is a possible one: the closest to the estimate in the metric of its
-covariance among those with a positive semidefinite pseudo-inertia. The tensor about the centre of
-mass has a prior at that of a reference body, a point or a box, as wide as the reference is large or
-as the recordings show the body to be: what the motion does not determine is the reference's.
+The friction f is that of the solution before; weak priors (:data:`DRIFT`) keep drifts apart from
+it. The covariance is cluster-robust by time of the motion. The body is the closest possible one to
+the estimate; what the motion does not determine of its tensor is a reference body's.
 """
 
 from __future__ import annotations
@@ -69,10 +64,8 @@ _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
 _ROUNDS: Final = 4  # of weights and friction
 _MOST_BLOCKS: Final = 500
-# Scores of neighbouring blocks may correlate by a tenth, which takes a fifth off the variance; in
-# twice as long ones by half of that. On simulated arms with noise correlated over 50 ms, 60 seeds
-# each, the nominal 95 % intervals of all ten figures covered 90 and 93 % without this, 93 and 95 %
-# with it (NS 16, one motion; Panda, two motions).
+# Scores of neighbouring blocks correlate less in longer ones. On noise correlated over 50 ms
+# nominal 95 % intervals covered 90 and 93 % without this, 93 and 95 % with it.
 _STRETCH: Final = 2
 _LEAST_NOISE: Final = 1e-6  # share of a torque's length: rounding of the Gram matrix
 _PARTICIPATION: Final = 1e-3
@@ -243,18 +236,18 @@ def identify_payload(
     )
     if low <= 0.0:
         return estimate
-    size = _reference(mass, box)
+    reference = _reference(mass, box)
     intervals[1:4] = found.centre_intervals
     to_centre = _moved(np.eye(3), -values[6:9] / mass)[_INERTIA]
     middle, halves = to_centre @ values, factor * found.std(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([middle - halves - lower, middle + halves + upper])
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
-    width, usual = (intervals[:, 1] - intervals[:, 0]) / 2.0, mass * size.tensor
-    open_ended = width > np.repeat([np.inf, size.inertia], [4, 6])
+    width, usual = (intervals[:, 1] - intervals[:, 0]) / 2.0, mass * reference[0]
+    open_ended = width > np.repeat([np.inf, reference[1]], [4, 6])
     open_ended[1:4] = np.isinf(width[1:4])
     open_ended[4:] &= (intervals[4:, 0] <= usual) & (usual <= intervals[4:, 1])
-    possible, misfit = _closest_body(found, size)
+    possible, misfit = _closest_body(found, *reference)
     figures = figures_of(possible)[:, None]
     intervals[:, :1] = np.minimum(intervals[:, :1], figures)
     intervals[:, 1:] = np.maximum(intervals[:, 1:], figures)
@@ -269,12 +262,6 @@ def identify_payload(
 
 def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, float, float]:
     """By how much more the loaded recordings carry [kg], and its 95 % interval.
-
-    Infinite ends where the motion does not determine it.
-
-    Args:
-        model: the arm without payload.
-        runs: bare and loaded.
 
     Raises:
         PayloadError: there is no bare or no loaded recording.
@@ -311,6 +298,10 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
     return max(found, key=lambda one: one[0])[1] if found else None
 
 
+# Of one joint in one run: its index, Gram matrices (B, c + 1, c + 1) and places among the unknowns.
+_Rows = tuple[int, Array, NDArray[np.intp]]
+
+
 class _Fit(NamedTuple):
     """Solution of the joint problem."""
 
@@ -329,14 +320,6 @@ class _Fit(NamedTuple):
         lost, axes = np.linalg.eigh(np.eye(len(part)) - basis @ basis.T)
         axes = np.where(np.abs(axes) < _ROUNDING, 0.0, axes)
         return np.asarray(axes[:, lost < _PARTICIPATION**2].T * scale[part])
-
-
-class _Rows(NamedTuple):
-    """Gram matrices of one joint in one run, over some of the unknowns and the torque."""
-
-    joint: int
-    gram: Array  # (B, c + 1, c + 1)
-    places: NDArray[np.intp]  # (c + 1,)
 
 
 def _fit(
@@ -413,7 +396,7 @@ class _Layout(NamedTuple):
                             mapping[ten, part] = shape
                 used = np.flatnonzero(mapping.any(axis=0))
                 small = mapping[:, used]
-                found.append(_Rows(joint, small.T @ gram @ small, used))
+                found.append((joint, small.T @ gram @ small, used))
         return found
 
     def prior(self, problem: Sequence[_Rows], weights: Array, rows: NDArray[np.intp]) -> Array:
@@ -434,7 +417,7 @@ class _Layout(NamedTuple):
 
     def total(self, problem: Sequence[_Rows], weights: Array) -> Array:
         """Weighted Gram matrices of all joints and runs (B, width + 1, width + 1)."""
-        count = max(len(one.gram) for one in problem)
+        count = max(len(gram) for _, gram, _ in problem)
         whole = np.zeros((count, self.width + 1, self.width + 1))
         for joint, gram, places in problem:
             whole[: len(gram), places[:, None], places] += weights[joint] * gram
@@ -472,20 +455,23 @@ class _BodyEstimate(NamedTuple):
         own = rows @ np.linalg.pinv(self.determined)
         return np.asarray(own @ self.spread @ own.T)
 
-    def std(self, rows: Array) -> Array:
-        """Standard deviations of linear functions (k, 10) of the parameters; infinite if lost."""
+    def _lost(self, rows: Array) -> tuple[Array, Array]:
+        """What functions (k, 10) have that is not determined, and they, in comparable units."""
         scale = np.linalg.norm(self.determined, axis=0)
         scale = np.where(scale > 0.0, scale, 1.0)
-        lost = rows / scale - rows @ np.linalg.pinv(self.determined) @ self.determined / scale
-        known = np.linalg.norm(lost, axis=1) < _PARTICIPATION * np.linalg.norm(rows / scale, axis=1)
+        seen = rows @ np.linalg.pinv(self.determined) @ self.determined
+        return (rows - seen) / scale, rows / scale
+
+    def std(self, rows: Array) -> Array:
+        """Standard deviations of linear functions (k, 10) of the parameters; infinite if lost."""
+        lost, scaled = self._lost(rows)
+        known = np.linalg.norm(lost, axis=1) < _PARTICIPATION * np.linalg.norm(scaled, axis=1)
         return np.where(known, np.sqrt(np.diag(self.covariance(rows))), np.inf)
 
     def principal(self, rows: Array) -> tuple[Array, Array]:
         """Uncorrelated combinations (k, 10) of k functions, and half their intervals (k,)."""
-        scale = np.linalg.norm(self.determined, axis=0)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
-        lost /= max(float(np.linalg.norm(rows / scale)), np.finfo(np.float64).tiny)
+        lost, scaled = self._lost(rows)
+        lost = lost / max(float(np.linalg.norm(scaled)), np.finfo(np.float64).tiny)
         variance, axes = np.linalg.eigh(self.covariance(rows) + _LOST * lost @ lost.T)
         return axes.T @ rows, self.factor * np.sqrt(np.maximum(variance, 0.0))
 
@@ -554,25 +540,22 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
     return off_diagonal + np.array([yy + zz, 0.0, 0.0, xx + zz, 0.0, xx + yy]), off_diagonal
 
 
-class _Reference(NamedTuple):
-    """Where figures come from that the motion does not determine."""
+def _reference(mass: float, box: tuple[float, float, float] | None) -> tuple[Array, float, float]:
+    """Tensor about its centre per kg (6,) of a reference body, and what is large [kg m²], [m].
 
-    tensor: Array  # about its centre, per kg (6,)
-    inertia: float  # what counts as large [kg m²]
-    length: float  # likewise [m]
-
-
-def _reference(mass: float, box: tuple[float, float, float] | None) -> _Reference:
-    """A point is small against a ball of water of its mass, a box is as large as it is."""
+    A point is small against a ball of water of its mass, a box is as large as it is.
+    """
     if box is None:
         radius = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
-        return _Reference(np.zeros(6), 0.4 * mass * radius**2, radius)
+        return np.zeros(6), 0.4 * mass * radius**2, radius
     x, y, z = (edge**2 / 12.0 for edge in box)
     tensor = np.array([y + z, 0.0, 0.0, x + z, 0.0, x + y])
-    return _Reference(tensor, mass * float(tensor.max()), max(box) / 2.0)
+    return tensor, mass * float(tensor.max()), max(box) / 2.0
 
 
-def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, float]:
+def _closest_body(
+    found: _BodyEstimate, tensor: Array, inertia: float, length: float
+) -> tuple[Body, float]:
     """The possible body closest to an estimate, and how far away it is, squared."""
     import cvxpy  # a third of a second to import
 
@@ -583,13 +566,13 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
     rows = (vectors.T / np.sqrt(variance)[:, None] / size) @ found.determined
     centre = values[6:9] / values[9]
     about = _moved(np.eye(3), -centre)[_INERTIA]
-    about[:, 9] -= reference.tensor
+    about[:, 9] -= tensor
     about *= np.sqrt(_OFF_DIAGONAL)[:, None]
     # As wide as the reference is large, or as the recordings show the body to be beyond chance.
     along, half = found.principal(about)
-    about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=reference.inertia**2))
+    about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=inertia**2))
     # In units of the reference the numbers are near one.
-    mass, length = values[9], max(reference.length, float(np.linalg.norm(centre)))
+    mass, length = values[9], max(length, float(np.linalg.norm(centre)))
     units = mass * np.repeat([length**2, length, 1.0], [6, 3, 1])
     x = cp.Variable(_BODY)
     entries = pseudo_inertia_map().reshape(_BODY, 16).T @ x
@@ -602,9 +585,7 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
         try:
             problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
-            raise PayloadError(f"no possible body was found: the solver failed ({failure})") from (
-                failure
-            )
+            raise PayloadError(f"no possible body was found: {failure}") from failure
     if problem.status not in ("optimal", "optimal_inaccurate") or x.value is None:
         raise PayloadError(f"no possible body was found: the solver ended with {problem.status}")
     near = body(np.asarray(x.value) * units)

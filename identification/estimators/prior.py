@@ -3,9 +3,7 @@ r"""Gaussian prior on the parameters, from CAD or zero (ridge), and what the dat
 .. math:: \hat\pi = \arg\min \; \sum_j w_j \lVert y_j - W_j \pi \rVert^2
                     + (\pi - \mu)^T C^{-1} (\pi - \mu)
 
-(Hoerl and Kennard 1970 with mu = 0; Gelman et al. 2013, section 14.8). Parameters that the data
-do not determine keep the prior; the ratio of posterior to prior standard deviation says of each
-parameter how much of what is now known the data have said.
+(Hoerl and Kennard 1970 with mu = 0; Gelman et al. 2013, section 14.8).
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
 """Least squares that gross errors do not carry away: iteratively reweighted (Holland, Welsch 1977).
 
-A collision, a slipped encoder count or a burst on the wire makes rows with errors of many
-standard deviations, and least squares gives one of ten deviations the say of a hundred good
-rows. A robust loss bounds it. The scale of each joint's noise is found alongside, from the
-median absolute residual, which bad rows hardly move.
-
-What it does not help against: rows whose *motion* is wrong (a torn time base), and what the
-model leaves out everywhere.
+The scale of each joint's noise is found alongside, from the median absolute residual. Rows whose
+*motion* is wrong, and what the model leaves out everywhere, it does not help against.
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
 """Choosing motions that excite the parameters: criteria, constraints, searches."""
 
+# ruff: noqa: F401
+from types import ModuleType
+
 from identification.excitation.collision.bodies import Box, Wall, Workspace
 from identification.excitation.collision.checker import CollisionChecker, Contact
 from identification.excitation.constraints import (
@@ -52,59 +55,7 @@ from identification.excitation.validation_motions import random_validation_motio
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
 
 __all__ = [
-    # criteria
-    "CRITERIA",
-    "Criteria",
-    "condition_number",
-    "correlation",
-    "coupling_index",
-    "coupling_index_max",
-    "fitness_eq7",
-    "information",
-    "log10_det",
-    "Objective",
-    "SAMPLE_PERIOD",
-    "midpoints",
-    "sampled",
-    # constraints
-    "Box",
-    "Wall",
-    "Workspace",
-    "CollisionChecker",
-    "Contact",
-    "Constraints",
-    "CurrentModel",
-    "KINDS",
-    "MotionCheck",
-    "Violation",
-    "check_motion",
-    # motions
-    "Genome",
-    "SineGenome",
-    "ViaPointGenome",
-    "DrawnMotion",
-    "Excitation",
-    "random_validation_motions",
-    # searches
-    "Design",
-    "Front",
-    "Journal",
-    "Method",
-    "Population",
-    "PostureError",
-    "Problem",
-    "Progress",
-    "RESCORE_PERIOD",
-    "Scale",
-    "Scores",
-    "SearchSettings",
-    "most_evaluations",
-    "search",
-    # errors
-    "CollisionModelError",
-    "MissingMeshError",
-    "DesignError",
-    "JournalError",
-    "NoFeasibleMotionError",
-    "WorkspaceError",
+    name
+    for name, one in globals().items()
+    if not (name.startswith("_") or isinstance(one, ModuleType))
 ]

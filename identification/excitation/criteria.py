@@ -1,13 +1,8 @@
 r"""How well a trajectory excites the parameters: the paper's two measures and condition numbers.
 
-All of them read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, rows of
-all joints together (see :func:`information`). Columns have different units and sizes, so each is
-first divided by its length, ``C = S^-1 Phi^T Phi S^-1`` with ``S = diag(|Phi_i|)``; the paper's
-measures follow exactly, since S drops out of the coupling index and adds ``2 log10 |S|`` to the
-determinant, which itself would overflow.
-
-A trajectory that leaves a parameter without excitation makes the Gram matrix singular: each
-measure is then the worst there is, never an exception, so that a search can rank it last.
+All read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, divided by the
+lengths of its columns so that nothing overflows. Of a singular one each measure is the worst there
+is, never an exception, so that a search can rank it last.
 """
 
 from __future__ import annotations

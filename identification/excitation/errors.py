@@ -1,16 +1,4 @@
-"""What the design of an excitation can refuse.
-
-```
-IdentificationError
-├── CollisionModelError    no collision shapes can be had from a robot description
-│   └── MissingMeshError       a mesh that it names is not to be found
-├── PostureError           a joint position that is no finite number (also a ValueError)
-├── WorkspaceError         obstacles or a margin that mean nothing (also a ValueError)
-├── DesignError            a setting outside its range (also a ValueError)
-├── NoFeasibleMotionError  every motion tried breaks a constraint
-└── JournalError           a file that is not the journal of this search
-```
-"""
+"""What the design of an excitation can refuse."""
 
 from __future__ import annotations
 

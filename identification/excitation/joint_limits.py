@@ -1,10 +1,7 @@
 """Whether a motion keeps the joint limits between its samples too, and rests at both ends.
 
-A table of cubics tells its extremes from its roots. A sum of sines does so only at a price that a
-search over thousands cannot pay, so its samples decide first: a limit that a sample exceeds is
-broken, and one that is farther from all samples than the sum can swing between two of them
-(f <= max + M h²/8, M the sum's largest second derivative) is satisfied. Only what lies between is
-looked at exactly. Either answer is rigorous.
+A table of cubics has its extremes at roots. Of a sum of sines the samples decide where they can,
+which swings between them by M h²/8 at most (M the largest second derivative); the rest is exact.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.friction import FrictionLaw, Kind, Tanh
+from identification.model.friction import TANH, FrictionLaw, FrictionTerm
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     linear = np.array([law.standstill if law.zone == "linear" else 0.0 for law in laws])
     lines = [
         '"""Identified friction of a robot\'s joints. Source: hil."""',
-        *(["", "from math import tanh"] if Tanh in kinds else []),
+        *(["", "from math import tanh"] if TANH in kinds else []),
         "",
         f"JOINTS = {_tuple(map(repr, model.joint_names))}",
         f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
@@ -135,7 +135,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     for kind in kinds:
         values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
         for one in friction.terms:
-            if isinstance(one.term, kind):
+            if one.term.label == kind.label:
                 place = friction.place(one)
                 values[place], speeds[place] = table[place][one.symbol], one.term.speed
                 units.add(one.unit)
@@ -159,8 +159,8 @@ def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool)
     ]
 
 
-def _formula(kinds: Sequence[Kind]) -> str:
-    return " + ".join(kind.formula() for kind in kinds)
+def _formula(kinds: Sequence[FrictionTerm]) -> str:
+    return " + ".join(kind.formula for kind in kinds)
 
 
 def _line(name: str) -> str:

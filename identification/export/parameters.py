@@ -1,7 +1,7 @@
-"""Identified parameters as JSON and CSV, with units, covariance and where they come from.
+"""Identified parameters as JSON and CSV, with units (SI), covariance and where they come from.
 
-Numbers are SI. What is infinite or was not determined stands as "Infinity" or "NaN", as JSON has
-no such numbers; a parameter that the data do not determine has an infinite standard deviation.
+Numbers that JSON has not are words, "Infinity" and "NaN"; the standard deviation of a parameter
+that the data do not determine is infinite.
 """
 
 from __future__ import annotations

@@ -1,20 +1,8 @@
 """The identified arm as simulators read it: MuJoCo's XML (MJCF), SDF, URDF.
 
-Bodies are those of the physically consistent parameters. What is fixed to a moving link is part of
-it, and so is a payload that is stated. Each format has room for a part of the model:
-
-| | URDF | SDF | MJCF |
-|---|---|---|---|
-| bodies, viscous friction | yes | yes | yes |
-| Coulomb friction f0 | number | number | a bounded constraint force (frictionloss) |
-| friction with the speed squared or cubed | no | no | polynomial damping |
-| rotor inertias | no | no | armature |
-| inertia and friction of coupled motors | no | no | fixed tendons |
-| torsion springs | no | yes | yes |
-| payload | no | yes | yes |
-
-The rest (asymmetry, Stribeck, offset, balancers, torque ripple, dry friction at reversals) is left
-out; :func:`compare` says how much torque that is, after it has read the text back.
+Bodies are those of the physically consistent parameters, with what is fixed to them and a stated
+payload. What each format has room for is in :data:`FORMATS`; :func:`compare` reads a text back and
+says how much torque the rest is (asymmetry, Stribeck, offset, balancers, ripple, reversals).
 """
 
 from __future__ import annotations
@@ -39,7 +27,7 @@ from identification.export.urdf import (
     write_urdf,
 )
 from identification.model.elements import TorsionSpring
-from identification.model.friction import Coulomb, Cubic, Kind, Quadratic, Tanh, Viscous
+from identification.model.friction import COULOMB, CUBIC, QUADRATIC, TANH, VISCOUS, FrictionTerm
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body
@@ -57,7 +45,8 @@ _SEED: Final = 20140903
 # Where nothing is stated: rad or m, rad/s or m/s, rad/s² or m/s².
 _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
 _BASE: Final = "base"
-_DRY: Final = (Coulomb, Tanh)
+_DRY: Final = (COULOMB, TANH)
+_DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
 # s; MuJoCo's dry friction follows a constraint of this time constant: no less than two steps.
 _FRICTION_TIME: Final = 2.0 * _TIMESTEP
@@ -163,11 +152,11 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
              fullinertia=as_text(six))  # fmt: skip
         friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
-        third = {term.symbol: type(term) for term in model.friction.laws[j].terms}.get("f2")
+        third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
         # Of v, v |v| and v³.
         damping = [
             friction.get("f1", 0.0),
-            *(friction["f2"] if third is kind else 0.0 for kind in (Quadratic, Cubic)),
+            *(friction["f2"] if third == kind else 0.0 for kind in (QUADRATIC, CUBIC)),
         ]
         lower, upper, most = ranges.lower[j], ranges.upper[j], ranges.effort[j]
         known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
@@ -259,7 +248,7 @@ class Format(NamedTuple):
     suffix: str
     write: Callable[[Arm, str, Sequence[str]], str]
     read: Callable[[str, Arm, Motion], Array]
-    friction: tuple[Kind, ...] = (Coulomb, Tanh, Viscous)
+    friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
     rotors: bool = False
     springs: bool = True
     payload: bool = True
@@ -334,10 +323,10 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
     yield "the links", _rigid(arm, motion), True
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
-            of_kind = [isinstance(one.term, kind) and not one.motor for one in terms]
+            of_kind = [one.term.label == kind.label and not one.motor for one in terms]
             yield kind.words, _friction(arm, motion, of_kind), kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
-    motors = [one.motor and not (form.rotors and isinstance(one.term, _DRY)) for one in terms]
+    motors = [one.motor and not (form.rotors and one.term.label in _DRY_LABELS) for one in terms]
     yield "rotor inertias", qdd @ diagonal, form.rotors
     yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.rotors
     yield "friction of coupled motors", _friction(arm, motion, motors), form.rotors
@@ -388,7 +377,7 @@ def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
     """Return the torque (m, n) of dry friction, as it is or as one that jumps at zero speed."""
     if not jumps:
         terms = arm.model.friction.terms
-        return _friction(arm, motion, [isinstance(one.term, _DRY) for one in terms])
+        return _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
     friction, n = arm.model.friction, arm.model.n_joints
     f0 = np.array([row.get("f0", 0.0) for row in arm.friction])
     shares = friction.motor_speeds()
@@ -473,7 +462,7 @@ FORMATS: Final[Mapping[str, Format]] = {
         ".xml",
         mjcf,
         _mujoco_torque,
-        friction=(Coulomb, Tanh, Viscous, Quadratic, Cubic),
+        friction=(COULOMB, TANH, VISCOUS, QUADRATIC, CUBIC),
         rotors=True,
     ),
     "sdf": Format(".sdf", sdf, _sdf_torque),

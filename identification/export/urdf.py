@@ -1,19 +1,10 @@
 """The way back: a URDF with identified inertia and friction, everything else as it was.
 
-- A moving link gets mass, centre of mass and the tensor about it, in the axes of the inertial
-  frame it had (its ``rpy`` stays).
-- What is fixed to a moving link cannot be distinguished from it. Its inertia is contained in the
-  moving link's, so its own ``<inertial>`` is removed, with a comment in its place.
-- A locked joint, and what it carries, stays as it was; the moving link gets what is left of the
-  identified inertia. Where that is no possible body, the locked links are treated as fixed ones.
-- The base and what is fixed to it keep theirs: no torque depends on it.
-- ``<dynamics>`` gets viscous friction as ``damping`` and Coulomb friction as ``friction``.
-- A payload is known and no part of the arm: it is not written.
-- What a URDF has no place for, such as rotor inertias, :func:`not_in_urdf` names; see
-  :func:`identification.export.parameters.parameters_json`.
-
-The text is read back and its inverse dynamics, by pinocchio, compared with the regressor's before
-it is returned.
+Moving links get mass, centre of mass and tensor in the axes that their ``rpy`` gives,
+``<dynamics>`` viscous friction as ``damping`` and Coulomb friction as ``friction``. The inertia of
+what is fixed to a moving link is contained in that link's and removed, with a comment in its place;
+a locked joint and what it carries stay, if what they leave of the moving link is a possible body.
+The text is read back and its inverse dynamics compared with the regressor's before it is returned.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 r"""What a fit needs of the samples, and least squares on it (the paper's eq. 4).
 
 Per joint j a :class:`Factor` holds the Gram matrix of the rows [W | y], a :class:`QRFactor` their
-triangular factor:
-
-.. math:: G_j = \sum_t \begin{bmatrix} W_j & y_j \end{bmatrix}^T
-                       \begin{bmatrix} W_j & y_j \end{bmatrix}, \qquad R_j^T R_j = G_j
-
-Both add: over chunks, repetitions, archives and machines (triangles by stacking them: Golub and
-Van Loan 2013, section 6.5). Joint weights, one value per joint, are applied afterwards, so no
-weight needs a second pass. A Gram matrix squares the condition number: from a scaled condition of
-1e5 on it leaves fewer than six of sixteen digits, where triangles keep eleven.
+triangular factor. Both add, over chunks, repetitions, archives and machines; joint weights are
+applied afterwards. Gram matrices square the condition: from 1e5 on triangles are used instead.
 """
 
 from __future__ import annotations

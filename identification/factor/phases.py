@@ -1,15 +1,8 @@
 r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in one pass.
 
-.. math:: G_{bj} = \sum_{t \in b} \begin{bmatrix} W_j & y_j \end{bmatrix}^T
-                                  \begin{bmatrix} W_j & y_j \end{bmatrix}
-
-Summed over the blocks b they are the :class:`identification.factor.factor.Factor`; block by block
-they give the scores of a cluster-robust covariance (:mod:`identification.estimators.covariance`)
-for any weights and parameters. Stored are only the columns that act on a joint, a third of all.
-
-Instrumental variables need the same of [Z | W | y], a factor of twice the parameters: W is the
-regressor of the measured motion, whose noise it carries, and Z that of a motion without measurement
-noise (:mod:`identification.estimators.instrumental`), column by column the same functions.
+Summed over blocks they are the :class:`identification.factor.factor.Factor`; block by block they
+give the scores of a cluster-robust covariance for any weights and parameters. Instrumental
+variables need the same of [Z | W | y], gains of [W | t | i].
 """
 
 from __future__ import annotations

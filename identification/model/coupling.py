@@ -1,13 +1,9 @@
 r"""Motors that turn with several joints: the coupled wrists of industrial arms.
 
 With motor angles per joint angle K (n, n), rotors with inertias J and friction in the motors act
-on the joints as
+on the joints as (Gautier 1997)
 
 .. math:: \tau = K^T J K \ddot q + \sum_m c_m^T\, f_m(c_m \dot q), \qquad c_m = K_m / K_{mm}
-
-so that a pair of joints that one motor turns with shares a constant inertia, and friction of a
-coupled motor depends on the sum of speeds that it turns with (Gautier 1997; for the Staeubli TX40
-Gandhi 2007).
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 r"""Springs, balancers and gear ripple: torques on a joint beside the rigid body.
 
-The torque of an element depends on the angle q of its joint, or of the joint's motor, alone. As
-with a payload it is counted as what the *drive* has to hold against: for a spring under the tension
-F between an anchor on the base side and one on the link side, at the distance l, that is
-:math:`F\,dl/dq`.
+They depend on the angle q of the joint or its motor, and count as what the *drive* has to hold: for
+a tension F between anchors at the distance l, :math:`F\,dl/dq`.
 """
 
 from __future__ import annotations

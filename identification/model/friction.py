@@ -3,30 +3,27 @@ r"""Friction of joints, linear in its coefficients: terms, the law of a joint, a
 .. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
                    + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
 
-with the joint's speed v. Each summand is a :class:`FrictionTerm`; a new one is a class in
-:data:`TERMS`, a field of :class:`FrictionLaw`, and fields of the same name in the cell file's
-tables. Dry friction does not jump at a reversal: over a displacement of some 1e-4 rad, while teeth
-and bearings bend, it reverses like a spring (presliding). Dahl (1968) describes it by a state z in
-place of sgn(v), which follows the displacement dq alone,
+with the joint's speed v. Each summand is a :class:`FrictionTerm`, a row of :data:`TERMS`. Dry
+friction does not jump at a reversal: over a displacement of some 1e-4 rad it reverses like a spring
+(presliding). Dahl (1968) describes it by a state z in place of sgn(v),
 
 .. math:: z \leftarrow s + (z - s)\,e^{-|dq| / d}, \qquad s = \mathrm{sgn}(dq)
 
 so that the torque stays linear in the coefficients once the distance d is fixed, and friction at
 rest is what was left of the motion before it.
 
-The source equation of the paper (after eq. 1: three coefficients per joint) could not be read. The
-quadratic third term is what the same authors' later software uses; the cubic one, ``v**3``, is the
-other form found in the field, so the term can be chosen or left out.
+The quadratic third term is that of the paper's authors, the cubic one the other form in the field.
 """
+
+# ruff: noqa: ARG005 - columns of all terms have the same arguments
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,32 +39,22 @@ Pair = tuple[str, tuple[tuple[float, float], tuple[float, float]]]
 _EXPONENT: Final = {1: "", 2: "²", 3: "³"}
 
 
-class Sliding(NamedTuple):
-    """Where a column is evaluated.
-
-    Attributes:
-        v: speeds (...) [rad/s, m/s].
-        s: direction of dry friction there (...), for a slope its derivative with v.
-    """
-
-    v: Array
-    s: Array
-
-
 @dataclass(frozen=True)
-class FrictionTerm(ABC):
+class FrictionTerm:
     """A coefficient times a column of speed and direction.
 
     Attributes:
-        speed: v_s of a column of v / v_s [rad/s, m/s].
         symbol: of the coefficient; terms with the same one exclude each other.
         option: of :class:`FrictionLaw`, and of `[robot.friction]`, that asks for it.
         label: of the term in a list; in lower case its name on the command line.
-        power: of the speed in the denominator of the coefficient's unit.
         words: what it is.
         basis: the column as a formula for people.
         code: the column in Python, as a factor of the coefficient; ``v`` is the speed, ``sign`` its
             direction, ``E`` Euler's number and ``LABEL_SPEED[joint]`` the `speed`.
+        value: the column (...) of speeds, directions of dry friction (...) and `speed`.
+        rate: its derivative with speed, of speeds, that of the direction (...) and `speed`.
+        asked: setting of a law, where it is not that of `option`.
+        power: of the speed in the denominator of the coefficient's unit.
         speed_symbol: of `speed`; empty for a column without it.
         urdf: attribute of `<dynamics>` that holds the coefficient; empty for none.
         of_motor: whether a coupled motor has one beside those of the joints.
@@ -75,59 +62,54 @@ class FrictionTerm(ABC):
         not_negative: whether only coefficients from zero on take energy. With a `pair` that holds
             of g, where ``(coefficient of the other symbol, this one) = matrix @ g``.
         pair: that symbol and matrix.
+        speed: v_s of a column of v / v_s [rad/s, m/s].
     """
 
+    symbol: str
+    option: str
+    label: str
+    words: str
+    basis: str
+    code: str
+    value: Callable[[Array, Array, float], Array]
+    rate: Callable[[Array, Array, float], Array]
+    asked: Callable[[FrictionLaw], Any] | None = None
+    power: int = 0
+    speed_symbol: str = ""
+    urdf: str = ""
+    of_motor: bool = False
+    is_friction: bool = True
+    not_negative: bool = False
+    pair: Pair | None = None
     speed: float = 1.0
 
-    symbol: ClassVar[str]
-    option: ClassVar[str]
-    label: ClassVar[str]
-    power: ClassVar[int] = 0
-    words: ClassVar[str]
-    basis: ClassVar[str] = ""
-    code: ClassVar[str] = ""
-    speed_symbol: ClassVar[str] = ""
-    urdf: ClassVar[str] = ""
-    of_motor: ClassVar[bool] = False
-    is_friction: ClassVar[bool] = True
-    not_negative: ClassVar[bool] = False
-    pair: ClassVar[Pair | None] = None
+    def __reduce__(self) -> tuple[object, ...]:
+        return _term, (self.label, self.speed)
 
-    @classmethod
-    def formula(cls) -> str:
-        """Return the term for people."""
-        return f"{cls.symbol} {cls.basis}".rstrip()
+    @property
+    def formula(self) -> str:
+        """The term for people."""
+        return f"{self.symbol} {self.basis}".rstrip()
 
-    @classmethod
-    def of(cls, law: FrictionLaw) -> Self | None:
+    def of(self, law: FrictionLaw) -> FrictionTerm | None:
         """Return the term as a law has it, None where it has not."""
-        match cls._setting(law):
+        match self.asked(law) if self.asked else getattr(law, self.option):
             case None | False:
                 return None
             case str(label):
-                return cls() if label == cls.label else None
+                return self if label == self.label else None
             case True:
-                return cls()
+                return self
             case speed:
-                return cls(speed)
-
-    @classmethod
-    def _setting(cls, law: FrictionLaw) -> Any:
-        return getattr(law, cls.option)
+                return replace(self, speed=speed)
 
     def column(self, v: Array, s: Array) -> Array:
         """Return the column (...) for speeds and directions of dry friction (...)."""
-        return self._column(Sliding(v, s))
+        return self.value(v, s, self.speed)
 
     def slope(self, v: Array, ds: Array) -> Array:
         """Return its derivative (...) with v, where that of the direction is `ds` (...)."""
-        return self._slope(Sliding(v, ds))
-
-    @abstractmethod
-    def _column(self, at: Sliding) -> Array: ...
-
-    @abstractmethod
-    def _slope(self, at: Sliding) -> Array: ...
+        return self.rate(v, ds, self.speed)
 
     def unit(self, *, revolute: bool) -> str:
         """Return the unit of the coefficient of a revolute or a prismatic joint."""
@@ -137,151 +119,51 @@ class FrictionTerm(ABC):
         return f"N·m·s{power}/rad{power}" if revolute else f"N·s{power}/m{power}"
 
 
-class Coulomb(FrictionTerm):
-    """Dry friction."""
-
-    symbol, option, label = "f0", "coulomb", "Coulomb"
-    words = "Coulomb (dry) friction f0"
-    basis, code = "sgn(v)", " * sign"
-    urdf, of_motor, not_negative = "friction", True, True
-
-    @classmethod
-    def _setting(cls, law: FrictionLaw) -> Any:
-        return law.coulomb and law.tanh is None
-
-    def _column(self, at: Sliding) -> Array:
-        return at.s
-
-    _slope = _column
+def _term(label: str, speed: float) -> FrictionTerm:
+    return next(replace(term, speed=speed) for term in TERMS if term.label == label)
 
 
-class Tanh(FrictionTerm):
-    """Dry friction that passes smoothly through zero, in place of Coulomb's."""
-
-    symbol, option, label = "f0", "tanh", "tanh"
-    words = "Coulomb friction f0 with a smooth sign"
-    basis, code = "tanh(v/vt)", " * tanh(v / TANH_SPEED[joint])"
-    speed_symbol = "vt"
-    urdf, of_motor, not_negative = "friction", True, True
-
-    def _column(self, at: Sliding) -> Array:
-        return np.tanh(at.v / self.speed)
-
-    def _slope(self, at: Sliding) -> Array:
-        return np.asarray((1.0 - np.tanh(at.v / self.speed) ** 2) / self.speed)
-
-
-class Viscous(FrictionTerm):
-    """Friction proportional to speed."""
-
-    symbol, option, label, power = "f1", "viscous", "viscous", 1
-    words = "viscous friction f1"
-    basis, code = "v", " * v"
-    urdf, of_motor, not_negative = "damping", True, True
-
-    def _column(self, at: Sliding) -> Array:
-        return at.v
-
-    def _slope(self, at: Sliding) -> Array:
-        return np.ones_like(at.v)
-
-
-class Asymmetric(FrictionTerm):
-    """Viscous friction by direction: f1 + fd forwards, f1 - fd backwards."""
-
-    symbol, option, label, power = "fd", "asymmetric", "asymmetric", 1
-    words = "half the difference fd of viscous friction forwards and backwards"
-    basis, code = "|v|", " * abs(v)"
-    not_negative, pair = True, ("f1", ((0.5, 0.5), (0.5, -0.5)))
-
-    @classmethod
-    def _setting(cls, law: FrictionLaw) -> Any:
-        return law.asymmetric and law.viscous
-
-    def _column(self, at: Sliding) -> Array:
-        return np.abs(at.v)
-
-    def _slope(self, at: Sliding) -> Array:
-        return np.asarray(np.sign(at.v))
-
-
-class Quadratic(FrictionTerm):
-    """The third term as the authors' later software has it."""
-
-    symbol, option, label, power = "f2", "third", "quadratic", 2
-    words = "a term f2 with the speed squared"
-    basis, code = "sgn(v) v²", " * v * abs(v)"
-
-    def _column(self, at: Sliding) -> Array:
-        return np.abs(at.v) * at.v
-
-    def _slope(self, at: Sliding) -> Array:
-        return 2.0 * np.abs(at.v)
-
-
-class Cubic(FrictionTerm):
-    """The third term in its other form."""
-
-    symbol, option, label, power = "f2", "third", "cubic", 3
-    words = "a term f2 with the third power of the speed"
-    basis, code = "v³", " * v**3"
-
-    def _column(self, at: Sliding) -> Array:
-        return at.v * at.v * at.v
-
-    def _slope(self, at: Sliding) -> Array:
-        return 3.0 * at.v**2
-
-
-class Stribeck(FrictionTerm):
-    """What friction is larger by at low speed."""
-
-    symbol, option, label = "fs", "stribeck", "Stribeck"
-    words = "additional friction fs at low speed (Stribeck)"
-    basis, code = "sgn(v) exp(-(v/vs)²)", " * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)"
-    speed_symbol = "vs"
-    not_negative, pair = True, ("f0", ((1.0, 0.0), (-1.0, 1.0)))
-
-    def _column(self, at: Sliding) -> Array:
-        ratio = at.v / self.speed
-        return np.asarray(np.exp(-ratio * ratio) * at.s)
-
-    def _slope(self, at: Sliding) -> Array:
-        # Without the fall with speed, which only the step after the next would feel.
-        return at.s
-
-
-class Offset(FrictionTerm):
-    """A constant torque, also the zero error of a sensor."""
-
-    symbol, option, label = "fo", "offset", "offset"
-    words = "a constant offset fo"
-    is_friction = False
-
-    @classmethod
-    def _setting(cls, law: FrictionLaw) -> Any:
-        return law.offset or (law.asymmetric and law.coulomb)
-
-    def _column(self, at: Sliding) -> Array:
-        return np.ones_like(at.v)
-
-    def _slope(self, at: Sliding) -> Array:
-        return np.zeros_like(at.v)
-
-
-Kind = type[FrictionTerm]
-TERMS: Final[tuple[Kind, ...]] = (
-    Coulomb,
-    Tanh,
-    Viscous,
-    Asymmetric,
-    Quadratic,
-    Cubic,
-    Stribeck,
-    Offset,
+# fmt: off
+TERMS: Final = (
+    FrictionTerm(
+        "f0", "coulomb", "Coulomb", "Coulomb (dry) friction f0", "sgn(v)", " * sign",
+        lambda v, s, _: s, lambda v, ds, _: ds, lambda law: law.coulomb and law.tanh is None,
+        urdf="friction", of_motor=True, not_negative=True),
+    FrictionTerm(
+        "f0", "tanh", "tanh", "Coulomb friction f0 with a smooth sign", "tanh(v/vt)",
+        " * tanh(v / TANH_SPEED[joint])", lambda v, s, vt: np.tanh(v / vt),
+        lambda v, ds, vt: (1.0 - np.tanh(v / vt) ** 2) / vt,
+        speed_symbol="vt", urdf="friction", of_motor=True, not_negative=True),
+    FrictionTerm(
+        "f1", "viscous", "viscous", "viscous friction f1", "v", " * v",
+        lambda v, s, _: v, lambda v, ds, _: np.ones_like(v),
+        power=1, urdf="damping", of_motor=True, not_negative=True),
+    FrictionTerm(  # f1 + fd forwards, f1 - fd backwards
+        "fd", "asymmetric", "asymmetric",
+        "half the difference fd of viscous friction forwards and backwards", "|v|", " * abs(v)",
+        lambda v, s, _: np.abs(v), lambda v, ds, _: np.sign(v),
+        lambda law: law.asymmetric and law.viscous,
+        power=1, not_negative=True, pair=("f1", ((0.5, 0.5), (0.5, -0.5)))),
+    FrictionTerm(
+        "f2", "third", "quadratic", "a term f2 with the speed squared", "sgn(v) v²",
+        " * v * abs(v)", lambda v, s, _: np.abs(v) * v, lambda v, ds, _: 2.0 * np.abs(v), power=2),
+    FrictionTerm(
+        "f2", "third", "cubic", "a term f2 with the third power of the speed", "v³", " * v**3",
+        lambda v, s, _: v * v * v, lambda v, ds, _: 3.0 * v**2, power=3),
+    FrictionTerm(  # the slope is without the fall with speed, which hardly any step feels
+        "fs", "stribeck", "Stribeck", "additional friction fs at low speed (Stribeck)",
+        "sgn(v) exp(-(v/vs)²)", " * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
+        lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s, lambda v, ds, _: ds,
+        speed_symbol="vs", not_negative=True, pair=("f0", ((1.0, 0.0), (-1.0, 1.0)))),
+    FrictionTerm(  # also the zero error of a sensor
+        "fo", "offset", "offset", "a constant offset fo", "", "",
+        lambda v, s, _: np.ones_like(v), lambda v, ds, _: np.zeros_like(v),
+        lambda law: law.offset or (law.asymmetric and law.coulomb), is_friction=False),
 )
+# fmt: on
 """All terms that a joint can have, in the order of the parameters."""
 
+COULOMB, TANH, VISCOUS, _, QUADRATIC, CUBIC, _, OFFSET = TERMS
 _SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
 ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0, "tanh": 0.0}
@@ -536,7 +418,7 @@ class JointFriction:
         return *self.laws, *(self.laws[motor] for motor in self.motors)
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[FrictionTerm, ...]:
         """Kinds of term that any joint has, in order."""
         return tuple(kind for kind in TERMS if any(kind.of(law) for law in self.laws))
 

@@ -1,8 +1,4 @@
-"""The chain of joints, read from a URDF.
-
-Every link is described in the frame of its own joint: origin on the joint axis, axes moving
-with the link. Joints are numbered depth first, so a parent comes before its children.
-"""
+"""The chain of joints, read from a URDF; links in the frame of their joint, parents first."""
 
 from __future__ import annotations
 

@@ -1,20 +1,13 @@
 r"""The pseudo-inertia of a body: when ten numbers can be those of a distribution of mass.
 
-For inertial parameters about a frame (tensor I, first moment h = mc, mass m)
+For inertial parameters about a frame (tensor I, first moment h = mc, mass m; in the order of
+:data:`identification.model.regressor.LINK_SYMBOLS`)
 
 .. math:: J = \begin{bmatrix} \Sigma & h \\ h^T & m \end{bmatrix}, \qquad
           \Sigma = \tfrac{1}{2}\,\mathrm{tr}(I)\,1 - I
 
-is the matrix of second moments of the mass about the frame's origin. Some mass density has these
-parameters if and only if J is positive (semi)definite (Wensing, Kim and Slotine 2018, who call
-this full physical consistency): the mass is positive, the tensor about the centre of mass is
-positive and obeys the triangle inequalities. J is linear in the parameters.
-
-Nominal parameters of a description are often no body at all: left out, typed with a slip, or of a
-rod without thickness. :func:`reference_bodies` keeps as much of each link as is possible, to hold
-on to where data leave its parameters open.
-
-The ten parameters stand in the order of :data:`identification.model.regressor.LINK_SYMBOLS`.
+is linear in the parameters, and positive (semi)definite if and only if some mass density has them
+(Wensing, Kim and Slotine 2018).
 """
 
 from __future__ import annotations

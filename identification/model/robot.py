@@ -15,7 +15,7 @@ from identification.errors import ModelError, ShapeError
 from identification.model.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
 from identification.model.coupling import Coupling
 from identification.model.elements import Element, ElementError, JointElements
-from identification.model.friction import FrictionLaw, JointFriction, Offset
+from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.payload import Load, Payload
 from identification.model.regressor import LINK_SYMBOLS, Regressor, RegressorPlan, joint_arrays
@@ -457,11 +457,11 @@ def _base_parameters(
 def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Array) -> None:
     """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
     n = chain.n_joints
-    if Offset not in friction.kinds:
+    if OFFSET not in friction.kinds:
         return
     offsets = np.tile(np.eye(n), (len(columns) // n, 1))
     for joint, share in enumerate(share_left(offsets, columns)):
-        if share <= TOLERANCE and Offset.symbol in friction.laws[joint].symbols:
+        if share <= TOLERANCE and OFFSET.symbol in friction.laws[joint].symbols:
             name = chain.joint_names[joint]
             raise ModelError(
                 f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
@@ -476,7 +476,7 @@ def _refuse_known_shape(
 ) -> None:
     """Refuse an element whose column the others contain, such as a weight's or an offset's."""
     m, n = q.shape
-    offsets = [j for j, law in enumerate(friction.laws) if Offset.symbol in law.symbols]
+    offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
     for one in elements.identified:
         own, owner = one.columns(q), one.element.joint

@@ -1,7 +1,7 @@
 """What a robot description must keep to before its readers see it: it may be anybody's file.
 
 Readers written in C++ end the process on some texts, take minutes for others, and leave out the
-whole inertia of a link where they cannot read one number of it, without an error.
+inertia of a link where they cannot read one number of it.
 """
 
 from __future__ import annotations

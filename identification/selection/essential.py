@@ -1,25 +1,9 @@
 """Essential parameters: those that a motion needs, chosen by backward elimination.
 
-One parameter after the other is removed, the one known worst first: of the largest relative
-standard deviation (Pham and Gautier 1991). The usual rule stops when the relative standard
-deviations left differ by less than a factor of 30. It knows nothing about prediction: on a real
-UR10 it gives away the offset of a wrist axis, whose error then rises from 7 to 16 %. Here every
-removal also has to stand on motion that was held out. It is refused, and the next worst known is
-tried, if it makes the prediction worse and the squared error, weighted by joint, then exceeds that
-of the best model so far
-
-- by more than chance (Student's t, one-sided 5 %, over blocks of time long enough to be
-  uncorrelated) and more than is worth a word; or
-- by more than may be given away however uncertain it is (see :class:`CutRule`).
-
-What was refused is tried once more when nothing else can go.
-
-The held-out motion decides which parameters stay, so its error flatters the model that is left.
-What the choice is worth on motion that had no say is found beside it: parameters chosen inside the
-fitted motion alone, on its last part, fitted to all of it and tried on the held-out motion.
-
-All of it works on factors: a step is the solution of the remaining normal equations, an error a
-quadratic form. The samples are not read again.
+The parameter of the largest relative standard deviation is removed (Pham and Gautier 1991) unless
+motion that was held out is predicted worse without it, by more than :class:`CutRule` gives away;
+what was refused is tried once more when nothing else can go. What the choice is worth on motion
+that had no say is found beside it (:class:`BlindChoice`). All of it works on factors.
 """
 
 from __future__ import annotations

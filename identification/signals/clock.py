@@ -1,9 +1,7 @@
 """The clock of a recording: what its time stamps are, and when the samples were measured.
 
-A logger stamps a sample when it comes to it. The robot takes its samples by a clock of its own,
-mostly an even one, so that uneven stamps are either right or the logger's lateness. The positions
-decide: at a speed of v, a stamp wrong by e moves its sample off the smooth motion of every joint
-by v e at once.
+Uneven stamps are either right or the logger's lateness. The positions decide: at a speed of v, a
+stamp wrong by e moves its sample off the smooth motion of every joint by v e at once.
 """
 
 from __future__ import annotations

@@ -1,19 +1,12 @@
 """Smoothing spline whose mean squared residual equals a given tolerance (the paper's SPAPS).
 
-Minimises, per channel and on any increasing time base,
+Quintic splines f on uniform knots that minimise, per channel and on any increasing time base,
 
     sum_i (y_i - f(t_i))^2 + penalty * integral f'''(t)^2 dt
 
-over quintic splines f, and chooses the penalty so that mean (y_i - f(t_i))^2 = tolerance, which
-is the measured variance of the channel (de Boor's rule, MATLAB's ``spaps``; Villagrossi et al.
-2014, section 4.1). On uniform time and away from the ends this is a zero-phase low-pass with
-gain 1 / (1 + (w / w_c)^6): three poles each way, like a third-order Butterworth filter run
-forwards and backwards, whose derivatives are exact.
-
-The knots are uniform and a few samples apart instead of one at each sample: every basis function
-is then the same cardinal B-spline, the normal equations have five off-diagonals whatever the
-time base, and a channel costs a few banded factorisations. The knots are refined where the
-tolerance asks for more detail than they can follow.
+with mean (y_i - f(t_i))^2 = tolerance (de Boor; Villagrossi et al. 2014, section 4.1): away from
+the ends a zero-phase low-pass of gain 1 / (1 + (w / w_c)^6). The normal equations have five
+off-diagonals; knots are refined where the tolerance asks for more detail.
 """
 
 from __future__ import annotations

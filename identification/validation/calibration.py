@@ -1,22 +1,10 @@
 r"""Whether intervals of predicted torque hold what is measured on motion that was not fitted.
 
-A half second's mean of the measured torque of joint j differs from its prediction by
-
-.. math:: \bar e = \bar w_j (\pi - \hat\pi) + \bar r, \qquad
-          \operatorname{var} \bar e = \bar w_j C \bar w_j^T + s_j^2
-
-with the mean row :math:`\bar w_j` of the regressor, the covariance C of the estimate and the
-residual's own mean :math:`\bar r`. White residuals of variance :math:`\sigma^2` would have
-:math:`s^2 = \sigma^2 / m` over m rows. Real ones are coloured and hold the errors of the model, so
-that their means hardly shrink. Here s is the root mean square of :math:`\bar e` where the fitted
-part is predicted by inner folds: each stretch of time from parameters of the others
-(:mod:`identification.selection.inner_prediction`). It is computed about zero, because the
-prediction is without bias only as far as the model is right; and it holds the uncertainty of the
-folds' parameters, so that intervals are rather too wide than too narrow where the fitted part is
-short.
-
-Rows count at rest and at reversals too, but not where motion or torque are not known: beside gaps
-and ends, and saturated. Nothing held out is read to make an interval.
+A half second's mean of the torque of joint j differs from its prediction with variance
+:math:`\bar w_j C \bar w_j^T + s_j^2`: mean row of the regressor, covariance C of the estimate, and
+the mean square s² of the same error where the fitted part is predicted by inner folds
+(:mod:`identification.selection.inner_prediction`), as residuals are coloured and hold the errors of
+the model. Rows at rest and at reversals count; nothing held out is read to make an interval.
 """
 
 from __future__ import annotations

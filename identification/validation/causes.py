@@ -1,14 +1,9 @@
 """Faults that explain what a model leaves over: mended, each has to predict better.
 
-The fitted recordings are cut into blocks of time, and the torque of every fifth block is predicted
-from the others: as measured, and with one fault after the other mended, such as torques of two
-joints in each other's column, an axis that counts the other way round, or a payload in one part of
-the recordings. The fault whose mending lowers the error most, beyond chance, is named; with it
-mended the search goes on. What is held out of the fit is never read.
-
-All but the faults of the positions are linear in the columns of one table per joint: regressor,
-columns of a payload, rate of the predicted torque, torques of all joints. Gram matrices of the
-blocks are therefore made once, and a candidate costs a few small solutions.
+The torque of every fifth block of the fitted recordings is predicted from the others, as measured
+and with one fault after the other mended. The one that lowers the error most, beyond chance, is
+named, and with it mended the search goes on. All but faults of the positions are linear in the
+columns of one table per joint, whose Gram matrices are made once.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """What physical consistency costs an estimate, and what of the machine stands in its way.
 
-Least squares may end at parameters that no machine has: a link thinner than nothing, a rotor of
-negative inertia. Where the data leave these parameters open, the nearest possible machine fits
-them as well, and nothing is wrong. Where they do not, the possible machine predicts worse, and
-the bound that stops it names what the data ask for in vain.
+Where the data leave parameters open, the nearest possible machine fits them as well. Where it
+predicts worse, the bound that stops it names what the data ask for in vain.
 """
 
 from __future__ import annotations

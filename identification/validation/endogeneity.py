@@ -1,22 +1,12 @@
 """Was least squares biased by noise in the regressor? A Durbin-Wu-Hausman test.
 
-Noise V in the measured regressor, W = W* + V, makes the error of the equation e - V pi, and least
-squares is biased exactly as far as that correlates with W. The test is the auxiliary regression
-(Durbin 1954, Wu 1973, Hausman 1978): what the instruments do not explain of W, V = W - P_Z W, is
-added to the equation, and its coefficients are zero if least squares was not biased. All p columns
-of V at once cannot be tested honestly: blocks of coloured residuals are no more than some dozens,
-as many as there are parameters. But measurement noise enters in one direction only, V pi. So one
-column per joint is added, V_j pi on that joint's rows, with pi as estimated by instrumental
-variables (under the hypothesis its coefficient is zero, so that pi is estimated does not matter:
-Pagan 1984). That is n coefficients, tested together with the covariance that leaves out one block
-of time at a time, and Hotelling's F for a covariance from few blocks.
-
-With noise of measurement alone the coefficients are minus the share of that column that is noise,
-between -1 and 0. A disturbance that moves the arm through its servo also correlates with the motion
-and biases least squares; its coefficients may have either sign, and a positive one is no noise.
-
-The same differently put, parameter by parameter: how far the two estimates are apart, in standard
-deviations of that difference, which is tested with Bonferroni's correction.
+What the instruments do not explain of W, V = W - P_Z W, is added to the equation; its coefficients
+are zero if least squares was not biased. Noise enters in the direction V pi only, so one column per
+joint is added, V_j pi with pi by instrumental variables, and the n coefficients are tested together
+with a covariance that leaves out one block of time at a time (Hotelling's F). With noise of
+measurement alone they are minus the share of that column that is noise; a disturbance that moves
+the arm may have either sign. Beside it, parameter by parameter: how far the two estimates are
+apart.
 """
 
 from __future__ import annotations

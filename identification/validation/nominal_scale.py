@@ -1,9 +1,7 @@
 """How large each axis's torque is beside what the nominal inertias ask for.
 
-A torque constant or gear ratio that is wrong by a factor scales everything that is estimated of its
-axis: the fit is as good as ever, and only knowledge from elsewhere can tell. The measured torque of
-each axis is regressed on the nominal model's rigid torque with friction free, which changes by tens
-of per cent, and so are rotor inertias of which nobody knows.
+A torque constant or gear ratio that is wrong by a factor fits as well as ever; only knowledge from
+elsewhere can tell. Friction is free in the comparison, and so are unknown rotor inertias.
 """
 
 from __future__ import annotations

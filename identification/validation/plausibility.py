@@ -1,8 +1,6 @@
-"""Whether estimated parameters can belong to a machine at all.
+"""Whether estimated parameters can belong to a machine at all, by signs that nature does not make.
 
-Signs that nature does not make: friction that drives, negative masses, an arm that could be
-accelerated at a gain of energy. Each is judged with the estimate's own uncertainty, so that
-a parameter that is merely not known is no offence.
+Each is judged with the estimate's own uncertainty: what is merely not known is no offence.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.factor.factor import Estimate, Factor
-from identification.model.friction import Coulomb
+from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -90,7 +88,7 @@ def _offences(
         for k, (_, term, owner, motor, _) in enumerate(model.friction.terms, start=first):
             if owner == joint and not motor and term.is_friction:
                 top[k] = term.column(one, law.sign(one))[0]
-                coulomb[k] = isinstance(term, Coulomb)
+                coulomb[k] = term == COULOMB
         if _is_negative(estimate, coulomb):
             words = (
                 f"Coulomb friction of {name} is negative ({coulomb @ values:.3g}): a torque or a"

@@ -1,12 +1,7 @@
 """Steps of a measured position that no arm makes: an encoder that slipped, or lost its count.
 
-A joint that moves at a speed of v changes it by at most its acceleration times the step of the
-clock; its position therefore steps by about what the steps beside it say. A step that departs from
-these and is not accepted back is no motion.
-
-A wrong time stamp, a missing row and a repeated one make every joint depart at once, each by its
-speed times one error of the time. What the other joints have in common with a departure is the
-clock's, and is subtracted before it is judged.
+A step that departs from the steps beside it and is not made up for is no motion. What the other
+joints have in common with a departure is the clock's, and is subtracted before it is judged.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """What is left over, looked at from all sides: is it noise, and if not, what does it follow?
 
-A check gives its size as a share of the torque and whether it stands out of noise. Both matter: of
-a long recording the smallest error is significant, and of a short one a large one may be chance.
-
-What a torque model leaves over is correlated over tenths of a second: a thousand samples of one
-move say about as much as one number. Means are therefore judged by how much they differ from
-block to block of time (cluster-robust, Liang and Zeger 1986). Repetitions of one motion share
-their blocks: an error that repeats with the motion is not confirmed by being repeated.
+Means are judged by how much they differ from block to block of time (cluster-robust, Liang and
+Zeger 1986); repetitions of one motion share their blocks, for an error that repeats with the motion
+is not confirmed by being repeated.
 """
 
 from __future__ import annotations

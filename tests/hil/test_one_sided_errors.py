@@ -21,7 +21,7 @@ from hil.progress import Silent
 from hil.recordings import recording_of
 from hil.results import VerdictResult
 from hil.simulation import simulated_drive
-from identification.model.friction import Coulomb
+from identification.model.friction import COULOMB
 from sim_fixtures import SimulatedDrive
 
 Run = Callable[..., Campaign]
@@ -122,7 +122,7 @@ def test_friction_columns_of_the_wrong_sign_are_red(
     honest: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The prediction stays as good, but friction that drives a joint is impossible."""
-    monkeypatch.setattr(Coulomb, "_column", lambda _, at: -at.s)
+    monkeypatch.setitem(vars(COULOMB), "value", lambda v, s, _: -s)
     found = verdict(honest)
     assert not found.good, found.line
     assert any("Coulomb friction of" in reason for reason in found.reasons)

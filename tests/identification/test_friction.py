@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,6 @@ from identification.model.friction import (
     TERMS,
     FrictionTerm,
     JointFriction,
-    Stribeck,
     dissipation,
     presliding_state,
 )
@@ -31,18 +32,21 @@ class TestFrictionTerms:
     SPEED = np.array([-2.0, -0.3, 0.1, 0.7])
     STEP = 1e-6
 
-    def test_source_code_computes_the_column(self, kind: type[FrictionTerm]) -> None:
-        term = kind(0.4)
+    def test_source_code_computes_the_column(self, kind: FrictionTerm) -> None:
+        term = replace(kind, speed=0.4)
         names = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0}
         names |= {"E": math.e, "tanh": math.tanh}
         code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **names}) for v in self.SPEED]
         np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
 
-    def test_slope_is_the_derivative_of_the_column(self, kind: type[FrictionTerm]) -> None:
+    def test_another_process_has_the_same_term(self, kind: FrictionTerm) -> None:
+        assert pickle.loads(pickle.dumps(replace(kind, speed=0.4))) == replace(kind, speed=0.4)
+
+    def test_slope_is_the_derivative_of_the_column(self, kind: FrictionTerm) -> None:
         """At a speed that the direction has no part in; the fall of Stribeck's is left out."""
-        if kind is Stribeck:
+        if kind.label == "Stribeck":
             return
-        sign, term = np.sign(self.SPEED), kind(0.4)
+        sign, term = np.sign(self.SPEED), replace(kind, speed=0.4)
         above, below = (term.column(self.SPEED + d, sign) for d in (self.STEP, -self.STEP))
         slope = term.slope(self.SPEED, np.zeros(4))
         np.testing.assert_allclose(slope, (above - below) / (2.0 * self.STEP), atol=1e-8)

@@ -1,11 +1,8 @@
 """Where along a motion the arm comes too close to itself or to what stands around it.
 
-A quick look at all pairs shows which are near (`Near`), a closer one whether they touch, at the
-samples and between them.
-
-Two bodies are clear from one sample to the next if they cannot meet for the way they go, or if
-one slab lies between them at both: their points leave straight lines by no more than is allowed
-for. What that leaves open is divided.
+A quick look at all pairs shows which are near (`Near`). These are clear from one sample to the next
+if they cannot meet for the way they go, or if one slab lies between them at both and their points
+leave straight lines by no more than is allowed for; what that leaves open is divided.
 """
 
 from __future__ import annotations

@@ -1,16 +1,9 @@
 """Where hulls are at many samples at once, how far apart, and how far they leave straight ways.
 
-The samples stand last in every array, so that each step is one product of a small matrix with a
-long one.
-
-Separation. Two convex bodies are as far apart as the widest slab between them, and overlap as
-deeply as the one with the least overlap. So any direction gives a lower bound of their signed
-distance, ``n · (c_a - c_b) - h_a(n) - h_b(n)`` with the support function h of each about its centre
-c; along the shortest way between their axes it is seldom far from the truth.
-
-Curvature. A path whose second derivative is at most A stays within A h²/8 of the straight line
-between two points that it passes h apart in time. Seen from the base all joints count, seen from
-the frame that carries both bodies of a pair only those beyond it.
+The samples stand last in every array. Any direction n gives a lower bound of the signed distance of
+two convex bodies, ``n · (c_a - c_b) - h_a(n) - h_b(n)`` with the support function h of each about
+its centre c. A path whose second derivative is at most A stays within A h²/8 of the straight line
+between two points that it passes h apart in time.
 """
 
 from __future__ import annotations

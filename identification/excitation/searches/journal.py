@@ -1,8 +1,4 @@
-"""What a search has scored so far, stored so that an interrupted search resumes.
-
-Nothing but scores is stored. A resumed search is the same search run once more: it asks for the
-same genes in the same order, and takes from the journal what is there. The last bit of its
-result is therefore that of a search nobody interrupted.
+"""What a search has scored so far, stored so that an interrupted search resumes bit-identically.
 
 Layout: a line that names the format, then frames of length (8 bytes, little endian), CRC-32 (4
 bytes) and that many bytes: first which search it belongs to (JSON), then for each generation its

@@ -1,9 +1,7 @@
 """Searching for the motion that excites the parameters best: the paper's methods, and others.
 
-Method A and method B of the paper are a genetic search for the largest determinant and for the
-largest fitness of eq. 7; which motions they search among is the genome's affair. The same seed
-gives the same design to the last bit, for any number of processes, and whether or not it was
-interrupted and resumed.
+The same seed gives the same design to the last bit, for any number of processes, and whether or not
+it was interrupted and resumed.
 """
 
 from __future__ import annotations
