@@ -63,11 +63,7 @@ class Gains:
 
 
 def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
-    """Estimate the gain of each motor, with its confidence.
-
-    Args:
-        factor: blocks of recordings with a known payload, and without or with another.
-        motor_names: (n,), in the order of the factor.
+    """Estimate the gain of each motor, from blocks with a known payload and with another or none.
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
@@ -241,13 +237,9 @@ def scale_from_nominal(
     currents: Sequence[Array],
     motor_from_joint: Array | None = None,
 ) -> CurrentScale:
-    """Gains of all motors from recordings of their currents.
+    """Gains of all motors from smoothed motions and currents (m, n) [A] in their rows.
 
-    Args:
-        model: with nominal inertias.
-        motions: smoothed, of each recording.
-        currents: in their rows (m, n) [A].
-        motor_from_joint: motor angles per joint angle (n, n); identity: gains include the gears.
+    `motor_from_joint`: motor angles per joint angle (n, n); identity: gains include the gears.
     """
     n = model.n_joints
     turns = np.eye(n) if motor_from_joint is None else np.asarray(motor_from_joint, np.float64)

@@ -73,13 +73,9 @@ class Instruments(NamedTuple):
 
 
 def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = None) -> Instruments:
-    """Commanded motion, shifted by the lag of each axis.
+    """Motion commanded by positions (m, n), NaN where none was, shifted by the lag of each axis.
 
-    Args:
-        samples: the measured motion.
-        commanded: commanded positions in the rows of the samples (m, n) [rad or m], NaN where
-            nothing was commanded.
-        lag: of each axis where it is known from the same motion (n,) [s]; else it is sought.
+    The lag (n,) [s] is sought unless it is known from the same motion.
 
     Raises:
         IdentificationError: no row has a commanded position, or no joint is commanded to move.
@@ -113,12 +109,10 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
-    """Whether two recordings were commanded the same motion.
+    """Whether two recordings were commanded the same motion, compared where both are known.
 
-    Args:
-        first: time since the motion's origin (m,) [s] and commanded positions (m, n), NaN where
-            nothing was commanded.
-        second: likewise; compared where both are known.
+    Of each the time since the motion's origin (m,) [s] and commanded positions (m, n), NaN where
+    nothing was commanded.
     """
     (time, one), (other_time, other) = first, second
     if one.shape[1] != other.shape[1]:
@@ -143,13 +137,8 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
     """Time by which each axis follows its command (n,) [s], NaN for one that is not moved.
 
-    The shift that leaves the smallest variance of the difference: a constant one, as gravity
-    makes it, does not count.
-
-    Args:
-        time: (m,) [s].
-        measured: positions (m, n) [rad or m].
-        command: spline through the commanded positions.
+    The shift that leaves the smallest variance of the difference to measured positions (m, n): a
+    constant one, as gravity makes it, does not count.
     """
     thin = slice(None, None, max(1, len(time) // _ROWS))
     time, measured = time[thin], measured[thin]
@@ -243,17 +232,10 @@ def solve_cross(total: Array) -> CrossSolution:
 def estimate_instrumental(
     model: RobotModel, factor: PhaseFactor, weights: Array | None = None
 ) -> InstrumentalEstimate:
-    """Estimate with instrumental variables.
+    """Estimate with instrumental variables, from a factor of :func:`instrument_factor`.
 
-    The covariance is the sandwich over blocks, how the estimate moves when one is left out: that of
-    least squares (:mod:`identification.estimators.covariance`) with Z'W for W'W.
-
-    Args:
-        model: the robot.
-        factor: see :func:`identification.factor.phases.instrument_factor`; of one repetition,
-            or a sum.
-        weights: per joint (n,); by default the inverse residual variances of an instrumental fit
-            whose weights are those of least squares.
+    The covariance is the sandwich over blocks: that of least squares with Z'W for W'W. Weights (n,)
+    are by default the inverse residual variances of an instrumental fit weighted by least squares.
 
     Raises:
         IdentificationError: the factor holds no rows.

@@ -41,11 +41,8 @@ def fit_least_squares(
 ) -> Estimate:
     """Fit recordings, by QR where the condition demands it, with cluster-robust covariance.
 
-    Args:
-        model: the robot.
-        recordings: can be gone through twice: a sequence, not a generator.
-        weighting: whether joints count alike or by their own noise (eq. 4).
-        phase: of the recordings, if it is known: they are then read for QR only.
+    Joints count alike or by their own noise (eq. 4). Where the factor is known the recordings are
+    read for QR only.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.
@@ -177,14 +174,9 @@ def estimate_repetitions(
     *,
     each: Fit | None = None,
 ) -> RepeatedEstimate:
-    """Estimate from each repetition and from all.
+    """Estimate from each repetition and from all, by default by weighted least squares (eq. 4).
 
-    Args:
-        model: the robot.
-        recordings: the repetitions.
-        fit: the estimator; by default weighted least squares (eq. 4), which reads the samples
-            once unless their condition demands QR.
-        each: that of single repetitions, by default the same.
+    `each` is the estimator of single repetitions, by default the same.
 
     Raises:
         IdentificationError: no repetitions, or one without a usable row.

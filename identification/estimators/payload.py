@@ -109,14 +109,9 @@ class Run:
     def of(
         cls, name: str, model: RobotModel, samples: Samples, frame: str | None, *, loaded: bool
     ) -> Run:
-        """Reduce a recording.
+        """Reduce a recording of an arm without payload; the body is at the frame of a link.
 
-        Args:
-            name: of it.
-            model: the arm without payload.
-            samples: of the recording.
-            frame: link of the description at whose frame the body is; None: that of the last joint.
-            loaded: whether the arm carried the body.
+        That of the last joint for None.
 
         Raises:
             ModelError: the description has no such frame, or it is fixed to the base.

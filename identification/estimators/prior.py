@@ -152,13 +152,8 @@ def with_prior(
 ) -> PosteriorEstimate:
     """Estimate from data and prior; without data, the prior; with a flat one, least squares.
 
-    Args:
-        model: the robot.
-        factor: the samples, possibly none.
-        prior: on the model's p parameters.
-        weights: per joint (n,), 1/variance; by default from an ordinary fit without prior.
-        design_effect: how many rows say as much as one would if residuals were white; the data
-            weigh that much less against the prior. See :func:`fit_with_prior`.
+    Weights (n,) are by default those of an ordinary fit without prior. `design_effect`: how many
+    rows say as much as one would if residuals were white (:func:`fit_with_prior`).
 
     Raises:
         IdentificationError: some rows, but too few to know the noise from, and no weights.
@@ -193,16 +188,9 @@ def fit_with_prior(
 ) -> PosteriorEstimate:
     """Fit recordings with a prior, the data weighing as much as their coloured residuals allow.
 
-    Counting every row as independent would make the data too sure of themselves, and the prior
-    worth nothing. So their information is divided by the design effect: the mean ratio, over
-    all directions of the parameter space, of the cluster-robust variance to that of white
-    residuals (Rao and Scott 1981; Pauli, Racugno and Ventura 2011).
-
-    Args:
-        model: the robot.
-        recordings: can be gone through twice: a sequence, not a generator.
-        prior: on the model's p parameters.
-        phase: of the recordings, if it is known: they are then read for QR only.
+    Their information is divided by the design effect: the mean ratio, over all directions of the
+    parameter space, of the cluster-robust variance to that of white residuals (Rao and Scott 1981;
+    Pauli, Racugno and Ventura 2011). Where the factor is known they are read for QR only.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.

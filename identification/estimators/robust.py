@@ -94,16 +94,9 @@ def robust_estimate(
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once, one at a time.
 
-    Only the residuals, one number per row, are stored. Tukey's loss starts where Huber's ends, and
-    with its scales (Yohai 1987): looked for anew they can shrink with the rows that count.
-    QR takes the place of Gram matrices where the condition demands it.
-
-    Args:
-        model: the robot.
-        recordings: can be gone through many times: a sequence, not a generator.
-        loss: what a residual costs.
-        gram: factor of the recordings, if it is known: saves a pass over the samples.
-        most_iterations: for each loss. What has not converged by then is returned and says so.
+    Only residuals are stored. Tukey's loss starts where Huber's ends, and with its scales (Yohai
+    1987). QR takes the place of Gram matrices where the condition demands it. `gram`, the factor of
+    the recordings, saves a pass; what has not converged after `most_iterations` of a loss says so.
 
     Raises:
         IdentificationError: no recordings, or not one usable row.

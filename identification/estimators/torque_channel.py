@@ -52,23 +52,16 @@ def possible_low_passes(
     options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
     undelayed: float | None = None,
 ) -> tuple[Preprocessing, ...]:
-    """Settings with the low-passes that fit a recording best, one of each kind.
+    """Settings with the low-passes that fit a recording with torque best, one of each kind.
 
     Many controllers log a smoothed effort: Coulomb friction, a step in the regressor, is then a
-    slope in the torque, and a fit of one to the other is wrong at every reversal.
+    slope in the torque. The kinds are causal ones, whose lag a delay without a low-pass would stand
+    in for, and ones without phase. A kind whose residuals are not clearly smaller than with a delay
+    by itself is left out. The motion is read with a wide bandwidth: a narrow one would itself be a
+    low-pass.
 
-    The kinds are causal ones, whose lag is what a delay without a low-pass would have to stand in
-    for, and ones without phase, beside that delay or without it, as fits better. A kind whose
-    residuals are not clearly smaller than with a delay by itself is left out. The motion is read
-    with a wide bandwidth: a narrow one would itself be a low-pass of the regressor.
-
-    Args:
-        recording: checked, with torque.
-        model: the robot.
-        noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
-        options: the other settings.
-        undelayed: delay [s] where that of the options was found without a low-pass; that of the
-            options if left out.
+    `undelayed` is the delay [s] found without a low-pass, that of the options if left out;
+    `noise_variance` (n,) as in :func:`identification.signals.samples.smooth`.
     """
     still = options.torque_delay if undelayed is None else undelayed
     wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH, torque_bandwidth=None)

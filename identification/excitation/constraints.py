@@ -160,13 +160,9 @@ class Constraints:
     ) -> tuple[Violation, ...]:
         """Return what a motion breaks: of each kind and subject the worst, of contacts the deepest.
 
-        Joint limits and contacts are looked at between the samples too, the rest at them; contacts
-        of a motion that breaks a joint limit at its samples only, and a motion so violent that its
-        samples are no finite numbers for joint limits alone.
-
-        Args:
-            trajectory: the motion.
-            motion: samples of it, both ends included.
+        Joint limits and contacts are looked at between the samples (both ends included) too, the
+        rest at them; contacts of a motion that breaks a joint limit at its samples only, and a
+        motion so violent that its samples are no finite numbers for joint limits alone.
 
         Raises:
             ShapeError: samples of another arm.

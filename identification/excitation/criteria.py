@@ -83,12 +83,9 @@ def measures(gram: Array, n_samples: int) -> dict[str, float]:
 
 
 def log10_det(gram: Array, n_samples: int) -> float:
-    r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix.
+    r"""Return :math:`\log_{10}(\det(\Phi^T\Phi) / N^{N_\pi})`, -inf for a singular matrix (p, p).
 
-    Args:
-        gram: the Gram matrix, shape (p, p).
-        n_samples: N, the number of time samples as in the paper's Table 1 (not of rows, of which
-            there are one per joint and sample).
+    N counts time samples as in the paper's Table 1, not rows.
     """
     return measures(gram, n_samples)["log10_det"]
 

@@ -27,10 +27,7 @@ def limit_violations(
 ) -> list[Violation]:
     """Return for each quantity and joint the largest excess over its limit, if there is any.
 
-    Args:
-        trajectory: the motion.
-        limits: what it must keep.
-        motion: samples of it, both ends included; they say when the excess is.
+    Samples of the motion, both ends included, say when the excess is.
     """
     if isinstance(trajectory, FourierSeries):
         for samples in (motion, *_short_ramps(trajectory, motion)):
@@ -148,12 +145,7 @@ def rate_bounds(
 ) -> tuple[Array, Array, Array]:
     """Return bounds of velocity, acceleration and jerk in parts of a motion, (n, g) each.
 
-    They are sound and quick rather than tight.
-
-    Args:
-        trajectory: a table, or a series: short ramps count only in the parts they reach into.
-        start: of each part (g,) [s].
-        stop: of each part (g,) [s].
+    From `start` to `stop` (g,) [s] each; sound and quick rather than tight.
     """
     if isinstance(trajectory, FourierSeries):
         ramp, length = trajectory.ramp, trajectory.length

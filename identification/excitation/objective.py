@@ -57,10 +57,7 @@ class Objective:
         return self.model.n_parameters if self.parameters is None else len(self.parameters)
 
     def information(self, motion: Motion) -> Array:
-        """Return the information (e, e) on the essential parameters, earlier archives included.
-
-        Args:
-            motion: m samples, uniform in time; `midpoints` of a planned motion.
+        """Return the information (e, e) of a motion, uniform in time, earlier archives included.
 
         Raises:
             ShapeError: an array does not have the shape it should have.

@@ -42,12 +42,8 @@ def parameters_json(
 ) -> str:
     """Return everything about an estimate as JSON text.
 
-    Args:
-        model: the robot.
-        estimate: of the model's parameters, with its covariance.
-        consistent: adds the full standard parameters, rotor inertias included.
-        essential: names of the essential parameters, where they were looked for.
-        provenance: what the parameters come from: recordings, versions, digests.
+    With the full standard parameters of a consistent estimate, the names of essential parameters,
+    and what the parameters come from, where given.
 
     Raises:
         IdentificationError: the estimate is of other parameters.

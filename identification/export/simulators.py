@@ -270,13 +270,7 @@ class Comparison(NamedTuple):
 
 
 def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
-    """Read a text back, and compare what it says with the model.
-
-    Args:
-        text: as the format writes it.
-        form: the format.
-        arm: what was written.
-        motion: over which the parts that are left out are measured.
+    """Read a text of a format back, compare it with the arm, and measure what it leaves out.
 
     Raises:
         WriteBackError: at some random state the torque is another one.

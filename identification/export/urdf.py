@@ -101,13 +101,7 @@ class Edit(NamedTuple):
 
 
 class XmlSource:
-    """An XML text that can be edited in place.
-
-    Args:
-        text: the whole file.
-
-    Attributes:
-        root: its outermost element.
+    """An XML text that can be edited in place, and its outermost element `root`.
 
     Raises:
         ModelError: the text is not well-formed XML.

@@ -132,13 +132,7 @@ class Factor:
     def from_blocks(
         cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
     ) -> Self:
-        """Reduce rows as :func:`augmented_rows` gives them, which may have been weighted.
-
-        Args:
-            model: the robot.
-            chunks: per chunk and joint (c_j + 1, k).
-            samples: rows that count, per joint (n,).
-        """
+        """Reduce chunks as :func:`augmented_rows` gives them, with `samples` rows that count (n,)."""
         columns = model.plan.columns
         sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
         for blocks in chunks:
@@ -324,15 +318,11 @@ def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solutio
 
 
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
-    """Solve ``rows @ x = target`` by least squares, naming what the rows do not determine.
+    """Solve ``rows @ x = target`` (k, p), (k,) by least squares, naming what they do not determine.
 
     By a singular value decomposition of the rows with columns scaled to unit length: forming
-    ``rows'rows`` would square the condition (Golub and Van Loan 2013, section 5.3).
-
-    Args:
-        rows: (k, p).
-        target: (k,).
-        worst: as for :func:`solve`.
+    ``rows'rows`` would square the condition (Golub and Van Loan 2013, section 5.3); `worst` as for
+    :func:`solve`.
     """
     length = np.linalg.norm(rows, axis=0)
     left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
@@ -427,15 +417,10 @@ class Estimate:
 
 
 def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
-    """Weighted least squares (eq. 4).
+    """Weighted least squares (eq. 4), by default by the residual variances of an ordinary fit.
 
     The covariance is the classical one, A^-1: honest only if the residuals are white. See
     :mod:`identification.estimators.covariance` for the one that does not need that.
-
-    Args:
-        model: the robot.
-        factor: the samples; of one repetition, or a sum.
-        weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
 
     Raises:
         IdentificationError: the factor holds no rows.
@@ -507,13 +492,8 @@ def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> t
 def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:
     """Return the Gram matrices of recordings, or triangles where the condition demands it.
 
-    Gram matrices are five times as fast; the samples are read once more only if the scaled
-    condition of the ordinary problem exceeds `QR_CONDITION`.
-
-    Args:
-        model: the robot.
-        recordings: none where the factor is all there is.
-        gram: their factor.
+    The samples are read once more only if the scaled condition of the ordinary problem exceeds
+    `QR_CONDITION`; there are none where the factor is all there is.
 
     Raises:
         IdentificationError: not one usable row.

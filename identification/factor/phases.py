@@ -70,14 +70,10 @@ class PhaseFactor:
         names: tuple[str, ...],
         chunks: Iterable[tuple[slice, Sequence[Array]]],
     ) -> PhaseFactor:
-        """Reduce rows.
+        """Reduce chunks: per joint columns and torque (c_j + 1, k), zero if not usable (m, n).
 
-        Args:
-            index: block of each (m,), rising.
-            usable: whether it counts (m, n); what does not count is zero in the chunks.
-            columns: per joint the parameters of its columns (c_j,).
-            names: of the parameters (p,).
-            chunks: which rows, and per joint their columns and, last, the torque (c_j + 1, k).
+        `index` is the block of each row (m,), rising; `columns` are per joint the parameters of its
+        columns (c_j,), `names` those of all (p,).
         """
         count = int(index[-1]) + 1 if len(index) else 0
         gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
@@ -180,13 +176,9 @@ def instrument_factor(
 ) -> PhaseFactor:
     """Reduce a recording to blocks of [Z | W | y]: columns of Z by name, then the same of W.
 
-    Args:
-        model: the robot.
-        samples: the measured motion and torque.
-        instrument: motion without measurement noise, in the rows of the samples.
-        usable: where the instrument is known (m, n); everywhere without it. Rows count in
-            which the samples are usable and the instrument moves as well: which rows count
-            must not depend on the noise.
+    The instrument is a motion without measurement noise in the rows of the samples, known where
+    `usable` (m, n) says. Rows count in which it moves as well: which count must not depend on
+    noise.
     """
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
@@ -219,14 +211,9 @@ def gain_factor(
 ) -> PhaseFactor:
     """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
 
-    Args:
-        model: the robot without payload.
-        samples: its motion, and which rows count; its torque is not used. A motor's row
-            counts where the rows of all joints it acts on count.
-        motor_current: (m, n) [A], in the rows of the samples.
-        payload: what the robot carried.
-        transmission: motors' angles per joint angle (n, n); identity: motors are joints, and
-            gains include the gear ratio.
+    A motor's current (m, n) [A] counts where the rows of all joints that it acts on do; t is the
+    torque of what the robot carried. `transmission`: motors' angles per joint angle (n, n),
+    identity: motors are joints, and gains include the gear ratio.
     """
     n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)

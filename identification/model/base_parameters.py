@@ -106,15 +106,10 @@ class BaseParameters:
 
 
 def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) -> BaseParameters:
-    """Choose the first independent columns, left to right, and group the others into them.
+    """Choose the first independent columns (rows, s), left to right, and group the others.
 
-    A QR factorisation reduces the rows first; it keeps lengths and angles of the columns. Then
-    Gram-Schmidt walks through them in the given order, so that the choice is deterministic.
-
-    Args:
-        regressor: rows for states that excite everything, shape (rows, s).
-        names: standard names, shape (s,).
-        units: their units: only columns of one unit can be compared in length, shape (s,).
+    A QR factorisation reduces the rows first; Gram-Schmidt walks through the columns in the given
+    order. Only columns of one unit are compared in length.
     """
     reduced = np.linalg.qr(regressor, mode="r")
     lengths = np.linalg.norm(reduced, axis=0)

@@ -278,13 +278,8 @@ class FrictionLaw:
     def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
 
-        A reversal between two instants divides the step where the velocity, linear between them,
-        is zero.
-
-        Args:
-            time: of m instants [s].
-            position: of the joint or motor [rad, m], in joint units.
-            velocity: likewise [rad/s, m/s].
+        Times [s], positions and velocities (m,) of joint or motor in joint units. A reversal
+        between two instants divides the step where the velocity, linear between them, is zero.
         """
         if self.presliding == 0.0:
             return self.sign(velocity)
@@ -446,10 +441,7 @@ class JointFriction:
     def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m, n + k), of joints and then of `motors`.
 
-        Args:
-            time: of m instants [s].
-            position: of the joints along a motion (m, n) [rad or m].
-            velocity: likewise (m, n).
+        At times (m,) [s], for positions [rad or m] and velocities of the joints (m, n).
         """
         joints = [
             law.direction(time, position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)

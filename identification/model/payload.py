@@ -77,12 +77,7 @@ class Payload:
 
 
 class Load:
-    """Torque of a payload on a chain.
-
-    Args:
-        chain: the robot.
-        gravity: acceleration of gravity in base axes (3,) [m/s²].
-        payload: what it carries.
+    """Torque of a payload on a chain under a gravity (3,) [m/s²], base axes.
 
     Raises:
         ModelError: the payload's frame is not one of the robot's.

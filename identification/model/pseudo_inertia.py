@@ -141,11 +141,9 @@ class ReferenceBodies(NamedTuple):
 
 
 def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:
-    """Return a possible body per link, from nominal parameters as far as they are possible.
+    """Return a possible body per link, from nominal parameters (n, 10) as far as they are possible.
 
-    Args:
-        nominal: inertial parameters (n, 10).
-        translation: origin of each joint in its parent's frame (n, 3) [m], for a size.
+    Origins of the joints in their parents' frames (n, 3) [m] give a size.
     """
     distances = np.linalg.norm(translation[1:], axis=1)
     distances = distances[distances > 0.0]

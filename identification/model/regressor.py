@@ -47,11 +47,7 @@ _TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def wrench_matrix(symbol: int) -> Array:
-    """Return the wrench (moment, then force) of a unit parameter, shape (6, 12).
-
-    Args:
-        symbol: index into :data:`LINK_SYMBOLS`.
-    """
+    """Return the wrench (moment, then force) of a unit parameter of `LINK_SYMBOLS`, (6, 12)."""
     matrix = np.zeros((6, N_PRIMITIVES))
     if symbol < N_INERTIA:
         _add_inertia(matrix[:3], *_TENSOR[symbol])
@@ -63,12 +59,7 @@ def wrench_matrix(symbol: int) -> Array:
 
 
 def write_primitives(motion: Array, out: Array) -> None:
-    """Compute the primitives of all links.
-
-    Args:
-        motion: spatial velocity and acceleration, shape (n, 2, 2, 3, k).
-        out: shape (n, 12, k).
-    """
+    """Compute primitives (n, 12, k) of all links from velocity and acceleration (n, 2, 2, 3, k)."""
     omega, speed = motion[:, 0, 0], motion[:, 0, 1]
     out[:, _ALPHA : _ALPHA + 3] = motion[:, 1, 0]
     np.multiply(omega, omega, out=out[:, _SQUARE : _SQUARE + 3])

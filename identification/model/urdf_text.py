@@ -22,13 +22,10 @@ from identification.errors import ModelError
 # where most libraries for XML put the namespace before every name: a `<link>` that the model has
 # would not be found.
 def urdf_tree(urdf: str, *, comments: bool = False) -> Element:
-    """Return the outermost element of URDF text; names are those written there.
+    """Return the outermost element of URDF text, with comments if wanted; names are those written.
 
-    `xml.etree.ElementTree.tostring` gives a text with the same names again.
-
-    Args:
-        urdf: the text of the file; the encoding it may name counts no longer.
-        comments: keep those inside the outermost element.
+    `xml.etree.ElementTree.tostring` gives a text with the same names again; the encoding that the
+    text may name counts no longer.
 
     Raises:
         ModelError: the text is not well-formed XML.

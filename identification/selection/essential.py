@@ -152,12 +152,7 @@ class EssentialChoice(NamedTuple):
 def choose_essential(
     model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
 ) -> EssentialChoice:
-    """Choose the essential parameters, and say what the choice is worth.
-
-    Args:
-        model: the robot.
-        training: the samples that are fitted.
-        held_out: of each held-out recording.
+    """Choose the essential parameters of fitted samples, and say what the choice is worth.
 
     Raises:
         IdentificationError: nothing was fitted or held out.
@@ -201,13 +196,8 @@ def eliminate(
 ) -> Elimination:
     """Take parameters out one by one and choose how many can go.
 
-    Args:
-        model: the robot whose parameters the factors have.
-        training: the samples to fit, of one repetition or of all.
-        held_out: samples that are not fitted; better another motion than another stretch of it.
-            They choose the cut, so their error there is a little flattered.
-        weights: per joint (n,); by default the inverse residual variances of an ordinary fit.
-        rule: when to stop.
+    The held-out samples, better of another motion, choose the cut, so their error there is a little
+    flattered. Weights (n,) are by default the inverse residual variances of an ordinary fit.
 
     Raises:
         IdentificationError: one of the factors has no rows.

@@ -103,11 +103,7 @@ class TimeBase:
 
 
 def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeBase:
-    """Examine time stamps (m,) [s], legal or not.
-
-    Args:
-        time: as recorded; finite.
-        gap_before: (m,) True at a sample before which samples are known to be missing.
+    """Examine time stamps (m,) [s], finite, legal or not; True before which samples are missing.
 
     Raises:
         RecordingError: fewer than two different times.

@@ -154,12 +154,8 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
     """Rows (m, n) that look clipped: a channel stays at its own extreme to the last bit.
 
     A run of `SHORTEST_TOP` equal values or more, at the largest or smallest value of the channel,
-    from which it departs faster than a smooth peak read with the channel's resolution would.
-
-    Args:
-        values: (m, n), of any unit.
-        moving: rows (m, n) that may be a clipped top; at standstill a channel without noise stays
-            the same for better reasons.
+    from which it departs faster than a smooth peak read with the channel's resolution would; where
+    it moves.
     """
     clipped = np.zeros(values.shape, dtype=np.bool_)
     for j, channel in enumerate(values.T):
@@ -188,14 +184,9 @@ def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:
 
 
 def near_any_reversal(model: RobotModel, motion: Motion, reach: Array) -> Rows:
-    """Rows (m, n) near a reversal of the joint, or of a coupled motor whose friction it feels.
+    """Rows (m, n) within the reach (n,) [s] of a reversal of the joint or a coupled motor on it.
 
     The motor's speed is as slow to follow as that of the slowest joint in it.
-
-    Args:
-        model: says which motors turn with several joints.
-        motion: m samples of n joints.
-        reach: of the joints (n,) [s].
     """
     near = near_reversal(motion.time, motion.velocity, reach)
     shares = model.friction.motor_speeds()
@@ -208,12 +199,9 @@ def near_any_reversal(model: RobotModel, motion: Motion, reach: Array) -> Rows:
 
 
 def torn_rows(recording: Recording, end: float, delay: float = 0.0) -> NDArray[np.bool_]:
-    """Rows (m,) within a time of the ends of their stretch, or of a stretch without inside.
+    """Rows (m,) within a time [s] of the ends of their stretch, or of a stretch without inside.
 
-    Args:
-        recording: checked.
-        end: that time [s].
-        delay: rows are read this much earlier than they stand [s].
+    Rows are read earlier than they stand by a delay [s].
     """
     torn = np.ones(recording.n_samples, dtype=np.bool_)
     for segment in recording.segments():

@@ -113,13 +113,10 @@ class RepetitionNoise(NamedTuple):
 
 
 def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
-    """Variances from repetitions, aligned at the start of their commanded motion.
+    """Variances from two or more repetitions, aligned at the start of their commanded motion.
 
-    Times are compared to the nearest sampling interval. What a shift of less than one leaves of
-    the motion is smooth, and no white noise.
-
-    Args:
-        recordings: two or more of one motion, checked, with equal joints and sampling rate.
+    Times are compared to the nearest sampling interval. What a shift of less than one leaves of the
+    motion is smooth, and no white noise.
 
     Raises:
         IdentificationError: fewer than two, other joints or rates, or no stretch in common.

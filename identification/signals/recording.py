@@ -239,15 +239,10 @@ def without_repeats(recording: Recording) -> Recording:
 
 
 def stuck(position: Array, command: Array) -> tuple[int, float] | None:
-    """Where a joint stays the same to the last bit while it is commanded to move.
+    """Where positions (m,) stay the same to the last bit while commands (m,) move [rad or m].
 
-    Args:
-        position: readings (m,) [rad or m].
-        command: likewise (m,), NaN where there is none.
-
-    Returns:
-        First sample of the stretch during which the command travels farthest, and how far
-        [rad or m]; None where that is nowhere more than `STUCK_MOVEMENT`.
+    First sample of the stretch during which the command travels farthest, and how far; None where
+    that is nowhere more than `STUCK_MOVEMENT`. Commands are NaN where there are none.
     """
     edges = np.flatnonzero(np.diff(position, prepend=np.nan, append=np.nan) != 0.0)
     starts = edges[:-1]

@@ -115,20 +115,13 @@ def calibrate(
     held_out: TorqueMeans,
     refit: Refit,
 ) -> Calibration:
-    """Compare held-out means of torque with their 95 % intervals.
+    """Compare held-out means of torque with their 95 % intervals, from `phase` and `fitted` means.
 
     A parameter that the data do not determine adds nothing to an interval.
 
-    Args:
-        estimate: what predicts.
-        phase: the rows that were fitted.
-        fitted: means of the fitted recordings.
-        held_out: of those that are predicted.
-        refit: the estimator.
-
     Raises:
-        IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks of the fitted motion, or
-            a fold cannot be fitted.
+        IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks of the fitted motion,
+            or a fold cannot be fitted.
     """
     inner = inner_errors(phase, fitted, refit)
     with np.errstate(invalid="ignore"):

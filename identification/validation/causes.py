@@ -124,13 +124,9 @@ class Causes(NamedTuple):
 def find_causes(
     model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str] = ()
 ) -> Causes:
-    """Faults with which, once mended, blocks of the recordings are predicted better.
+    """Faults with which, once mended, blocks of the fitted recordings are predicted better.
 
-    Args:
-        model: the robot.
-        recordings: what is fitted.
-        values: parameters (p,) estimated from them.
-        names: of the recordings.
+    Beside parameters (p,) estimated from them.
     """
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
     search = _Search(model, recordings, values, words)

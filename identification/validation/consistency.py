@@ -110,17 +110,13 @@ def check_consistency(
     *,
     weights: Array | None = None,
 ) -> ConsistencyCheck:
-    """Find the physically consistent estimate and what it costs.
+    """Find the physically consistent estimate and what it costs beside an unconstrained one.
 
-    Args:
-        model: the robot.
-        training: the samples that were fitted.
-        held_out: samples that were not.
-        unconstrained: the estimate to compare with, of the model's parameters.
-        weights: per joint (n,); by default the inverse residual variances of an ordinary fit.
+    Weights (n,) are by default the inverse residual variances of an ordinary fit.
 
     Raises:
-        IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
+        IdentificationError: see
+            :func:`identification.estimators.consistent.consistent_estimate`.
     """
     found = consistent_estimate(model, training, unconstrained, weights=weights)
     ours, free = found.estimate.values, unconstrained.values

@@ -145,15 +145,8 @@ def repetition_noise(
 ) -> Array:
     """Standard deviation of the residual between repetitions at equal times (n,) [N·m or N].
 
-    No model can predict it. NaN for a joint that never moves twice at the same time. Times are
-    compared to the nearest sampling interval since each recording's origin; on a controller's clock
-    that is exact.
-
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        recordings: repetitions of one motion, read once, one at a time.
-        bandwidth: of a low-pass on the residual [Hz]; None for none.
+    Of parameters (p,), through a low-pass [Hz] if there is one; no model can predict it. NaN for a
+    joint that never moves twice at the same time, to the nearest sampling interval.
 
     Raises:
         IdentificationError: fewer than two repetitions, or no row that two of them share.

@@ -91,14 +91,10 @@ def nominal_scale(
     rotors_known: bool = False,
     share: float = NOMINAL_SHARE,
 ) -> NominalScale:
-    """Compare measured with nominal torque, axis by axis.
+    """Compare measured torque with that of nominal parameters (p,), axis by axis, without friction.
 
-    Args:
-        model: the robot.
-        nominal: parameters (p,) of the nominal model; its friction is not looked at.
-        runs: recordings.
-        rotors_known: whether the nominal parameters hold the rotors' inertias.
-        share: standard deviation of the nominal torque, as a share of it.
+    `rotors_known`: the nominal parameters hold the rotors' inertias; `share`: standard deviation of
+    the nominal torque, as a share of it.
 
     Raises:
         IdentificationError: no recording.
@@ -166,16 +162,10 @@ class InertiaRatio(NamedTuple):
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
-    """Compare the controller's diagonal inertia (m, n) at positions (m, n) with the model's.
+    """Compare a diagonal inertia (m, n) at positions (m, n) with that of parameters (p,).
 
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        position: of the joints [rad or m].
-        theirs: joint side [kg·m² or kg]; zero where the controller sends nothing.
-
-    Returns:
-        None where there is nothing to compare.
+    The controller's, `theirs`, is on the joint side [kg·m² or kg], zero where the controller sends nothing; None where
+    there is nothing to compare.
     """
     if not np.any(theirs):
         return None

@@ -48,13 +48,8 @@ def implausibilities(
 ) -> Implausible:
     """Say in words what about an estimate is physically impossible.
 
-    Args:
-        model: the robot.
-        estimate: of the model's parameters.
-        motion: on which the model predicts, to weigh offences by their torque.
-        error_rms: of those predictions (n,).
-        position: postures to look at the inertia matrix in (k, n).
-        speed: highest measured speed per joint (n,): friction is looked at up to there.
+    Offences are weighed by their torque on a `motion`, against the error of its prediction (n,).
+    The inertia matrix is looked at in positions (k, n), friction up to the highest speeds (n,).
     """
     impossible: list[str] = []
     doubtful: list[str] = []

@@ -51,10 +51,8 @@ class PositionJump:
 def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
     """Lasting steps of the measured positions, in the order of time for each joint.
 
-    Args:
-        recording: positions in its stretches without gaps, at the times that
-            :func:`identification.signals.clock.true_times` decided on.
-        name: by which the jumps say where they are.
+    In stretches without gaps, at the times that :func:`identification.signals.clock.true_times`
+    decided on; `name` is that of the recording.
     """
     time, position = recording.time, recording.position
     parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]

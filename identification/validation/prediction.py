@@ -175,12 +175,8 @@ def prediction_error(
 ) -> tuple[PredictionError, ...]:
     """Prediction error of parameters (p,) on each of several runs.
 
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        runs: motions that were not used to estimate the values, if the error is to mean much.
-        all_rows: count rows at standstill and near ends as well, where no model of sliding
-            friction can be right.
+    `all_rows` counts rows at standstill and near ends as well, where no model of sliding friction
+    can be right.
     """
     return tuple(
         PredictionError.between(

@@ -51,10 +51,8 @@ class Simulated(NamedTuple):
 def replay(arms: Simulated, samples: Samples) -> Array:
     """Return simulated less recorded positions (V, m, n) [rad or m]; NaN between stretches.
 
-    Args:
-        arms: what is simulated, from the first recorded state of each stretch on. The feedback is
-            that of the first one's inertia for all.
-        samples: recorded motion and torque, without that of a payload and known elements.
+    From the first recorded state of each stretch on, under the torque without that of a payload and
+    known elements; the feedback is that of the first arm's inertia for all.
 
     Raises:
         numpy.linalg.LinAlgError: a joint moves nothing that has inertia.

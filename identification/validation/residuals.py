@@ -67,10 +67,8 @@ class BlockMean(NamedTuple):
 def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
     """Sum of values over sum of weights of all blocks, and its standard error.
 
-    Args:
-        parts: of each recording by blocks the sums of a quantity, and of what it is divided by (a
-            number of samples, or the power of a regressor): (2, B, ...).
-        repeated: so many recordings, the first ones, are of one motion and share their blocks.
+    Of each recording by blocks the sums of a quantity, and of what it is divided by (2, B, ...).
+    The first `repeated` recordings are of one motion and share their blocks.
     """
     shared = np.zeros((2, max(p.shape[1] for p in parts[:repeated]), *parts[0].shape[2:]))
     for part in parts[:repeated]:
@@ -330,14 +328,9 @@ class Autocorrelation(NamedTuple):
 def autocorrelation(
     residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = LONGEST_LAG
 ) -> Autocorrelation:
-    """Autocorrelation over several recordings, each with one clock step.
+    """Autocorrelation up to the longest lag [s] over several recordings with a clock step [s].
 
-    Pairs of rows count if both do, so that gaps and reversals need not be bridged.
-
-    Args:
-        residuals: of each recording torque residual (m, n) and which rows count (m, n).
-        step: sampling step [s].
-        longest: lag [s].
+    Of each recording the residual (m, n) and which rows count (m, n): pairs count if both do.
     """
     lags = max(2, min(_MOST_LAGS, round(longest / step)))
     products = sum(_products(np.where(usable, left, 0.0), lags) for left, usable in residuals)
@@ -405,13 +398,8 @@ def check_residuals(
 ) -> ResidualChecks:
     """Look at the residuals of parameters (p,) on all recordings.
 
-    Args:
-        model: the robot.
-        values: parameters (p,).
-        training: recordings in the order in which they were made; drift is looked for in these.
-        held_out: recordings of other motions.
-        same_motion: whether the training recordings repeat one motion.
-        motor_from_joint: motor angle per joint angle (n, n); None where unknown.
+    Drift is looked for in the training recordings, in their order; `same_motion`: they repeat one.
+    Ripple needs motor angles per joint angle (n, n).
 
     Raises:
         IdentificationError: no recording was fitted.

@@ -68,14 +68,7 @@ def judge(
     *,
     tested_on: str = "unseen motion",
 ) -> Verdict:
-    """Give the verdict.
-
-    Args:
-        joint_names: names of the n axes.
-        evidence: see :func:`identification.validation.evidence.gather`.
-        thresholds: what a good result keeps to.
-        tested_on: what the held-out motion was, in words.
-    """
+    """Give the verdict on the axes of these names; `tested_on` is the held-out motion in words."""
     names = tuple(joint_names)
     facts = _facts(names, evidence, thresholds) | {"on": tested_on}
     findings: list[Finding] = []

@@ -177,7 +177,7 @@ def checkers(margin, made={}):  # noqa: B006 - the cache is the point
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_no_distance_changes_faster_than_the_bodies_travel(arm, seed):
-    scene = checkers(0.05)._scene
+    scene = checkers(0.05)
     q = np.linspace(*postures(arm, seed, 2), 40)
     path = scene.path(q)
     for pair in range(len(scene.separation.first)):
@@ -190,7 +190,7 @@ def test_no_distance_changes_faster_than_the_bodies_travel(arm, seed):
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_no_slab_is_thicker_than_the_distance_of_what_it_lies_between(arm, seed):
-    scene = mixed_shapes()._scene
+    scene = mixed_shapes()
     path = scene.path(np.random.default_rng(seed).uniform(-2.0, 2.0, (30, 3)))
     count = len(scene.separation.first)
     pair, sample = np.indices((count, 30)).reshape(2, -1)
@@ -316,7 +316,7 @@ def test_what_is_met_only_between_two_samples_is_found(steps):
 @given(st.integers(0, 10**6))
 @settings(max_examples=20)
 def test_no_point_leaves_the_straight_line_by_more_than_its_acceleration_allows(seed):
-    scene = mixed_shapes()._scene
+    scene = mixed_shapes()
     random = np.random.default_rng(seed)
     q0, rate, bend = random.uniform(-1.0, 1.0, (3, 3)) * [[1.0], [3.0], [8.0]]
     step = 0.1
@@ -422,11 +422,11 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
 
 def test_what_is_built_in_is_named_shape_by_shape():
     wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
-    (pair,) = wrist._scene.built_in
+    (pair,) = wrist.built_in
     assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
     assert pair.nearest <= pair.farthest < 0.0
     assert "link_0_0 and link_2_0" in str(wrist.exceptions)
-    assert checkers(0.05)._scene.built_in == ()
+    assert checkers(0.05).built_in == ()
     assert checkers(0.05).exceptions is None
 
 
@@ -468,7 +468,7 @@ def test_obstacles_in_the_wrong_place_leave_no_moving_link_unchecked(arm, worksp
     with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
     assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
     # The first link turns in it: no motion can mend that, so it is told and not checked.
-    assert {pair.first[:6] for pair in checker._scene.built_in} == {"link_1"}
+    assert {pair.first[:6] for pair in checker.built_in} == {"link_1"}
     home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
     contact = checker.deepest_contact(home)
     assert contact is not None and contact.first == "link_2"
@@ -481,7 +481,7 @@ def test_a_first_link_that_swings_towards_the_floor_is_checked():
     for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
         checker = CollisionChecker(urdf, Workspace(floor=floor))
         assert checker.pairs == (("arm", "floor"),)
-        assert checker._scene.built_in == ()
+        assert checker.built_in == ()
 
 
 def test_limits_of_another_arm_are_refused():
@@ -569,9 +569,7 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     boxed = CollisionChecker(cell('<box size="0.2 0.2 0.2"/>'), workspace)
     q = np.linspace(-2.0, 2.0, 9)[:, None]
     for k in range(len(q)):
-        distances = [
-            checker._scene.distance(0, checker._scene.path(q), k) for checker in (meshed, boxed)
-        ]
+        distances = [checker.distance(0, checker.path(q), k) for checker in (meshed, boxed)]
         assert distances[0] == pytest.approx(distances[1], abs=1e-6)
 
 

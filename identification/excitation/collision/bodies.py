@@ -83,11 +83,7 @@ class Workspace:
 
 
 def lost_shapes(urdf: str, links: Iterable[str]) -> str | None:
-    """Return in words the first link of which shapes were left out; None if of none.
-
-    Args:
-        urdf: text of the description.
-        links: the link of each shape that was read.
+    """Return in words the first link of which not all shapes were read; `links` has that of each.
 
     Raises:
         ModelError: the text is no XML.

@@ -7,18 +7,16 @@ leave straight lines by no more than is allowed for; what that leaves open is di
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.hulls import Indices
-from identification.excitation.collision.scene import Path, Scene, exceptions
+from identification.excitation.collision.scene import Path, Scene
 from identification.excitation.joint_limits import rate_bounds
 from identification.model.motion import Motion
-from planner import FourierSeries, JointLimits, PiecewiseCubic
+from planner import FourierSeries, PiecewiseCubic
 
 Array = NDArray[np.float64]
 
@@ -63,7 +61,7 @@ class Contact(NamedTuple):
     distance: float
 
 
-class CollisionChecker:
+class CollisionChecker(Scene):
     """Distances between the collision shapes of a URDF, the floor, walls and boxes.
 
     Links that share a joint are never checked against each other, nor is the base against what
@@ -87,44 +85,6 @@ class CollisionChecker:
         ModelError: the description is no open chain.
     """
 
-    def __init__(
-        self,
-        urdf: str,
-        workspace: Workspace,
-        limits: JointLimits | None = None,
-        mesh_folders: Sequence[str] = (),
-    ) -> None:
-        self.workspace = workspace
-        self._arguments = urdf, workspace, limits, tuple(mesh_folders)
-        self._scene = Scene(urdf, workspace, mesh_folders, limits)
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return CollisionChecker, self._arguments
-
-    @property
-    def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of what is checked against what, without repetitions."""
-        numbers = range(len(self._scene.separation.first))
-        return tuple(dict.fromkeys(map(self._scene.names, numbers)))
-
-    @property
-    def exceptions(self) -> str | None:
-        """What is not checked, or with less than the margin, in a sentence; None for nothing."""
-        return exceptions(self._scene.built_in, self._scene.narrowed)
-
-    def spread(self, first: str, second: str) -> tuple[float, float]:
-        """Return the least and largest distance [m] of a pair (see `pairs`) in random postures.
-
-        Raises:
-            ValueError: they are no pair.
-        """
-        return self._scene.spread(first, second)
-
-    @property
-    def arm_length(self) -> float:
-        """Way along the arm from the base to its last joint [m]; 1 where there is none."""
-        return self._scene.arm_length
-
     def deepest_contact(self, q: Array, time: Array | None = None) -> Contact | None:
         """Return the deepest contact along postures (m, n), at times (m,); None if all are clear.
 
@@ -136,11 +96,11 @@ class CollisionChecker:
             ShapeError: postures of another arm.
             PostureError: a position that is no finite number.
         """
-        path = self._scene.path(q)
+        path = self.path(q)
         if len(q) == 0:
             return None
-        touch = _deepest(self._scene, path, _what_is_near(self._scene, path, np.zeros((2, 1, 1))))
-        return None if touch is None else _contact(self._scene, touch, q, time)
+        touch = _deepest(self, path, _what_is_near(self, path, np.zeros((2, 1, 1))))
+        return None if touch is None else _contact(self, touch, q, time)
 
     def deepest_along(
         self,
@@ -149,26 +109,18 @@ class CollisionChecker:
         *,
         between: bool = True,
     ) -> Contact | None:
-        """Return the deepest contact along a motion; None if all of it is clear.
+        """Return the deepest contact along a motion and its samples with both ends, or None.
 
-        Where all samples are clear, the motion is looked at between them too, without a gap: no
-        point of a body leaves the straight line between two of its places by more than its
-        acceleration allows. What even fine division cannot tell from a contact counts as one, and
-        so does what would take too long to tell: a motion far too violent for an arm.
-        Where samples touch, another contact may be deeper by 5 mm, and by what the arm bulges
-        out between two samples, 2 cm at most in the fastest motions and often far less.
-
-        Args:
-            trajectory: the motion.
-            motion: samples of it, both ends included.
-            between: whether to look between the samples; what is refused for its rates already
-                need not be.
+        Where all samples are clear, the motion is looked at `between` them too, without a gap; what
+        even fine division cannot tell from a contact counts as one, and so does what would take too
+        long to tell. Where samples touch, another contact may be deeper by 5 mm, and by what the
+        arm bulges out between two samples, 2 cm at most.
 
         Raises:
             ShapeError: a motion of another arm.
             PostureError: a position that is no finite number.
         """
-        motion = motion.rows(_looked_at(self._scene, trajectory, motion))
+        motion = motion.rows(_looked_at(self, trajectory, motion))
         deepest: Contact | None = None
         for start in range(0, max(motion.n_samples - 1, 1), _PART):
             part = motion.rows(slice(start, start + _PART + 1))
@@ -180,17 +132,16 @@ class CollisionChecker:
     def _deepest_in(
         self, trajectory: PiecewiseCubic | FourierSeries, motion: Motion, between: bool
     ) -> Contact | None:
-        scene = self._scene
-        path = scene.path(motion.position)
-        bulges = _bulges_of(scene, trajectory, motion) if between else np.zeros((2, 1, 1))
-        near = _what_is_near(scene, path, bulges)
-        touch = _deepest(scene, path, near)
+        path = self.path(motion.position)
+        bulges = _bulges_of(self, trajectory, motion) if between else np.zeros((2, 1, 1))
+        near = _what_is_near(self, path, bulges)
+        touch = _deepest(self, path, near)
         if touch is None:
-            found = _touch_between(scene, trajectory, motion, path, near) if between else None
+            found = _touch_between(self, trajectory, motion, path, near) if between else None
             if found is None:
                 return None
             touch, motion = found
-        return _contact(scene, touch, motion.position, motion.time)
+        return _contact(self, touch, motion.position, motion.time)
 
     def clear(self, q: Array) -> NDArray[np.bool_]:
         """Return which of the unrelated postures (m, n) keep the margin, (m,).
@@ -199,18 +150,16 @@ class CollisionChecker:
             ShapeError: postures of another arm.
             PostureError: a position that is no finite number.
         """
-        scene = self._scene
-        path = scene.path(q)
-        pairs, samples = np.indices((len(scene.separation.first), len(q))).reshape(2, -1)
-        lower, _ = scene.separation.bound(path.bodies, pairs, samples)
+        path = self.path(q)
+        pairs, samples = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
+        lower, _ = self.separation.bound(path.bodies, pairs, samples)
         blocked = np.zeros(len(q), dtype=np.bool_)
-        near = np.flatnonzero(~(lower >= scene.margin))
+        near = np.flatnonzero(~(lower >= self.margin))
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
             pair, sample = int(pairs[k]), int(samples[k])
             if not blocked[sample]:
-                blocked[sample] = not scene.distance(pair, path, sample) >= scene.margin
-        clear: NDArray[np.bool_] = ~blocked
-        return clear
+                blocked[sample] = not self.distance(pair, path, sample) >= self.margin
+        return np.asarray(~blocked)
 
 
 class Touch(NamedTuple):
@@ -364,13 +313,6 @@ class _Stretch(NamedTuple):
     bulge: float  # seen from the base
     own_bulge: float  # seen from the frame that carries both
 
-    def joined(self, other: _Stretch) -> _Stretch | None:
-        """Return both together if the other one follows immediately."""
-        if self.pair != other.pair or self.stop != other.start:
-            return None
-        bulges = max(self.bulge, other.bulge), max(self.own_bulge, other.own_bulge)
-        return _Stretch(self.pair, self.start, other.stop, *bulges)
-
     def gap(self, left: int) -> _Stretch:
         """Return the part between one sample and the next."""
         return self._replace(start=left, stop=left + 1)
@@ -441,11 +383,12 @@ def _open_stretches(scene: Scene, path: Path, near: Near) -> list[_Stretch]:
     for k in open_[~(least - own_bulge[open_] >= margin)].tolist():
         ends = int(pair[k]), int(before[k]), int(after[k])
         stretch = _Stretch(*ends, float(bulge[k]), float(own_bulge[k]))
-        joined = stretches[-1].joined(stretch) if stretches else None
-        if joined is None:
-            stretches.append(stretch)
+        last = stretches[-1] if stretches else None
+        if last is not None and (last.pair, last.stop) == (stretch.pair, stretch.start):
+            bulges = max(last.bulge, stretch.bulge), max(last.own_bulge, stretch.own_bulge)
+            stretches[-1] = _Stretch(last.pair, last.start, stretch.stop, *bulges)
         else:
-            stretches[-1] = joined
+            stretches.append(stretch)
     return stretches
 
 

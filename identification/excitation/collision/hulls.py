@@ -100,13 +100,8 @@ def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
 def travel(bodies: Sequence[Body], at: Bodies, turning: Array) -> Array:
     """Bound how far any point of each body has gone since the first sample, (b, m) [m].
 
-    From sample to sample in a straight line: a point of the hull goes with its centre, with its
-    axis, and about that by the turning at most.
-
-    Args:
-        bodies: b bodies.
-        at: where they are.
-        turning: (1 + n, m - 1) how far base and links turn from sample to sample at most [rad].
+    From sample to sample in a straight line: with the centre of its hull, its axis, and about that
+    by the turning of base and links (1 + n, m - 1) at most [rad].
     """
     half = np.array([body.hull.half_length for body in bodies])
     around = np.array([body.hull.radius + body.hull.ball for body in bodies])
@@ -129,17 +124,13 @@ def turning(chain: Chain, q: Array) -> Array:
 
 
 class Separation:
-    """Lower bounds of the signed distances of pairs of bodies.
+    """Lower bounds of the signed distances of pairs of bodies, an obstacle always second.
 
     Attributes:
         first, second: (p,) the two bodies of each pair. Pairs with a moving second body come
             first, then those with a box, last those with a plane.
         exact: (p,) whether the bounds are the distances themselves.
         sharp: (p,) whether the hulls are the shapes themselves.
-
-    Args:
-        bodies: all of them.
-        pairs: of their indices, an obstacle always second.
     """
 
     def __init__(self, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> None:
@@ -185,13 +176,7 @@ class Separation:
         return bound
 
     def bound(self, at: Bodies, pair: Indices, sample: Indices) -> tuple[Array, Array]:
-        """Return lower bounds (k,) [m] and their directions (3, k), from second to first body.
-
-        Args:
-            at: where the bodies are.
-            pair: (k,), never falling.
-            sample: (k,).
-        """
+        """Return lower bounds (k,) [m] and directions (3, k) of pairs (k,), in rising order."""
         lower, normal = np.empty(len(pair)), np.empty((3, len(pair)))
         boxes, planes = np.searchsorted(pair, (self._boxes, self._planes)).tolist()
         for part, towards in (
@@ -275,8 +260,7 @@ def _shortest_way(between: Array, u: Array, half_u: Array, v: Array, half_v: Arr
 
 def _at(table: Array, body: Indices, sample: Indices) -> Array:
     """Return columns (3, k) of a table (3, b, m)."""
-    columns: Array = table.reshape(3, -1).take(body * table.shape[2] + sample, axis=1)
-    return columns
+    return np.asarray(table.reshape(3, -1).take(body * table.shape[2] + sample, axis=1))
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -287,8 +271,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _norm(vectors: Array) -> Array:
-    length: Array = np.sqrt(_dot(vectors, vectors))
-    return length
+    return np.asarray(np.sqrt(_dot(vectors, vectors)))
 
 
 class Curvature:
@@ -297,12 +280,8 @@ class Curvature:
     A point's derivative by joint k is z_k x r_k, r_k from the joint to the point, or z_k for a
     slide; that derived by a revolute joint j before it, or by k itself, is no longer. So its
     acceleration is bounded by the longest r_k and the rates of the joints, whatever the posture.
-
-    Args:
-        chain: the arm.
-        bodies: all bodies on it and about it.
-        first, second: (p,) indices of the pairs.
-        frame: (p,) the joint that a pair is seen from, one that moves both; -1 for the base.
+    `first` and `second` are indices of the pairs (p,), `frame` the joint that each is seen from,
+    one that moves both; -1 for the base.
     """
 
     def __init__(
@@ -314,7 +293,9 @@ class Curvature:
         frame: Indices,
     ) -> None:
         self._chain = chain
-        radius = np.array([_radius(body) for body in bodies])
+        hulls = [body.hull for body in bodies]
+        reach = [np.hypot(hull.half_length, hull.radius) + hull.ball for hull in hulls]
+        radius = np.array([np.linalg.norm(hull.centre) for hull in hulls]) + reach
         moved = [
             (bodies[a].joint, bodies[b].joint, int(seen_from))
             for a, b, seen_from in zip(first, second, frame, strict=True)
@@ -340,11 +321,8 @@ class Curvature:
     def bulge(self, velocity: Array, acceleration: Array, q: Array, step: float) -> Array:
         """Bound how far two bodies leave straight lines between samples together, (p, g) [m].
 
-        Args:
-            velocity: largest |qd| of the joints in each part of a motion (n, g).
-            acceleration: largest |qdd| there (n, g).
-            q: the samples (m, n).
-            step: time between them [s].
+        From the largest |qd| and |qdd| of the joints in each part of a motion (n, g), its samples
+        (m, n) and the step between them [s].
         """
         arms = self._fixed_arms
         if not np.all(self._chain.revolute):
@@ -370,13 +348,6 @@ class Curvature:
                     arms[row, k] += arm if chain.revolute[k] else 1.0
                     arm += float(np.linalg.norm(chain.translation[k]))
         return arms
-
-
-def _radius(body: Body) -> float:
-    """Bound how far points of a body are from the origin of its joint's frame [m]."""
-    hull = body.hull
-    reach = np.hypot(hull.half_length, hull.radius) + hull.ball
-    return float(np.linalg.norm(hull.centre) + reach)
 
 
 def carrier(chain: Chain, a: int, b: int) -> int:

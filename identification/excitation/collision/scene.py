@@ -63,23 +63,6 @@ class BuiltIn(NamedTuple):
         return f"{self.first} and {self.second} ({self.nearest:.3f} to {self.farthest:.3f} m)"
 
 
-def exceptions(built_in: Sequence[BuiltIn], narrowed: Sequence[BuiltIn]) -> str | None:
-    """Return the sentence that says what is not checked, or with less than the margin."""
-    sentences = []
-    if built_in:
-        pairs = "; ".join(map(str, built_in))
-        sentences.append(
-            f"not checked for collisions, always too close by the way the arm is built: {pairs}"
-        )
-    if narrowed:
-        pairs = "; ".join(map(str, narrowed))
-        sentences.append(
-            f"checked with the largest distance that the mounting leaves instead of the margin:"
-            f" {pairs}"
-        )
-    return "; ".join(sentences) or None
-
-
 class Path(NamedTuple):
     """Where everything is at m samples.
 
@@ -100,6 +83,7 @@ class Scene:
     """The bodies of an arm and of its workspace, in pairs that are to be clear of each other.
 
     Attributes:
+        workspace: obstacles and margin.
         margin: least distance [m] of each pair.
         arm_length: way along the arm from the base to its last joint [m]; 1 where there is none.
         separation: of the p pairs.
@@ -107,12 +91,6 @@ class Scene:
         from_base, from_carrier: how far pairs leave straight lines, seen from there.
         built_in: shapes that are no pair, because they are always too close.
         narrowed: links and planes that keep less than the margin, because they never can.
-
-    Args:
-        urdf: of the arm.
-        workspace: obstacles and margin.
-        mesh_folders: where `package://` paths begin.
-        limits: in use; None for those of the description.
 
     Raises:
         CollisionModelError: the description has no collision shapes, or a mesh is missing.
@@ -123,41 +101,58 @@ class Scene:
         self,
         urdf: str,
         workspace: Workspace,
-        mesh_folders: Sequence[str],
         limits: JointLimits | None = None,
+        mesh_folders: Sequence[str] = (),
     ) -> None:
-        self.margin = workspace.margin
-        self._chain = chain_from_urdf(urdf)
+        self._arguments = urdf, workspace, limits, tuple(mesh_folders)
+        self.workspace, self.margin = workspace, workspace.margin
+        self._chain = chain = chain_from_urdf(urdf)
         model = pin.buildModelFromXML(urdf)
         links = link_bodies(model, urdf, mesh_folders)
         self._bodies = [*links, *obstacles(workspace)]
-        self._request = coal.DistanceRequest()
-        self._result = coal.DistanceResult()
-        if limits is not None and limits.n_joints != self._chain.n_joints:
-            raise ShapeError("limits", (limits.n_joints,), f"({self._chain.n_joints},)")
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        if limits is not None and limits.n_joints != chain.n_joints:
+            raise ShapeError("limits", (limits.n_joints,), f"({chain.n_joints},)")
         self._n_links = len(links)
         pairs = [
             (a, b)
             for a, b in combinations(range(len(self._bodies)), 2)
-            if a < len(links) and self.joints_apart(a, b) > (0 if b >= len(links) else 1)
+            if a < len(links) and self._joints_apart(a, b) > (0 if b >= len(links) else 1)
         ]
         self.separation = Separation(self._bodies, pairs)
         self._tried = self.path(random_postures(model, limits))
         self.built_in, self.narrowed = self._leave_out()
         first, second = self.separation.first, self.separation.second
-        joints = [body.joint for body in self._bodies]
+        joints = np.array([body.joint for body in self._bodies], dtype=np.intp)
         self.carrier: Indices = np.array(
-            [
-                carrier(self._chain, joints[a], joints[b])
-                for a, b in zip(first, second, strict=True)
-            ],
+            [carrier(chain, *pair) for pair in zip(joints[first], joints[second], strict=True)],
             dtype=np.intp,
         )
         self.from_base, self.from_carrier = (
-            Curvature(self._chain, self._bodies, first, second, frame)
+            Curvature(chain, self._bodies, first, second, frame)
             for frame in (np.full_like(self.carrier, -1), self.carrier)
         )
-        self.arm_length = _length(self._chain)
+        self.arm_length = _length(chain)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), self._arguments
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of what is checked against what, without repetitions."""
+        return tuple(dict.fromkeys(map(self.names, range(len(self.separation.first)))))
+
+    @property
+    def exceptions(self) -> str | None:
+        """What is not checked, or with less than the margin, in a sentence; None for nothing."""
+        left_out = "not checked for collisions, always too close by the way the arm is built"
+        less = "checked with the largest distance that the mounting leaves instead of the margin"
+        sentences = [
+            f"{words}: {'; '.join(map(str, those))}"
+            for words, those in ((left_out, self.built_in), (less, self.narrowed))
+            if those
+        ]
+        return "; ".join(sentences) or None
 
     def path(self, q: Array) -> Path:
         """Return where everything is at postures (m, n).
@@ -180,22 +175,16 @@ class Scene:
 
     def distance(self, pair: int, path: Path, sample: int) -> float:
         """Return the signed distance of a pair at a sample [m], -inf if it cannot be determined."""
-        poses = []
-        for index in (self.separation.first[pair], self.separation.second[pair]):
-            body = self._bodies[index]
-            if body.joint < 0:
-                poses.append(body.pose)
-                continue
-            rotation = path.frames.rotation[body.joint + 1, :, :, sample]
-            translation = path.frames.translation[body.joint + 1, :, sample]
-            poses.append(coal.Transform3s(rotation, translation) * body.pose)
+        placed_shapes: list[object] = []
+        for body in (self._bodies[i] for i in self.indices(pair)):
+            pose = body.pose
+            if body.joint >= 0:
+                rotation = path.frames.rotation[body.joint + 1, :, :, sample]
+                translation = path.frames.translation[body.joint + 1, :, sample]
+                pose = coal.Transform3s(rotation, translation) * pose
+            placed_shapes += [body.shape, pose]
         self._result.clear()
-        first, second = (self._bodies[i] for i in self.indices(pair))
-        distance = float(
-            coal.distance(
-                first.shape, poses[0], second.shape, poses[1], self._request, self._result
-            )
-        )
+        distance = float(coal.distance(*placed_shapes, self._request, self._result))
         return -np.inf if np.isnan(distance) else distance
 
     def normal(self, second: int) -> Array:
@@ -214,28 +203,19 @@ class Scene:
         return self._bodies[a].name, self._bodies[b].name
 
     def _leave_out(self) -> tuple[tuple[BuiltIn, ...], tuple[BuiltIn, ...]]:
-        """Leave out the pairs that are built in, as random postures show.
-
-        A plane stands back for a link that can never keep the margin of it.
-
-        Two links are built in that are two joints apart at most, and too close in every posture.
-        So are an obstacle and a shape of the first link, which can but turn in it, if they are too
-        close at the same distance in every posture; one that comes nearer and goes farther is
-        checked along the motion. A link never keeps a plane's margin that is one of the two next
-        to the mounting, such as an upper arm whose shoulder turns close above the floor; in some
-        postures it does not touch.
-
-        Returns:
-            What is left out, and those links.
-        """
+        """Leave out the pairs that are built in; a plane stands back from some others."""
+        # Built in are two links two joints apart at most that are too close in every posture, and
+        # an obstacle and a shape of the first link that are too close at the same distance in every
+        # posture. A plane stands back for one of the two links next to the mounting that can never
+        # keep the margin of it, and does not touch it in some postures.
         near = min(self.margin, NEAR)
         checked: list[tuple[int, int]] = []
         left_out, narrowed = list[BuiltIn](), list[BuiltIn]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
             obstacle, plane = b >= self._n_links, self._bodies[b].normal is not None
-            joints = self.joints_apart(a, b)
-            least, most = (-np.inf, np.inf)
+            joints = self._joints_apart(a, b)
+            least, most = -np.inf, np.inf
             if joints <= 2 and self._may_be_near(pair, near):
                 distances = self._distances(pair)
                 least, most = float(distances.min()), float(distances.max())
@@ -253,7 +233,7 @@ class Scene:
         return tuple(left_out), tuple(narrowed)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
-        """Return the least and largest distance of two bodies in random postures [m].
+        """Return the least and largest distance [m] of a pair (see `pairs`) in random postures.
 
         Raises:
             ValueError: they are no pair.
@@ -263,7 +243,7 @@ class Scene:
         distances = np.min([self._distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
 
-    def joints_apart(self, a: int, b: int) -> int:
+    def _joints_apart(self, a: int, b: int) -> int:
         """Count the joints between two bodies."""
         trunks = [
             set(self._chain.ancestors(joint)) if joint >= 0 else set()
@@ -283,11 +263,9 @@ class Scene:
 
 
 def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
-    """Return postures within limits, half a turn to either side where there are none (k, n).
+    """Return postures (k, n) within limits or, without them, those of the description.
 
-    Args:
-        model: the arm.
-        limits: in use; None for those of the description, where none given means 0 to 0.
+    Half a turn to either side where there are none.
     """
     lower, upper = _described(model) if limits is None else (limits.lower, limits.upper)
     range_ = upper - lower

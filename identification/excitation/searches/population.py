@@ -159,12 +159,7 @@ class Population:
             child.close()
 
     def score(self, genes: Array, scored: Callable[[int], None] | None = None) -> Scores:
-        """Return the scores of rows of genes (m, n_genes).
-
-        Args:
-            genes: what to score.
-            scored: called with a number of motions whenever so many more are scored.
-        """
+        """Return the scores of genes (m, n_genes); `scored` is called with how many more are."""
         results = map_in_children(
             self._children,
             _score,

@@ -171,15 +171,10 @@ def polish(
 
 
 def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
-    """Return a fitness that no motion can have above 0 unless it is as good as `reference`.
+    """Return a fitness that no motion can have above 0 unless it is as good as a reference (m = 1).
 
-    The smallest of its gains counts (an achievement function, Wierzbicki 1980); where none is a
-    loss the largest one counts a little too. Polished on this, a motion gets better in all
-    measures or stays.
-
-    Args:
-        reference: scores of one motion, m = 1, that excites every parameter.
-        scale: units of the gains; without it those of the measures themselves.
+    The smallest of its gains, in units of the scale if there is one, counts (Wierzbicki 1980);
+    where none is a loss the largest one counts a little too.
     """
     spread = 1.0 if scale is None else np.array(scale.spread)
 
@@ -242,14 +237,9 @@ def _strategy(start: Array, size: int, seed: int) -> Any:
 class Evolution:
     """A GA with one objective, NSGA-II with more; both rank feasible motions before all others.
 
-    Infeasible ones are ranked by the sum of their excesses, so constraints need no weights.
-    Crossover is simulated binary, mutation polynomial, selection a binary tournament. Random
-    numbers come from the seed alone.
-
-    Args:
-        settings: rates and sizes.
-        first: genes (m, n_genes) of the first generation.
-        n_objectives: 1 or more.
+    From a first generation of genes (m, n_genes). Infeasible ones are ranked by the sum of their
+    excesses, so constraints need no weights. Crossover is simulated binary, mutation polynomial,
+    selection a binary tournament. Random numbers come from the seed alone.
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:

@@ -133,13 +133,9 @@ class Scale(NamedTuple):
         return gains
 
     def fitness(self, measures: ArrayLike, weights: tuple[float, ...]) -> Array:
-        """Return the balanced fitness (...), the larger the better, of measures (..., d).
+        """Return the balanced fitness (...) of measures (..., d), with weights (d,).
 
-        -inf for a motion that leaves a parameter without excitation.
-
-        Args:
-            measures: of the motions, (..., d).
-            weights: of each measure (d,).
+        The larger the better; -inf for a motion that leaves a parameter without excitation.
         """
         given = np.asarray(measures, dtype=np.float64)
         judged = _finite(given)
