@@ -132,7 +132,7 @@ class Factor:
     def from_blocks(
         cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
     ) -> Self:
-        """Reduce chunks as :func:`augmented_rows` gives them, with `samples` rows that count (n,)."""
+        """Reduce chunks of :func:`augmented_rows`, with `samples` rows that count (n,)."""
         columns = model.plan.columns
         sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
         for blocks in chunks:

@@ -81,7 +81,7 @@ class EndogeneityTest:
 def endogeneity_test(
     model: RobotModel, factor: PhaseFactor, result: InstrumentalEstimate
 ) -> EndogeneityTest:
-    """Test whether noise in the regressor has biased least squares, from what a result was made of."""
+    """Test whether noise in the regressor has biased least squares, by the factor of a result."""
     used = np.asarray(factor.samples.any(axis=1))
     blocks, values = factor.weighted(result.weights)[used], result.estimate.values
     p, total = len(values), blocks.sum(axis=0)

@@ -164,8 +164,8 @@ def inertia_ratio(
 ) -> InertiaRatio | None:
     """Compare a diagonal inertia (m, n) at positions (m, n) with that of parameters (p,).
 
-    The controller's, `theirs`, is on the joint side [kg·m² or kg], zero where the controller sends nothing; None where
-    there is nothing to compare.
+    The controller's, `theirs`, is on the joint side [kg·m² or kg], zero where it sends nothing;
+    None where there is nothing to compare.
     """
     if not np.any(theirs):
         return None

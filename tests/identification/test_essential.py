@@ -96,13 +96,6 @@ def test_a_step_is_the_least_squares_fit_of_the_columns_left() -> None:
     assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
 
 
-def test_the_held_out_errors_are_those_of_the_prediction() -> None:
-    runs = [samples_of(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
-    result = eliminate(MODEL, *(PhaseFactor.from_samples(MODEL, run) for run in runs))
-    (expected,) = prediction_error(MODEL, result.values, runs[1:])
-    assert result.chosen.held_out == pytest.approx(expected.overall, rel=1e-7)
-
-
 def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter() -> None:
     training, unseen = factors(MODEL, TRUTH)
     result = eliminate(MODEL, training, unseen)
@@ -237,24 +230,6 @@ def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data: Path) -> None:
     assert error(blind.values)[5] > 2.0 * error(result.values)[5]
 
 
-def test_the_essential_parameters_of_the_ur10_predict_a_stretch_that_did_not_choose_them(
-    shared_data: Path,
-) -> None:
-    model, recording = ur10(shared_data)
-    edges = [round(share * recording.n_samples) for share in (0.0, 0.6, 0.8, 1.0)]
-    parts = [recording.between(a, b) for a, b in pairwise(edges)]
-    options = possible_low_passes(parts[0], model)[0]
-    runs = [prepare(part, model, options=options) for part in parts]
-    training, chooser = (PhaseFactor.from_samples(model, run) for run in runs[:2])
-    result = eliminate(model, training, chooser)
-    full = estimate(model, training.total).values
-    with_all, essential = (
-        prediction_error(model, values, runs[2:])[0].overall for values in (full, result.values)
-    )
-    assert result.chosen.left < 40
-    assert essential < with_all
-
-
 def runs_of(model: RobotModel, truth: Array, seed: int, count: int) -> list[Samples]:
     seeds = range(seed, seed + count)
     return [samples_of(model, truth, a_motion(k), NOISE, k) for k in seeds]
@@ -262,14 +237,6 @@ def runs_of(model: RobotModel, truth: Array, seed: int, count: int) -> list[Samp
 
 def factors_of(model: RobotModel, runs: list[Samples]) -> list[PhaseFactor]:
     return [PhaseFactor.from_samples(model, run) for run in runs]
-
-
-def test_the_relative_error_is_that_of_the_prediction() -> None:
-    runs = runs_of(MODEL, TRUTH, 3, 2)
-    values = 1.1 * TRUTH
-    both = sum(factors_of(MODEL, runs), PhaseFactor.zero(MODEL)).total
-    expected = over_all(prediction_error(MODEL, values, runs)).overall
-    assert both.relative_error(values) == pytest.approx(expected, rel=1e-9)
 
 
 @settings(max_examples=8)

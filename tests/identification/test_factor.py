@@ -203,10 +203,6 @@ class TestFactor:
             np.testing.assert_array_equal(MODEL.plan.columns[joint], columns[joint])
         assert (chunks[0][0].start, chunks[-1][0].stop) == (0, 3000)
 
-    def test_triangles_are_triangular(self) -> None:
-        factor = QRFactor.of(MODEL, noisy(a_motion(), NOISE))
-        np.testing.assert_array_equal(factor.matrices, np.triu(factor.matrices))
-
     @pytest.mark.parametrize("weights", [None, np.array([0.3, 20.0])])
     def test_both_kinds_agree_to_nine_digits(self, weights: Array | None) -> None:
         samples = noisy(a_motion(), NOISE)
@@ -354,18 +350,6 @@ class TestEstimate:
         if np.all(weights == 1.0):
             ordinary = fit_least_squares(MODEL, [samples], "ordinary")
             np.testing.assert_allclose(ordinary.values, expected, rtol=1e-8)
-
-    def test_weighting_pays_when_joints_differ_in_noise(self) -> None:
-        factors = [self.trial(seed) for seed in range(30)]
-        even = np.array([f.solve(np.ones(2)).values for f in factors]) - truth()
-        weighted = np.array([estimate(MODEL, f).values for f in factors]) - truth()
-        elbow = [MODEL.parameter_names.index(name) for name in ("f0_2", "f1_2")]
-        assert np.mean(weighted[:, elbow] ** 2) < np.mean(even[:, elbow] ** 2)
-
-    def test_of_white_noise_the_covariance_is_that_of_many_trials(self) -> None:
-        trials = [estimate(MODEL, self.trial(seed)) for seed in range(150)]
-        scatter = np.std([trial.values for trial in trials], axis=0)
-        np.testing.assert_allclose(trials[0].std, scatter, rtol=0.25)
 
     def test_parameters_take_degrees_of_freedom(self) -> None:
         """So few rows that the parameters take half of them."""

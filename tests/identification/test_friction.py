@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification import Factor, FrictionLaw, ModelError, Motion, RobotModel, ShapeError
-from identification.factor.factor import estimate
+from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.model.coupling import Coupling
 from identification.model.friction import (
     TERMS,
@@ -256,14 +255,6 @@ class TestDirectionOfFriction:
         )
 
 
-class TestOtherFriction:
-    def test_a_model_with_other_friction_names_its_parameters(self) -> None:
-        changed = MODEL.with_friction(third="cubic", offset=True)
-        assert changed.friction.laws[0] == FrictionLaw(third="cubic", offset=True)
-        assert changed.parameter_names == MODEL.base.names + changed.friction.names
-        assert len(changed.units) == changed.n_parameters
-
-
 GEARS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0])
 
 
@@ -326,20 +317,6 @@ def test_rotors_and_motor_friction_act_as_the_drive_train_says(model: RobotModel
         speed = qd @ c
         expected += np.outer(coulomb * np.sign(speed) + viscous * speed, c)
     np.testing.assert_allclose(model.torque(values, q, qd, qdd), expected, atol=1e-9)
-
-
-def test_planted_couplings_come_back(model: RobotModel) -> None:
-    random = np.random.default_rng(3)
-    time = np.arange(3000, dtype=np.float64) * 4e-3
-    phase = random.uniform(0, 6, (4, 1, 6)) + time[:, None] * random.uniform(1, 7, (4, 1, 6))
-    pace = np.gradient(phase, time, axis=1)
-    q, qd = np.sin(phase).sum(axis=0), (pace * np.cos(phase)).sum(axis=0)
-    motion = Motion(time, q, qd, -(pace**2 * np.sin(phase)).sum(axis=0))
-    truth = random.uniform(0.5, 2.0, model.n_parameters)
-    torque = model.torque(truth, *motion[1:])
-    found = estimate(model, Factor.from_samples(model, motion, torque))
-    np.testing.assert_allclose(found.values, truth, rtol=1e-6)
-    assert found.undetermined == ()
 
 
 def test_rows_count_while_every_motor_on_them_turns(model: RobotModel) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
@@ -146,21 +145,6 @@ def many() -> list[Gains]:
 
 
 class TestGains:
-    def test_torque_of_a_payload_is_pinocchios_difference(self) -> None:
-        model = RobotModel.from_urdf(urdf_text())
-        load = Payload(7.0, (0.05, -0.02, 0.11), (0.03, 0.002, -0.001, 0.04, 0.003, 0.05))
-        motion = lively(6, count=20)
-        bare, loaded = pin.buildModelFromXML(urdf_text()), pin.buildModelFromXML(urdf_text())
-        xx, xy, xz, yy, yz, zz = load.inertia
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        loaded.inertias[6] += pin.Inertia(load.mass, np.array(load.centre), tensor)
-        difference = [
-            pin.rnea(loaded, loaded.createData(), *one) - pin.rnea(bare, bare.createData(), *one)
-            for one in zip(*motion[1:4], strict=True)
-        ]
-        found = load_torque(model, load, motion)
-        np.testing.assert_allclose(found, difference, rtol=1e-9, atol=1e-9)
-
     def test_without_noise_the_planted_gains_come_back(self) -> None:
         assert gains_of(factor_of(np.zeros(2))).values == pytest.approx(PLANTED, rel=1e-6)
 

@@ -13,11 +13,9 @@ from identification.excitation import (
     Box,
     CollisionChecker,
     DesignError,
-    Excitation,
     Workspace,
     check_motion,
 )
-from identification.excitation.criteria import Criteria
 from identification.excitation.genomes import SineGenome, ViaPointGenome
 from planner import (
     FourierSeries,
@@ -26,14 +24,11 @@ from planner import (
     WorkerProcess,
     check_limits,
     plan,
-    plan_moves,
 )
 from sim_fixtures.ns16 import urdf_text
 
 DEG = np.pi / 180.0
 HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
-CRITERIA = Criteria(100.0, 90.0, 75.5, 1000)
-RECORD = {"method": "b", "seed": 1, "tried": 2, "rejected": {"duration": 1}}
 
 
 def ns16_limits() -> JointLimits:
@@ -155,17 +150,6 @@ def test_motions_are_the_planners_and_keep_its_limits(genome):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_a_path_leads_home_or_from_first_to_last():
-    for genome, ends in ((CLOSED, (HOME, HOME)), (OPEN, None)):
-        genes = some_genes(genome, 1)
-        points, _ = genome.decode(genes)
-        first, last = ends or points[0, [0, -1]]
-        (motion,) = genome.motions(genes)
-        q, qd, _ = motion.sample(np.array([0.0, motion.duration]))
-        np.testing.assert_allclose(q, [first, last], atol=1e-12)
-        np.testing.assert_allclose(qd, 0.0, atol=1e-9)
-
-
 def test_an_error_of_planning_has_its_motions_place(monkeypatch):
     # No legal genes are known to fail; so the second's via points leave the range on the way.
     genes = some_genes(OPEN, 3)
@@ -174,19 +158,6 @@ def test_an_error_of_planning_has_its_motions_place(monkeypatch):
     monkeypatch.setattr(ViaPointGenome, "decode", lambda self, genes: (points, speed))
     kinds = [type(motion).__name__ for motion in OPEN.motions(genes)]
     assert kinds == ["PiecewiseCubic", "InvalidViaPoints", "PiecewiseCubic"]
-
-
-@pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_recorded_via_points_plan_to_the_motion(genome):
-    genes = some_genes(genome, 1)
-    (motion,) = genome.motions(genes)
-    record = Excitation(criteria=CRITERIA, **RECORD, trajectory=motion, **genome.recorded(genes[0]))
-    again = plan_moves(record.via_points[0], record.moves, LIMITS)
-    assert again.trajectory.to_dict() == record.trajectory.to_dict()
-    times = np.arange(0.0, motion.duration, 0.001)
-    for ours, theirs in zip(record.trajectory.sample(times), motion.sample(times), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert record.fly == genome.fly
 
 
 # Via points among obstacles
@@ -260,20 +231,6 @@ def test_genes_at_their_ends_reach_the_papers_bounds():
     assert not np.any(RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))[0].amplitude)
 
 
-@pytest.mark.parametrize("genome", [BARE, RAMPED])
-@given(data=st.data())
-@settings(max_examples=50, deadline=None)
-def test_no_genes_lead_sines_beyond_the_papers_bounds(genome, data):
-    (motion,) = genome.motions(data.draw(genes_of(genome)))
-    reach = np.abs(motion.amplitude).sum(axis=1)
-    rounding = 1e-12 * np.abs(LIMITS.upper)
-    assert np.all(motion.offset + reach <= LIMITS.upper + rounding)
-    assert np.all(motion.offset - reach >= LIMITS.lower - rounding)
-    slowest, fastest = genome.frequency_range
-    assert np.all(motion.frequency >= slowest[:, None])
-    assert np.all(motion.frequency <= fastest[:, None])
-
-
 @given(genes=genes_of(BARE))
 @settings(max_examples=25, deadline=None)
 def test_bare_sines_keep_the_limits_of_position_and_acceleration(genes):
@@ -281,25 +238,6 @@ def test_bare_sines_keep_the_limits_of_position_and_acceleration(genes):
     q, _, qdd = motion.sample(np.linspace(0.0, 20.0, 4001))
     assert np.all((q >= LIMITS.lower - 1e-12) & (q <= LIMITS.upper + 1e-12))
     assert np.all(np.abs(qdd) <= LIMITS.acceleration * (1.0 + 1e-12))
-
-
-def test_a_bare_motion_is_equation_8_about_the_middle_of_the_range():
-    genes = some_genes(BARE, 1)
-    amplitude, frequency = (each[0] for each in BARE.decode(genes))
-    (motion,) = BARE.motions(genes)
-    t = np.linspace(0.0, 20.0, 101)
-    middle = (LIMITS.lower + LIMITS.upper) / 2.0
-    expected = middle + np.sum(amplitude * np.sin(frequency * t[:, None, None]), axis=2)
-    np.testing.assert_allclose(motion.sample(t)[0], expected, atol=1e-13)
-    assert np.all(np.abs(motion.sample(t[:1])[1]) > 0.0)
-
-
-def test_with_a_ramp_it_starts_and_ends_at_rest_in_its_offset():
-    (motion,) = RAMPED.motions(some_genes(RAMPED, 1))
-    q, qd, qdd = motion.sample(np.array([0.0, 15.0]))
-    np.testing.assert_array_equal(q, [HOME, HOME])
-    assert not np.any(qd) and not np.any(qdd)
-    assert np.ptp(motion.sample(np.linspace(0.0, 15.0, 500))[0], axis=0).min() > 0.05
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import fit_smoothing_spline
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
-from sim_fixtures.ns16 import urdf_text
 from tests.identification import two_link
 from tests.identification.two_link import URDF, as_samples, sine_motion, truth
 
@@ -139,14 +138,6 @@ def test_where_position_noise_is_large_it_beats_least_squares() -> None:
     assert np.median(errors[0] / errors[1]) < 0.3
 
 
-def test_where_position_noise_is_small_both_agree() -> None:
-    for seed in range(5):
-        _, result = fit(executed(seed, position_noise=SMALL))
-        apart = np.abs(result.estimate.values - result.least_squares.values)
-        assert np.all(apart < result.estimate.std)
-        np.testing.assert_allclose(result.estimate.std, result.least_squares.std, rtol=0.35)
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
 def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
     covered = []
@@ -155,17 +146,6 @@ def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None
         one = fit(samples)[1].estimate
         covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
     assert 0.90 <= np.mean(covered) <= 0.99
-
-
-def test_repetitions_and_pieces_add_up() -> None:
-    runs = [executed(seed, position_noise=LARGE) for seed in (1, 2)]
-    one, two = (instrument_factor(MODEL, run, PLAN) for run in runs)
-    both = estimate_instrumental(MODEL, one + two, np.ones(2)).estimate
-    parts = [dense(run) for run in runs]
-    z, w, y = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
-    np.testing.assert_allclose(both.values, expected, rtol=1e-7, atol=1e-9)
-    np.testing.assert_array_equal(both.samples, one.samples.sum(0) + two.samples.sum(0))
 
 
 def test_the_part_without_instruments_is_what_least_squares_reads() -> None:
@@ -264,19 +244,6 @@ def test_it_says_whether_there_is_a_bias_that_matters(
     assert words in test.words
 
 
-def test_a_bias_of_many_standard_deviations_matters_only_if_it_moves_torques() -> None:
-    factor, result = fit(executed(0, position_noise=2e-5), PLAN)
-    # As from so many samples that parameters are known far better than torques need them.
-    least = replace(result.least_squares, covariance=1e-4 * result.least_squares.covariance)
-    test = endogeneity_test(MODEL, factor, replace(result, least_squares=least))
-    assert test.biased
-    assert np.any(np.abs(test.shift) > 3.0 * least.std)
-    assert test.predicted.max() < 0.005
-    assert not test.matters
-    assert "too small to matter" in test.words
-    assert "Use the instrumental variables" not in test.words
-
-
 def test_instruments_that_are_the_measured_motion_leave_nothing_to_test() -> None:
     samples = executed(0, position_noise=SMALL)
     factor, result = fit(samples, samples.motion)
@@ -319,47 +286,6 @@ def test_the_statistic_is_that_of_the_auxiliary_regression_refitted_without_each
     squared = gamma @ np.linalg.solve(covariance, gamma)
     expected = squared * (blocks - 2) / (2 * (blocks - 1))
     assert test.statistic == pytest.approx(expected, rel=1e-5)
-
-
-def test_on_the_ns16_noisy_encoders_bias_least_squares_and_not_the_instruments() -> None:
-    arm = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None, standstill=0.1))
-    standard = arm.nominal.reshape(6, -1).copy()
-    standard[:, -1] = [7.6465, 24.5955, 10.48, 0.253, 0.298, 0.12]
-    coulomb = [68.035, 108.777, 50.446, 9.248, 8.904, 5.148]
-    viscous = [41.196, 63.255, 39.248, 3.2659, 16.4439, 8.8808]
-    true = np.concatenate([arm.base.grouping @ standard.ravel(), coulomb, viscous])
-    rng = np.random.default_rng(4)
-    rate = rng.uniform(0.8, 6.0, (4, 6))
-    size = rng.uniform(0.1, 0.3, (4, 6)) * [1.0, 0.5, 1.0, 2.0, 1.0, 2.0]
-    angle = rate * TIME[:, None, None] + rng.uniform(0.0, 6.0, (4, 6))
-    centre = np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0])
-    motion = Motion(
-        TIME,
-        centre + (size * np.sin(angle)).sum(axis=1),
-        (size * rate * np.cos(angle)).sum(axis=1),
-        (-size * rate**2 * np.sin(angle)).sum(axis=1),
-    )
-    torque = arm.torque(true, *motion[1:])
-    torque += 0.03 * torque.std(axis=0) * rng.standard_normal(torque.shape)
-    measured = motion.position + 2e-4 * rng.standard_normal(torque.shape)
-    samples = samples_of(smoothed(measured), torque, arm)
-    plan = planned_motion(samples, motion.position)
-    assert np.all(np.abs(plan.lag) < 1e-4)
-    factor = instrument_factor(arm, samples, plan.motion, plan.usable)
-    result = estimate_instrumental(arm, factor)
-    still_to_predict = arm.torque(true, *motion[1:])
-    errors = [
-        np.linalg.norm(arm.torque(one.values, *motion[1:]) - still_to_predict, axis=0)
-        for one in (result.estimate, result.least_squares)
-    ]
-    assert np.all(errors[0] < 0.6 * errors[1])
-    inside = np.abs(result.estimate.values - true) < (
-        result.estimate.interval_factor * result.estimate.std
-    )
-    assert np.mean(inside) >= 0.85  # one run: intervals of one arm's parameters hang together
-    test = endogeneity_test(arm, factor, result)
-    assert test.biased
-    assert np.all(test.coefficient < 0.0)
 
 
 # Where instruments come from

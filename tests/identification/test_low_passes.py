@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from identification.estimators.torque_channel import possible_low_passes
@@ -17,8 +16,6 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
 from tests.identification.two_link import MODEL, NOISE, a_motion, truth
-
-Array = NDArray[np.float64]
 
 CUT = 2800  # of 4000 rows: what is fitted
 RATE = 200.0  # Hz

@@ -148,14 +148,6 @@ def test_it_is_never_worse_than_its_start(seed, genes):
         assert rugged(after)[0] >= rugged(before)[0]
 
 
-def test_motions_that_cannot_be_judged_rank_last():
-    def patchy(scores):
-        return np.where(np.sin(40.0 * size_of(scores)) > 0.5, -np.inf, size_of(scores))
-
-    _, scores = polished(Bowl(), START, patchy, evaluations=1000)
-    assert patchy(scores)[0] > 100.0 - bowl(START[None])[0]
-
-
 def test_a_seed_is_one_motion_whatever_else_draws(tmp_path, monkeypatch, capfd):
     class Disturbing(Bowl):
         def score(self, genes):

@@ -21,7 +21,7 @@ from identification.excitation import (
 from identification.excitation.searches.run import Evolution
 from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import KINDS, excess_by_kind
-from planner import PiecewiseCubic, check_limits
+from planner import check_limits
 from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, moody, problem
 
@@ -46,28 +46,6 @@ def importable(monkeypatch):
 def population():
     with Population(problem()) as population:
         yield population
-
-
-def test_scores_are_those_of_the_regressor_of_the_planned_motion(population):
-    model = population.problem.objective.model
-    rows = genes(5)
-    scores = population.score(rows)
-    for k, trajectory in enumerate(population.problem.genome.motions(rows)):
-        assert isinstance(trajectory, PiecewiseCubic)
-        motion = midpoints(trajectory, 0.008)
-        phi = model.regressor(motion.position, motion.velocity, motion.acceleration)
-        stacked = phi.dense(model.n_parameters).reshape(-1, model.n_parameters)
-        sign, log_det = np.linalg.slogdet(stacked.T @ stacked / motion.n_samples)
-        assert sign == 1.0
-        expected = log_det / np.log(10.0)
-        np.testing.assert_allclose(scores.measure("log10_det")[k], expected, rtol=1e-9)
-        psi = np.linalg.inv(stacked.T @ stacked)
-        length = np.sqrt(np.diag(psi))
-        coupling = np.abs(np.tril(psi / length[:, None] / length, -1)).sum()
-        np.testing.assert_allclose(scores.measure("coupling_index")[k], coupling, rtol=1e-9)
-        assert scores.duration[k] == trajectory.duration
-    assert np.all(scores.feasible)
-    assert np.all(scores.usable)
 
 
 def test_processes_company_and_order_change_no_bit(population):
@@ -171,19 +149,6 @@ def test_excess_is_that_of_the_violations_by_kind(population):
     assert set(np.flatnonzero(scores.excess.any(axis=0))) >= {1, 2, 5}
     # constraints decide what is feasible, not what is measured
     np.testing.assert_array_equal(scores.measures, population.score(rows).measures)
-
-
-def test_a_motion_is_judged_at_a_period_of_choice(population):
-    trajectory, criteria = population.judged(genes(1)[0], 0.001)
-    assert criteria == population.problem.objective.criteria(trajectory, 0.001)
-
-
-def test_a_motion_without_excitation_is_feasible_and_useless(population):
-    rows = genes(1)
-    rows[:, 1:6:2] = 0.5  # the elbow rests
-    scores = population.score(rows)
-    assert scores.feasible.tolist() == [True]
-    assert scores.usable.tolist() == [False]
 
 
 def test_a_population_needs_a_process():

@@ -9,15 +9,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
-from identification.signals.masks import REVERSAL
 from identification.signals.noise import difference_variance, standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import (
     Preprocessing,
     prepare,
-    smooth,
 )
 from tests.identification.two_link import MODEL, truth
 
@@ -26,7 +23,6 @@ Array = NDArray[np.float64]
 TRUTH = truth()
 
 RESOLUTION = 2e-6  # rad, of the encoders
-TRUE_FRICTION = np.array([4.0, 2.0, 1.5, 0.8])
 
 
 def motion(time: Array) -> tuple[Array, Array, Array]:
@@ -69,32 +65,6 @@ def test_the_torque_is_left_as_measured() -> None:
     assert prepare(recording, MODEL).torque is recording.torque
 
 
-def test_rows_at_standstill_and_near_the_ends_do_not_count() -> None:
-    recording = a_recording(MODEL, TRUTH)
-    samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
-    standing = np.abs(samples.motion.velocity) <= MODEL.friction.standstill
-    assert standing.any()
-    assert not samples.usable[standing].any()
-    assert not samples.usable[:10].any()
-    assert not samples.usable[-10:].any()
-    assert samples.mask is not None
-    turning = int(samples.mask.counts[REVERSAL].sum())
-    assert samples.usable.sum() + turning > 0.9 * samples.usable.size
-
-
-def test_rows_just_before_and_after_a_reversal_do_not_count_for_the_joint_that_turns() -> None:
-    recording = a_recording(MODEL, TRUTH)
-    samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
-    exact = motion(recording.time)[1]
-    turns = np.flatnonzero(exact[1:, 0] * exact[:-1, 0] < 0.0)
-    reach = 0.5 / samples.position_bandwidth[0]
-    for row in turns[1:-1]:
-        apart = np.abs(recording.time - recording.time[row])
-        assert not samples.usable[apart < 0.9 * reach, 0].any()
-        assert samples.usable[(apart > 2.0 * reach + 0.01) & (apart < 0.2), 0].all()
-        assert samples.usable[row, 1]
-
-
 def test_no_derivative_is_taken_across_a_gap() -> None:
     whole = a_recording(MODEL, TRUTH)
     keep = np.r_[0:2000, 2300:6000]
@@ -118,15 +88,6 @@ def test_no_derivative_is_taken_across_a_gap() -> None:
     assert np.abs(unflagged.motion.velocity - exact[1])[1995:2005].max() > 1.0
 
 
-def test_a_segment_too_short_to_smooth_is_left_out() -> None:
-    recording = a_recording(MODEL, TRUTH)
-    gap = np.zeros(6000, dtype=bool)
-    gap[[3000, 3015]] = True
-    samples = prepare(replace(recording, gap_before=gap), MODEL, noise_variance=QUANTISATION)
-    assert not samples.usable[3000:3015].any()
-    assert np.isfinite(samples.motion.acceleration).all()
-
-
 @pytest.mark.parametrize("delay", [0.004, -0.0025])
 def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
     recording = a_recording(MODEL, TRUTH, delay=delay)
@@ -144,14 +105,6 @@ def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
 
     assert worst(delay) < 0.1
     assert worst(0.0) > 5 * worst(delay)
-
-
-def test_smooth_gives_the_motion_in_the_rows_of_the_recording() -> None:
-    recording = a_recording(MODEL, TRUTH)
-    smoothed, _ = smooth(recording, QUANTISATION)
-    assert smoothed.position.shape == recording.position.shape
-    np.testing.assert_array_equal(smoothed.time, recording.time)
-    assert np.abs(smoothed.position - recording.position).max() < 3 * RESOLUTION
 
 
 @settings(max_examples=30)
@@ -229,19 +182,6 @@ def test_the_papers_way_smooths_torque_and_regressor_alike() -> None:
     assert np.sqrt(np.mean(error**2)) < 0.2
 
 
-def test_factors_of_filtered_samples_hold_the_filtered_rows() -> None:
-    samples = prepare(
-        a_recording(MODEL, TRUTH), MODEL, options=Preprocessing(torque_bandwidth=20.0)
-    )
-    dense = samples.regressor(MODEL).dense(MODEL.n_parameters)
-    factor = Factor.of(MODEL, samples)
-    for joint in range(2):
-        rows = samples.usable[:, joint]
-        table = np.column_stack([dense[rows, joint], samples.torque[rows, joint]])
-        np.testing.assert_allclose(factor.gram[joint], table.T @ table, rtol=1e-10, atol=1e-8)
-        assert factor.samples[joint] == rows.sum()
-
-
 def test_a_recording_without_torque_is_refused() -> None:
     with pytest.raises(RecordingError, match="no joint torque"):
         prepare(replace(a_recording(MODEL, TRUTH), torque=None), MODEL)
@@ -251,15 +191,6 @@ def test_a_recording_that_fails_its_checks_is_refused() -> None:
     wrong = replace(a_recording(MODEL, TRUTH), joint_names=("elbow", "shoulder"))
     with pytest.raises(RecordingError, match="order"):
         prepare(wrong, MODEL)
-
-
-def test_torque_and_regressor_can_be_low_passed_alike_at_a_given_bandwidth() -> None:
-    recording = a_recording(MODEL, TRUTH, noise=0.5)
-    options = Preprocessing(smooth_torque=True, torque_bandwidth=20.0)
-    samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
-    error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
-    # White noise of 0.5 in 20 Hz of 500.
-    assert np.std(error) == pytest.approx(0.5 * np.sqrt(20.0 / 500.0), rel=0.25)
 
 
 def test_a_bandwidth_that_is_none_is_refused() -> None:

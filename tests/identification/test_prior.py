@@ -194,15 +194,6 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
     np.testing.assert_allclose(second.std, once.std, rtol=1e-5)
 
 
-def test_the_ratio_does_not_depend_on_units() -> None:
-    factor, std = Factor.of(MODEL, noisy()), np.linspace(0.1, 2.0, P)
-    scale = np.append(np.logspace(-4, 4, P), 1.0)
-    scaled = replace(factor, matrices=factor.gram * np.outer(scale, scale))
-    one = with_prior(MODEL, factor, independent(np.zeros(P), std))
-    other = with_prior(MODEL, scaled, independent(np.zeros(P), std / scale[:-1]))
-    np.testing.assert_allclose(other.ratio, one.ratio, rtol=1e-6)
-
-
 def test_too_few_rows_to_know_the_noise_need_weights() -> None:
     samples = noisy()
     few = replace(
@@ -302,13 +293,6 @@ def test_of_rotors_and_friction_a_urdf_says_nothing() -> None:
     assert flat == groups | set(model.parameter_names[model.base.rank :])
     assert {"I3m", "I4m", "f0_1", "f2_6"} <= flat
     assert all(value > 0.0 for value in std.values())
-
-
-def test_a_zero_in_the_cad_is_no_certainty() -> None:
-    model = RobotModel.from_urdf(urdf_text())
-    prior = nominal_prior(model)
-    zeros = np.flatnonzero(prior.mean[: model.base.rank] == 0.0)
-    assert np.all(prior.std[zeros] > 0.0)
 
 
 def test_a_urdf_without_inertia_a_name_unknown_or_no_share_are_errors() -> None:

@@ -30,7 +30,6 @@ from identification.model.motion import Motion
 from identification.model.regressor import CHUNK, LinkMotion, _cos_sin
 from identification.selection.essential import eliminate
 from identification.signals.samples import Samples
-from identification.validation.endogeneity import endogeneity_test
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.two_link import MODEL, a_motion, coloured, recording
 
@@ -58,18 +57,6 @@ def test_inertial_columns_are_pinocchios(model: RobotModel) -> None:
         for t in range(len(q)):
             expected = pin.computeJointTorqueRegressor(reference, data, q[t], qd[t], qdd[t])
             assert np.abs(dense[t, :, column] - expected[:, theirs]).max() < 1e-12
-
-
-def test_rotor_and_friction_columns_act_on_their_joint_alone(model: RobotModel) -> None:
-    q, qd, qdd = states(20)
-    dense = model.regressor(q, qd, qdd).dense(58)
-    own = {"I3m": qdd[:, 2], "f0_2": np.sign(qd[:, 1]), "f1_5": qd[:, 4], "f2_1": abs(qd) * qd}
-    own["f2_1"] = own["f2_1"][:, 0]
-    for name, expected in own.items():
-        column = dense[:, :, model.parameter_names.index(name)]
-        joint = int(name[-1]) - 1 if "_" in name else int(name[1]) - 1
-        assert np.array_equal(column[:, joint], expected), name
-        assert not np.delete(column, joint, axis=1).any(), name
 
 
 def test_blocks_hold_what_acts_on_a_joint_and_nothing_else(model: RobotModel) -> None:
@@ -259,22 +246,6 @@ def test_pieces_of_any_length_give_the_same_values_and_covariance(
     assert deviations(one, many).max() < 1e-9
     np.testing.assert_allclose(many.std, one.std, rtol=1e-9)
     assert many.method.rpartition(", ")[2] == one.method.rpartition(", ")[2]  # the blocks
-
-
-@pytest.mark.parametrize("name", sorted(set(ESTIMATORS) - {"huber", "tukey", "consistent"}))
-def test_a_thousand_pieces_of_one_sample_each_do_too(name: str) -> None:
-    many = ESTIMATORS[name](cut(range(1, 1000)))
-    assert deviations(from_one(name), many).max() < 1e-9
-    np.testing.assert_allclose(many.std, from_one(name).std, rtol=1e-9)
-
-
-def test_the_test_for_bias_does_not_depend_on_the_pieces_either() -> None:
-    one, many = (
-        endogeneity_test(MODEL, factor, estimate_instrumental(MODEL, factor))
-        for factor in map(instruments, (cut([]), cut([17, 400, 401, 800])))
-    )
-    assert many.statistic == pytest.approx(one.statistic, rel=1e-7)
-    assert many.words == one.words
 
 
 # The factor itself

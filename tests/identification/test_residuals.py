@@ -155,13 +155,6 @@ def test_one_recording_is_cut_so_that_drift_can_be_seen(model: RobotModel) -> No
     assert drift is not None and len(drift.share) >= 4
 
 
-def test_samples_of_white_noise_are_worth_what_they_are() -> None:
-    rng = np.random.default_rng(1)
-    residual = rng.standard_normal((20000, 3))
-    found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
-    np.testing.assert_allclose(found.effective_rows, 20000, rtol=0.1)
-
-
 @pytest.mark.parametrize("memory", [0.01, 0.05])
 def test_the_memory_of_coloured_noise_is_that_of_theory(memory: float) -> None:
     rng = np.random.default_rng(2)

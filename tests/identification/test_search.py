@@ -23,7 +23,6 @@ from identification.excitation import (
     SineGenome,
     check_motion,
     coupling_index_max,
-    midpoints,
     most_evaluations,
     search,
 )
@@ -187,27 +186,6 @@ def _room_under(front: Front) -> float:
     size, coupled = front.measures.T
     assert size[0] > 0.0 and coupled[-1] < 30.0
     return float(size @ np.diff(coupled, append=30.0))
-
-
-def test_generations_count_the_first_random_one(population):
-    design = search(population, settings("b"))
-    assert [len(genes) for genes in population.genes] == [12] * 4
-    assert design.excitation.tried == 48
-
-
-def test_the_result_is_judged_at_1_ms_by_brute_force(population):
-    design = search(population, settings("b"))
-    model, excitation = population.problem.objective.model, design.excitation
-    motion = midpoints(excitation.trajectory, 0.001)
-    phi = model.regressor(motion.position, motion.velocity, motion.acceleration).dense(13)
-    phi = phi.reshape(-1, 13)
-    _, log_det = np.linalg.slogdet(phi.T @ phi / motion.n_samples)
-    np.testing.assert_allclose(excitation.criteria.log10_det, log_det / np.log(10.0), rtol=1e-9)
-    np.testing.assert_allclose(excitation.criteria.condition, np.linalg.cond(phi), rtol=1e-6)
-    assert excitation.criteria.n_samples == motion.n_samples
-    # what the search saw every 8 ms is nearly that
-    seen = design.front.measure("log10_det")[design.chosen]
-    assert abs(excitation.criteria.log10_det - seen) < 0.1
 
 
 def test_the_result_keeps_the_constraints_and_plans_from_its_moves(population):
@@ -402,16 +380,6 @@ def test_a_finished_search_is_read_without_scoring(population):
     assert len(file.getvalue()) == size
 
 
-def test_a_journal_that_lost_its_tail_costs_only_that(population):
-    chosen = settings("b")
-    file = io.BytesIO()
-    whole = bits(search(population, chosen, journal=opened(file, chosen)))
-    torn = io.BytesIO(file.getvalue()[:-100])
-    assert bits(search(population.begin(), chosen, journal=opened(torn, chosen))) == whole
-    assert [len(genes) for genes in population.genes] == [12]
-    assert torn.getvalue() == file.getvalue()
-
-
 def test_progress_says_how_far_it_is_and_the_best(population):
     seen = []
     design = search(population, settings("front", polish=40), progress=seen.append)
@@ -422,14 +390,6 @@ def test_progress_says_how_far_it_is_and_the_best(population):
     assert all(each.feasible == each.evaluated for each in seen)
     before = search(population, settings("front"))
     assert list(seen[4].best) == before.front.measures[before.chosen].tolist()
-
-
-def test_a_polish_can_be_stopped_and_gives_what_it_has(population):
-    chosen = settings("b", polish=200)
-    half = search(population, chosen, stop=Stop(4 + 1 + 2))
-    assert not half.complete
-    assert len(half.history) == 4
-    assert half.excitation.tried == 48 + 2 * 16
 
 
 def test_a_search_gets_from_infeasible_motions_to_feasible_ones(population):

@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, RobotModel
 from identification.export.simulators import (
@@ -26,8 +25,6 @@ from identification.model.elements import Anchors, GasCylinder, TorqueRipple, To
 from identification.model.payload import Payload
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-
-Array = NDArray[np.float64]
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
 WRIST = np.eye(6)

@@ -6,14 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, Preprocessing, Recording, RobotModel, prepare
 from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.coupling import Coupling
 from identification.validation.prediction import PredictionError, prediction_error
-
-Array = NDArray[np.float64]
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "tx40"
 GEARS = np.array([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])

@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.export.urdf import (
@@ -20,8 +19,6 @@ from identification.export.urdf import (
 )
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import robot_text, some_bodies
-
-Array = NDArray[np.float64]
 
 TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
 

@@ -22,10 +22,8 @@ from identification.validation.calibration import Calibration, TorqueMeans, cali
 from identification.validation.evidence import repetition_noise
 from identification.validation.prediction import (
     PredictionError,
-    for_figure,
     over_all,
     prediction_error,
-    residual,
     slow_error,
 )
 from tests.identification.two_link import (
@@ -106,18 +104,6 @@ def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for(
     assert error.overall > 0.05
 
 
-def test_a_low_pass_takes_noise_away_and_leaves_slow_errors(model: RobotModel) -> None:
-    values = np.ones(model.n_parameters)
-    slow = 0.3 * np.sin(2.0 * np.pi * np.arange(5000) * 2e-3)[:, None]
-    noise = np.random.default_rng(1).standard_normal((5000, 2))
-    samples = samples_with(model, slow + noise)
-    left = np.where(samples.usable, residual(model, values, samples, 10.0), np.nan)
-    noise_left = np.sqrt(2 * 10.0 * 2e-3)  # of white noise of 1, in 10 Hz of 250
-    expected = np.sqrt(0.3**2 / 2 + noise_left**2)
-    np.testing.assert_allclose(np.sqrt(np.nanmean(left**2, axis=0)), expected, rtol=0.15)
-    np.testing.assert_array_equal(residual(model, values, samples)[~samples.usable], 0.0)
-
-
 def test_a_change_of_friction_is_apart_from_other_slow_errors(model: RobotModel) -> None:
     """Measured in full, and forgiven up to a tenth."""
     values = np.ones(model.n_parameters)
@@ -140,14 +126,6 @@ def test_no_runs_and_other_shapes_are_errors() -> None:
         over_all([])
     with pytest.raises(ShapeError):
         PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
-
-
-def test_the_figures_low_pass_keeps_10_hz_and_drops_100_hz() -> None:
-    time = np.arange(4000) * 1e-3
-    tones = np.sin(2.0 * np.pi * np.array([10.0, 100.0]) * time[:, None])
-    drawn = for_figure(time, tones)[500:-500]
-    np.testing.assert_allclose(drawn[:, 0], tones[500:-500, 0], atol=0.01)
-    assert np.abs(drawn[:, 1]).max() < 0.01
 
 
 def test_noise_is_what_differs_between_repetitions(model: RobotModel) -> None:
