@@ -104,24 +104,22 @@ def _reasons(
     # Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
     loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)
-
-    def why_not(m: int) -> str | None:
-        if rows[m] == 0:
-            return "the motor has no usable row"
-        if determined[m] and found[m] > 0.0 and relative[m] <= WORST_RELATIVE_STD:
-            return None
-        if not loaded[m]:
-            return "the payload does not load it, and nothing else fixes its scale"
-        if not determined[m]:
-            return "the payload's torque on it looks like the robot's own"
-        if not found[m] > 0.0:
-            return "its best value is not positive: what the payload adds to its current is noise"
-        return (
+    good = determined & (found > 0.0) & (relative <= WORST_RELATIVE_STD)
+    checks = (  # the first that holds
+        (rows == 0, "the motor has no usable row"),
+        (good, None),
+        (~loaded, "the payload does not load it, and nothing else fixes its scale"),
+        (~determined, "the payload's torque on it looks like the robot's own"),
+        (~(found > 0.0), "its best value is not positive: what the payload adds to it is noise"),
+    )
+    return tuple(
+        next(
+            (words for holds, words in checks if holds[m]),
             f"its relative standard deviation would be {relative[m]:.0%}, more than"
-            f" {WORST_RELATIVE_STD:.0%}"
+            f" {WORST_RELATIVE_STD:.0%}",
         )
-
-    return tuple(why_not(m) for m in range(len(total)))
+        for m in range(len(total))
+    )
 
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -144,31 +142,29 @@ def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, S
     """Parameters and inverse gains (p + n,), these from a start (n,); and the last problem."""
     p = total.shape[1] - 2
 
-    def problem(unknowns: Array) -> tuple[Array, Array, float]:
+    def problem(unknowns: Array) -> tuple[NormalEquations, float]:
         information, scores, squares = _linearised(total[None], unknowns, noise)
-        return information[0], scores[0], float(squares[0])
+        return NormalEquations(information[0], scores[0]), float(squares[0])
 
     unknowns = np.concatenate([np.zeros(p), inverses])
-    information, score, _ = problem(unknowns)
-    unknowns[:p] = solve(NormalEquations(information[:p, :p], score[:p], 0.0, 0)).values
+    unknowns[:p] = solve(problem(unknowns)[0].part(np.arange(p))).values
     # Halved if the sum of squares does not fall: far from determined, steps overshoot.
     damping, cost = 1.0, np.inf
     best, step = unknowns, np.zeros_like(unknowns)
     for _ in range(_ITERATIONS):
-        information, score, squares = problem(unknowns)
+        equations, squares = problem(unknowns)
         if squares > cost * (1.0 + 1e-12):
             damping *= 0.5
             unknowns = best + damping * step
             if damping < 1e-3:
                 break
             continue
-        step = solve(NormalEquations(information, score, 0.0, 0)).values
+        step = solve(equations).values
         best, cost, damping = unknowns, squares, 1.0
         unknowns = best + step
-        if step @ information @ step < _CONVERGED:
+        if step @ equations.A @ step < _CONVERGED:
             break
-    information, score, _ = problem(best)
-    return best, solve(NormalEquations(information, score, 0.0, 0))
+    return best, solve(problem(best)[0])
 
 
 def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Array, Array]:
@@ -193,12 +189,9 @@ def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Arra
     return information, scores, squares
 
 
-# Where no torque constant is known, from the masses of the description: motor m of a robot with
-# motor angles M q obeys
+# Where no torque constant is known, from the masses of the description, linear motor by motor:
 #     i_m = kappa_m [M^-T tau_nominal]_m + J_m qdd_m + c_m sgn(qd_m) + v_m qd_m + o_m
-# with the nominal (CAD) torque of the links. It is linear, motor by motor; the weight of the links
-# fixes kappa_m = 1 / K_m, which is as right as the masses: every torque that is made with it is in
-# their units.
+# for motor angles M q; kappa_m = 1 / K_m is as right as the masses.
 
 WORST_SCALE_STD: Final = 0.1
 _BLOCKS: Final = 20  # of time, left out one by one

@@ -14,6 +14,7 @@ speed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -40,10 +41,6 @@ from identification.signals.smoothing import ORDER, SmoothingSpline, fit_smoothi
 
 Array = NDArray[np.float64]
 
-
-# An instrument need not be right, only close to the motion and independent of its noise. The
-# planned motion is what was commanded, later by the lag with which each axis follows: one number
-# per axis from thousands of noisy samples, so no noise to speak of gets in.
 
 LONGEST_LAG: Final = 0.5  # s; position loops of industrial arms lag 5 to 100 ms
 _LAG_STEP: Final = 0.01  # s
@@ -164,7 +161,7 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
 
 
 # A first-stage F below 10 leaves more than a tenth of the bias of least squares (Staiger and
-# Stock 1997). Each block of time is counted as one independent sample, no matter how many rows.
+# Stock 1997). Each block of time counts as one independent sample.
 WEAK: Final = 10.0
 _PARTICIPATION: Final = 1e-3
 
@@ -202,11 +199,6 @@ class CrossSolution(NamedTuple):
     left: Array
     condition: float
     determined: NDArray[np.bool_]
-
-    @property
-    def inverse(self) -> Array:
-        """Inverse of Z^T W on what is determined, zero elsewhere (p, p)."""
-        return np.asarray(self.right @ self.left.T)
 
 
 def solve_cross(total: Array) -> CrossSolution:
@@ -290,13 +282,8 @@ def partial_r2(total: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(total)[:-1], 1e-300))
     scaled = total[:-1, :-1] / np.outer(scale, scale)
     zz, zw, ww = scaled[:p, :p], scaled[:p, p:], scaled[p:, p:]
-    explained = zw.T @ _inverse(zz) @ zw
-    own, by_instruments = np.diag(_inverse(ww)), np.diag(_inverse(explained))
+    inverse = partial(np.linalg.pinv, rcond=1.0 / WORST_CONDITION**2, hermitian=True)
+    own, by_instruments = np.diag(inverse(ww)), np.diag(inverse(zw.T @ inverse(zz) @ zw))
     known = (own > 0.0) & (by_instruments > 0.0)
     share = np.where(known, own / np.where(known, by_instruments, 1.0), 0.0)
     return np.clip(share, 0.0, 1.0)
-
-
-def _inverse(matrix: Array) -> Array:
-    """Inverse of a symmetric matrix without the directions that carry no information."""
-    return np.asarray(np.linalg.pinv(matrix, rcond=1.0 / WORST_CONDITION**2, hermitian=True))

@@ -57,19 +57,14 @@ class BaseParameters:
         """How clear the rank decision is: smallest independent over largest dropped share."""
         return self.smallest_pivot / max(self.largest_dropped, np.finfo(np.float64).tiny)
 
-    @property
-    def unobservable(self) -> tuple[str, ...]:
-        """Standard parameters that no torque depends on."""
-        absent = ~np.any(np.abs(self.grouping) > _UNSPEAKABLE, axis=0)
-        return tuple(n for n, gone in zip(self.standard_names, absent, strict=True) if gone)
-
     def explanation(self) -> str:
         """Return the rank decision in words: how many are independent, how clearly.
 
         Shares are of the longest column of the same unit, after what those before it
         explain; a parameter is dropped below :data:`TOLERANCE`.
         """
-        s, absent = len(self.standard_names), len(self.unobservable)
+        s = len(self.standard_names)
+        absent = s - np.count_nonzero(np.any(np.abs(self.grouping) > _UNSPEAKABLE, axis=0))
         text = (
             f"{self.rank} of {s} standard parameters are independent, {s - self.rank - absent} are"
             f" grouped into them, {absent} act on no torque."
@@ -117,9 +112,6 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
     scale = np.array([longest[unit] or 1.0 for unit in units])
     scaled = reduced / scale
     pivots, shares = _first_independent(scaled)
-    dropped = np.setdiff1d(np.arange(len(names)), pivots)
-    largest_dropped = float(shares[dropped].max(initial=0.0))
-
     relation, *_ = np.linalg.lstsq(scaled[:, pivots], scaled, rcond=None)
     # What is no larger than what stays unexplained is rounding, not grouping.
     unexplained = np.linalg.norm(scaled - scaled[:, pivots] @ relation, axis=0).max(initial=0.0)
@@ -132,7 +124,7 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
         grouping=grouping,
         standard_names=tuple(names),
         smallest_pivot=float(shares[pivots].min(initial=1.0)),
-        largest_dropped=largest_dropped,
+        largest_dropped=float(np.delete(shares, pivots).max(initial=0.0)),
         shares=shares,
     )
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -226,10 +225,8 @@ class GasCylinder(Element):
     identified: bool = False
 
     def __post_init__(self) -> None:
-        _require_positive("length", "m", self.length)
-        _require_positive("area", "m²", self.area)
-        _require_positive("pressure", "Pa", self.pressure)
-        _require_positive("volume", "m³", self.volume)
+        for name, unit in (("length", "m"), ("area", "m²"), ("pressure", "Pa"), ("volume", "m³")):
+            _require_positive(name, unit, getattr(self, name))
         base, link = self.anchors.base, self.anchors.link
         end = base + link if self.pulls else abs(base - link)
         left = float(self._volume_left(np.array(end)))
@@ -370,14 +367,11 @@ class JointElements:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the e parameters: ``spring_2``, then ``spring_2b`` of another on that joint."""
-        found: Counter[str] = Counter()
-        names = []
-        for one in self.placed:
-            for symbol in one.element.symbols:
-                name = f"{symbol}_{one.joint + 1}"
-                names.append(name + ("" if not found[name] else chr(ord("a") + found[name])))
-                found[name] += 1
-        return tuple(names)
+        first = [f"{s}_{one.joint + 1}" for one in self.placed for s in one.element.symbols]
+        before = [first[:k].count(name) for k, name in enumerate(first)]
+        return tuple(
+            name + (chr(ord("a") + k) if k else "") for name, k in zip(first, before, strict=True)
+        )
 
     @property
     def _coefficients(self) -> list[Coefficient]:
@@ -410,12 +404,12 @@ class JointElements:
 
 def _require_positive(what: str, unit: str, *values: float) -> None:
     for value in values:
-        if not (math.isfinite(value) and value > 0.0):
+        if not 0.0 < value < math.inf:
             raise ModelError(f"the {what} is {value!r} {unit}; it must be finite and positive")
 
 
 def _require_finite(what: str, *values: float) -> None:
-    if not all(math.isfinite(value) for value in values):
+    if not all(map(math.isfinite, values)):
         raise ModelError(f"the {what} is not finite; give a number")
 
 

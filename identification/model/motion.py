@@ -30,14 +30,7 @@ class Motion(NamedTuple):
 
     def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
         """The motion at some of the instants."""
-        direction = None if self.direction is None else self.direction[which]
-        return Motion(
-            self.time[which],
-            self.position[which],
-            self.velocity[which],
-            self.acceleration[which],
-            direction,
-        )
+        return Motion(*(None if one is None else one[which] for one in self))  # type: ignore[arg-type]
 
     @property
     def n_samples(self) -> int:

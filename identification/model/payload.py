@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
-from identification.model.pseudo_inertia import Body, inertial_parameters
+from identification.model.pseudo_inertia import Body, inertial_parameters, tensors
 from identification.model.regressor import RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
@@ -45,10 +44,16 @@ class Payload:
     def __post_init__(self) -> None:
         if not 0.0 <= self.mass <= _MOST:
             raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
-        if not all(math.isfinite(value) for value in (*self.centre, *self.inertia)):
-            raise ModelError("the payload's centre or inertia holds a number that is not finite")
         if not all(abs(value) <= _MOST for value in (*self.centre, *self.inertia)):
-            raise ModelError(f"the payload's centre or inertia holds a number beyond {_MOST:g}")
+            raise ModelError(
+                f"the payload's centre or inertia holds a number that is not finite or beyond"
+                f" {_MOST:g}"
+            )
+
+    @property
+    def tensor(self) -> Array:
+        """Inertia about the centre of mass, in the axes of the frame (3, 3) [kg m²]."""
+        return tensors(np.array(self.inertia))
 
     @property
     def possible(self) -> bool:
@@ -56,13 +61,13 @@ class Payload:
 
         Principal moments are not negative, and none exceeds the sum of the others.
         """
-        least, middle, most = np.linalg.eigvalsh(_tensor(self.inertia))
+        least, middle, most = np.linalg.eigvalsh(self.tensor)
         return bool(least >= -_ROUNDING * most and most <= (1.0 + _ROUNDING) * (least + middle))
 
     @property
     def parameters(self) -> Array:
         """Inertial parameters about the frame's origin, in its axes (10,), as `LINK_SYMBOLS`."""
-        return inertial_parameters(Body(self.mass, np.array(self.centre), _tensor(self.inertia)))
+        return inertial_parameters(Body(self.mass, np.array(self.centre), self.tensor))
 
     def carried_by(self, chain: Chain) -> tuple[int, Array]:
         """Return the joint that carries it, from 0, and its parameters about that joint (10,).
@@ -72,7 +77,7 @@ class Payload:
         """
         joint, rotation, translation = chain.frame(self.frame)
         centre = rotation @ np.array(self.centre) + translation
-        tensor = rotation @ _tensor(self.inertia) @ rotation.T
+        tensor = rotation @ self.tensor @ rotation.T
         return joint, inertial_parameters(Body(self.mass, centre, tensor))
 
 
@@ -91,8 +96,3 @@ class Load:
         """Return the joint torques (m, n) [N·m or N] that moving it alone takes."""
         q, qd, qdd = joint_arrays(self._plan.chain.n_joints, q=q, qd=qd, qdd=qdd)
         return self._plan.torque(self.parameters, q, qd, qdd)
-
-
-def _tensor(six: tuple[float, ...]) -> Array:
-    xx, xy, xz, yy, yz, zz = six
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

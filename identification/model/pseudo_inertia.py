@@ -47,7 +47,7 @@ class Body(NamedTuple):
 def pseudo_inertia(inertial: Array) -> Array:
     """Return the pseudo-inertias (..., 4, 4) of inertial parameters (..., 10)."""
     inertial = np.asarray(inertial, dtype=np.float64)
-    tensor = _tensor(inertial[..., :6])
+    tensor = tensors(inertial[..., :6])
     matrix = np.empty((*inertial.shape[:-1], 4, 4))
     half_trace = 0.5 * np.trace(tensor, axis1=-2, axis2=-1)
     matrix[..., :3, :3] = half_trace[..., None, None] * np.eye(3) - tensor
@@ -93,7 +93,7 @@ def body(inertial: Array) -> Body:
         raise NoMassError("a body without mass has no centre of mass")
     centre = inertial[6:9] / mass
     lever = skew(centre)
-    return Body(mass, centre, _tensor(inertial[:6]) + mass * lever @ lever)
+    return Body(mass, centre, tensors(inertial[:6]) + mass * lever @ lever)
 
 
 def inertial_parameters(body: Body) -> Array:
@@ -103,7 +103,7 @@ def inertial_parameters(body: Body) -> Array:
     return np.concatenate([tensor[_UPPER], body.mass * body.centre, [body.mass]])
 
 
-def _tensor(six: Array) -> Array:
+def tensors(six: Array) -> Array:
     """Return symmetric matrices (..., 3, 3) of xx, xy, xz, yy, yz, zz (..., 6)."""
     rows, columns = _UPPER
     tensor = np.empty((*six.shape[:-1], 3, 3))

@@ -90,19 +90,11 @@ class StandardLayout:
 
     def split(self, pivots: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
         """Return what of each joint is among `pivots`: link symbols, rotor, and which couplings."""
-        links: list[list[int]] = [[] for _ in self.revolute]
-        rotors = [False] * self.n_joints
-        couplings: list[int] = []
-        first = self.n_joints * self.width
-        for standard in (int(k) for k in pivots):
-            joint, symbol = divmod(standard, self.width)
-            if standard >= first:
-                couplings.append(standard - first)
-            elif symbol < _N_LINK:
-                links[joint].append(symbol)
-            else:
-                rotors[joint] = True
-        return links, rotors, couplings
+        first, there = self.n_joints * self.width, set(map(int, pivots))
+        joints = range(0, first, self.width)
+        links = [[k for k in range(_N_LINK) if start + k in there] for start in joints]
+        rotors = [self.rotor_inertia and start + _N_LINK in there for start in joints]
+        return links, rotors, sorted(k - first for k in there if k >= first)
 
     def rotor_matrix(self, standard: Array) -> Array:
         """Return the rotors' inertia matrix in joint coordinates (n, n): positive if possible."""
@@ -241,20 +233,17 @@ class RobotModel:
         all_friction = JointFriction(laws, revolute, coupling)
         beside = JointElements.of(elements, chain.joint_names, revolute)
         base = _base_parameters(chain, down, layout, all_friction, beside)
+        load = None if payload is None else Load(chain, down, payload)
         return cls(
             chain=chain,
             gravity=down,
             layout=layout,
-            friction=all_friction,
             base=base,
-            parameter_names=base.names + all_friction.names + beside.names,
-            units=tuple(layout.units[k] for k in base.pivots) + all_friction.units + beside.units,
-            plan=_plan(chain, down, layout, base.pivots, all_friction, beside),
             locked=dict(locked),
             coupling=coupling,
             payload=payload,
-            elements=beside,
-            _load=None if payload is None else Load(chain, down, payload),
+            _load=load,
+            **_parameters(chain, down, layout, base, all_friction, beside),
         )
 
     def with_friction(self, **changes: Any) -> RobotModel:
@@ -264,26 +253,18 @@ class RobotModel:
             ModelError: some joint's law would be none, see :class:`FrictionLaw`.
         """
         laws = tuple(replace(law, **changes) for law in self.friction.laws)
-        return self._beside(replace(self.friction, laws=laws), self.elements)
+        return self._with(replace(self.friction, laws=laws), self.elements)
 
     def with_elements(self, more: Sequence[Element]) -> RobotModel:
         """Return the model with these elements behind its own, see :meth:`from_urdf`."""
         elements = JointElements.of(
             [*self.elements.elements, *more], self.joint_names, self.friction.revolute
         )
-        return self._beside(self.friction, elements)
+        return self._with(self.friction, elements)
 
-    def _beside(self, friction: JointFriction, elements: JointElements) -> RobotModel:
-        return replace(
-            self,
-            friction=friction,
-            elements=elements,
-            parameter_names=self.base.names + friction.names + elements.names,
-            units=tuple(self.layout.units[k] for k in self.base.pivots)
-            + friction.units
-            + elements.units,
-            plan=_plan(self.chain, self.gravity, self.layout, self.base.pivots, friction, elements),
-        )
+    def _with(self, friction: JointFriction, elements: JointElements) -> RobotModel:
+        own = self.chain, self.gravity, self.layout, self.base
+        return replace(self, **_parameters(*own, friction, elements))
 
     def of_payload(self) -> RobotModel:
         """Return the model of what the arm carries: ten parameters about the last joint's frame.
@@ -418,6 +399,24 @@ def _laws(
                 f" {', '.join(chain.joint_names)}"
             )
     return tuple(others.get(name, law) for name in chain.joint_names)
+
+
+def _parameters(
+    chain: Chain,
+    gravity: Array,
+    layout: StandardLayout,
+    base: BaseParameters,
+    friction: JointFriction,
+    elements: JointElements,
+) -> dict[str, Any]:
+    """What of a model follows from its friction and elements."""
+    return {
+        "friction": friction,
+        "elements": elements,
+        "parameter_names": base.names + friction.names + elements.names,
+        "units": (*(layout.units[k] for k in base.pivots), *friction.units, *elements.units),
+        "plan": _plan(chain, gravity, layout, base.pivots, friction, elements),
+    }
 
 
 def _plan(
