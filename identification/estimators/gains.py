@@ -199,18 +199,13 @@ _BLOCKS: Final = 20  # of time, left out one by one
 
 @dataclass(frozen=True, eq=False)
 class CurrentScale:
-    """Torque per current of n motors, in units of the nominal masses.
+    """Torque per current of n motors, in units of the nominal masses."""
 
-    Attributes:
-        values: (n,) [N·m/A or N/A, motor side], 1 where not determined.
-        std: standard deviations given the masses, by leaving out blocks of time (n,); infinite
-            where not determined.
-        inertial: motors whose gain rests on inertia without a rotor's: weight does not load them
-            enough (n,).
-    """
-
-    values: Array
+    values: Array  # (n,) [N·m/A or N/A, motor side], 1 where not determined
+    # standard deviations given the masses, by leaving out blocks of time (n,); infinite where not
+    # determined
     std: Array
+    # motors whose gain rests on inertia without a rotor's: weight does not load them enough (n,)
     inertial: NDArray[np.bool_]
 
     @property

@@ -55,17 +55,12 @@ _COMPARED: Final = 400  # instants
 
 
 class Instruments(NamedTuple):
-    """Motion to make instruments from, in the rows of some samples.
+    """Motion to make instruments from, in the rows of some samples."""
 
-    Attributes:
-        motion: m instants of n joints.
-        usable: where it is known (m, n).
-        lag: by which the measured motion follows the command (n,) [s]; NaN for a joint that
-            does not move.
-    """
-
-    motion: Motion
-    usable: NDArray[np.bool_]
+    motion: Motion  # m instants of n joints
+    usable: NDArray[np.bool_]  # where it is known (m, n)
+    # by which the measured motion follows the command (n,) [s]; NaN for a joint that does not
+    # move
     lag: Array
 
 
@@ -184,21 +179,13 @@ class InstrumentalEstimate:
 
 
 class CrossSolution(NamedTuple):
-    """Solution of ``Z^T W pi = Z^T y``.
+    """Solution of ``Z^T W pi = Z^T y``."""
 
-    Attributes:
-        values: (p,), of least (scaled) norm where the instruments leave a choice.
-        right: R (p, k), and
-        left: L (p, k): R L^T is the inverse of Z^T W on the k directions determined.
-        condition: square root of the scaled condition of Z^T W, comparable to that of W.
-        determined: (p,).
-    """
-
-    values: Array
-    right: Array
-    left: Array
-    condition: float
-    determined: NDArray[np.bool_]
+    values: Array  # (p,), of least (scaled) norm where the instruments leave a choice
+    right: Array  # R (p, k)
+    left: Array  # L (p, k): R L^T is the inverse of Z^T W on the k directions determined
+    condition: float  # square root of the scaled condition of Z^T W, comparable to that of W
+    determined: NDArray[np.bool_]  # (p,)
 
 
 def solve_cross(total: Array) -> CrossSolution:

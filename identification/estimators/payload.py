@@ -93,17 +93,12 @@ class PayloadError(IdentificationError):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One recording, reduced.
+    """One recording, reduced."""
 
-    Attributes:
-        name: of the recording.
-        phase: over the arm's parameters, those of the body (10) and an offset of each joint (n).
-        loaded: whether the arm carried the body.
-    """
-
-    name: str
+    name: str  # of the recording
+    # over the arm's parameters, those of the body (10) and an offset of each joint (n)
     phase: PhaseFactor
-    loaded: bool
+    loaded: bool  # whether the arm carried the body
 
     @classmethod
     def of(
@@ -145,47 +140,32 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """A recording that carries something else than the first of its kind.
+    """A recording that carries something else than the first of its kind."""
 
-    Attributes:
-        run: the recording.
-        reference: the first one.
-        mass: by which it carries more [kg].
-    """
-
-    run: Run
-    reference: Run
-    mass: float
+    run: Run  # the recording
+    reference: Run  # the first one
+    mass: float  # by which it carries more [kg]
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadEstimate:
-    """What the arm carries at the frame.
+    """What the arm carries at the frame."""
 
-    Attributes:
-        parameters: about the frame's origin, least squares (10,), as `LINK_SYMBOLS`; a body need
-            not have them.
-        covariance: of them (10, 10), cluster-robust; infinite variance where not determined.
-        interval_factor: standard deviations in half a 95 % interval.
-        body: the possible body closest to them; None where the mass is not significantly above
-            zero.
-        intervals: 95 %, of the figures `NAMES` (10, 2), with those of `body` inside; infinite where
-            not determined.
-        moment: mass times distance of the centre from the frame's origin [kg m], and its interval.
-        undetermined: names of what the motion does not determine: of `body` the reference body's.
-        contradicted: whether no possible body fits the recordings to their noise.
-        method: how the covariance was made, in words.
-    """
-
+    # about the frame's origin, least squares (10,), as `LINK_SYMBOLS`; a body need not have them
     parameters: Array
-    covariance: Array
-    interval_factor: float
+    covariance: Array  # of them (10, 10), cluster-robust; infinite variance where not determined
+    interval_factor: float  # standard deviations in half a 95 % interval
+    # the possible body closest to them; None where the mass is not significantly above zero
     body: Body | None
+    # 95 %, of the figures `NAMES` (10, 2), with those of `body` inside; infinite where not
+    # determined
     intervals: Array
+    # mass times distance of the centre from the frame's origin [kg m], and its interval
     moment: tuple[float, float, float]
+    # names of what the motion does not determine: of `body` the reference body's
     undetermined: tuple[str, ...]
-    contradicted: bool
-    method: str
+    contradicted: bool  # whether no possible body fits the recordings to their noise
+    method: str  # how the covariance was made, in words
 
 
 def identify_payload(

@@ -51,17 +51,11 @@ def _coupling_index(gram: _Cholesky, _: int) -> float:
 
 
 class Criterion(NamedTuple):
-    """A measure that searches weigh.
+    """A measure that searches weigh."""
 
-    Attributes:
-        score: it, of a factorised Gram matrix and N time samples.
-        label: its name in messages.
-        sense: 1 where more is better, -1 where less is.
-    """
-
-    score: Callable[[_Cholesky, int], float]
-    label: str
-    sense: float
+    score: Callable[[_Cholesky, int], float]  # it, of a factorised Gram matrix and N time samples
+    label: str  # its name in messages
+    sense: float  # 1 where more is better, -1 where less is
 
 
 CRITERIA: Final[Mapping[str, Criterion]] = {

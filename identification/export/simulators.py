@@ -69,21 +69,13 @@ class Ranges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm with parameters that a machine can have.
+    """An arm with parameters that a machine can have."""
 
-    Attributes:
-        urdf: the text that the model was made from.
-        model: the robot.
-        standard: standard parameters (s,), every body and rotor possible.
-        values: the parameters (p,) that follow, with friction, springs and balancers.
-        ranges: limits of its joints.
-    """
-
-    urdf: str
-    model: RobotModel
-    standard: Array
-    values: Array
-    ranges: Ranges
+    urdf: str  # the text that the model was made from
+    model: RobotModel  # the robot
+    standard: Array  # standard parameters (s,), every body and rotor possible
+    values: Array  # the parameters (p,) that follow, with friction, springs and balancers
+    ranges: Ranges  # limits of its joints
 
     @property
     def friction(self) -> tuple[dict[str, float], ...]:
@@ -232,41 +224,27 @@ def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
 
 
 class Format(NamedTuple):
-    """A file format, and what of the model it has room for.
+    """A file format, and what of the model it has room for."""
 
-    Attributes:
-        suffix: of its files.
-        write: an arm, its name and remarks to text.
-        read: text, arm and motion to the torques (m, n) that its bodies, rotors, springs and
-            speed-dependent friction take.
-        friction: kinds of term.
-        rotors: rotor inertias, and inertia and friction of coupled motors.
-        springs: torsion springs.
-        payload: a stated payload.
-    """
-
-    suffix: str
-    write: Callable[[Arm, str, Sequence[str]], str]
+    suffix: str  # of its files
+    write: Callable[[Arm, str, Sequence[str]], str]  # an arm, its name and remarks to text
+    # text, arm and motion to the torques (m, n) that its bodies, rotors, springs and speed-
+    # dependent friction take
     read: Callable[[str, Arm, Motion], Array]
-    friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
-    rotors: bool = False
-    springs: bool = True
-    payload: bool = True
+    friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)  # kinds of term
+    rotors: bool = False  # rotor inertias, and inertia and friction of coupled motors
+    springs: bool = True  # torsion springs
+    payload: bool = True  # a stated payload
 
 
 class Comparison(NamedTuple):
-    """A text read back beside the model.
+    """A text read back beside the model."""
 
-    Attributes:
-        difference: largest at `STATES` random states, as a share of the largest torque of its
-            joint, of what the format has room for.
-        torque: root mean square of the whole torque over the motion (n,) [N·m or N].
-        left_out: that of each part without a place in the format (n,), by words.
-    """
-
+    # largest at `STATES` random states, as a share of the largest torque of its joint, of what
+    # the format has room for
     difference: float
-    torque: Array
-    left_out: Mapping[str, Array]
+    torque: Array  # root mean square of the whole torque over the motion (n,) [N·m or N]
+    left_out: Mapping[str, Array]  # that of each part without a place in the format (n,), by words
 
 
 def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:

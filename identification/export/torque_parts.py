@@ -22,19 +22,13 @@ _TURNED: Final = 6.0
 
 
 class FrictionCurve(NamedTuple):
-    """Friction torque of one joint [N·m or N], offset included, coupled motors left out.
+    """Friction torque of one joint [N·m or N], offset included, coupled motors left out."""
 
-    Attributes:
-        speed: (2 SPEEDS,) [rad/s or m/s], densest around zero.
-        sliding: torque (2 SPEEDS,) of a joint that slides.
-        travel: displacement since a reversal (TRAVELS,) [rad or m]; NaN where dry friction jumps.
-        turning: torque (TRAVELS,) of a joint that creeps forwards after it has gone backwards.
-    """
-
-    speed: Array
-    sliding: Array
+    speed: Array  # (2 SPEEDS,) [rad/s or m/s], densest around zero
+    sliding: Array  # torque (2 SPEEDS,) of a joint that slides
+    # displacement since a reversal (TRAVELS,) [rad or m]; NaN where dry friction jumps
     travel: Array
-    turning: Array
+    turning: Array  # torque (TRAVELS,) of a joint that creeps forwards after it has gone backwards
 
 
 def friction_curve(
@@ -67,19 +61,12 @@ def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array
 
 
 class TorqueParts(NamedTuple):
-    """What a predicted torque is made of; each (m, n) [N·m or N], together the prediction.
+    """What a predicted torque is made of; each (m, n) [N·m or N], together the prediction."""
 
-    Attributes:
-        inertia: of accelerations at rest.
-        coriolis: of velocities, centrifugal torque included.
-        gravity: of positions.
-        friction: of joints and coupled motors, offsets included.
-    """
-
-    inertia: Array
-    coriolis: Array
-    gravity: Array
-    friction: Array
+    inertia: Array  # of accelerations at rest
+    coriolis: Array  # of velocities, centrifugal torque included
+    gravity: Array  # of positions
+    friction: Array  # of joints and coupled motors, offsets included
 
 
 def torque_parts(model: RobotModel, values: Array, samples: Samples) -> TorqueParts:

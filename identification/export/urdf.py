@@ -65,23 +65,14 @@ class WriteBackError(IdentificationError):
 
 @dataclass(eq=False)
 class Element:
-    """One element and where it stands in the UTF-8 text.
+    """One element and where it stands in the UTF-8 text."""
 
-    Attributes:
-        name: of the tag.
-        attributes: as parsed.
-        start: first byte of the opening tag.
-        inside: first byte behind the opening tag.
-        end: first byte behind the whole element.
-        children: elements directly inside.
-    """
-
-    name: str
-    attributes: dict[str, str]
-    start: int
-    inside: int
-    end: int = -1
-    children: list[Element] = field(default_factory=list)
+    name: str  # of the tag
+    attributes: dict[str, str]  # as parsed
+    start: int  # first byte of the opening tag
+    inside: int  # first byte behind the opening tag
+    end: int = -1  # first byte behind the whole element
+    children: list[Element] = field(default_factory=list)  # elements directly inside
 
     def child(self, name: str) -> Element | None:
         """Return the first child of that name."""

@@ -53,19 +53,12 @@ class NormalEquations(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows.
+    """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows."""
 
-    Attributes:
-        values: (p,), of least (scaled) norm where the data leave a choice.
-        root: S (p, k) with S S' the inverse of A on the k directions the data determine.
-        condition: of the regressor with columns of unit length, infinite without some column.
-        determined: (p,).
-    """
-
-    values: Array
-    root: Array
-    condition: float
-    determined: NDArray[np.bool_]
+    values: Array  # (p,), of least (scaled) norm where the data leave a choice
+    root: Array  # S (p, k) with S S' the inverse of A on the k directions the data determine
+    condition: float  # of the regressor with columns of unit length, infinite without some column
+    determined: NDArray[np.bool_]  # (p,)
 
     @property
     def inverse(self) -> Array:
@@ -505,15 +498,11 @@ def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> F
 
 
 class Rows(NamedTuple):
-    """Rows of k consecutive samples, joint by joint.
+    """Rows of k consecutive samples, joint by joint."""
 
-    Attributes:
-        part: which samples of the recording these are.
-        blocks: per joint j the columns of its row and, last, its torque (c_j + 1, k). Columns of
-            samples that do not count are zero. Valid until the next chunk is asked for.
-    """
-
-    part: slice
+    part: slice  # which samples of the recording these are
+    # per joint j the columns of its row and, last, its torque (c_j + 1, k). Columns of samples
+    # that do not count are zero. Valid until the next chunk is asked for
     blocks: list[Array]
 
 

@@ -267,19 +267,12 @@ def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
 
 
 class EqualRuns(NamedTuple):
-    """Blocks one after the other that have as many rows each.
+    """Blocks one after the other that have as many rows each."""
 
-    Attributes:
-        first: the first block.
-        blocks: how many of them.
-        start: its first row.
-        length: rows of each.
-    """
-
-    first: int
-    blocks: int
-    start: int
-    length: int
+    first: int  # the first block
+    blocks: int  # how many of them
+    start: int  # its first row
+    length: int  # rows of each
 
 
 def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
@@ -342,15 +335,12 @@ class StandardGram:
     The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz. One pass over the
     samples therefore says what any other gravity would have made of them. Standard parameters are
     used, since which combinations of them are base parameters depends on gravity.
-
-    Attributes:
-        gram: (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, friction, then
-            springs and balancers.
-        rows: that were summed (n,).
     """
 
+    # (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, friction, then springs and
+    # balancers
     gram: Array
-    rows: NDArray[np.intp]
+    rows: NDArray[np.intp]  # that were summed (n,)
 
     def under(self, gravity: Array) -> Factor:
         """Factor of the s columns under a gravity (3,) [m/s²]."""

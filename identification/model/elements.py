@@ -29,30 +29,19 @@ class ElementError(ModelError):
 
 
 class Coefficient(NamedTuple):
-    """A factor of one shape of torque.
+    """A factor of one shape of torque."""
 
-    Attributes:
-        symbol: name of the parameter, without the number of the joint.
-        unit: its unit.
-        value: as given; None where it is not.
-        identified: whether it is a parameter.
-    """
-
-    symbol: str
-    unit: str
-    value: float | None
-    identified: bool
+    symbol: str  # name of the parameter, without the number of the joint
+    unit: str  # its unit
+    value: float | None  # as given; None where it is not
+    identified: bool  # whether it is a parameter
 
 
 @dataclass(frozen=True)
 class Element(ABC):
-    """A torque on one joint: coefficients times shapes, c of them identified, the others known.
+    """A torque on one joint: coefficients times shapes, c of them identified, the others known."""
 
-    Attributes:
-        joint: name.
-    """
-
-    joint: str
+    joint: str  # name
 
     @property
     def turns(self) -> Mapping[str, float]:
@@ -292,19 +281,12 @@ class TorqueRipple(Element):
 
 
 class PlacedElement(NamedTuple):
-    """An element among the joints and parameters of an arm.
+    """An element among the joints and parameters of an arm."""
 
-    Attributes:
-        element: which.
-        joint: that it acts on, from 0.
-        turns: the angle that it depends on, per angle of each joint (n,).
-        part: where its parameters stand among the e of all elements.
-    """
-
-    element: Element
-    joint: int
-    turns: tuple[float, ...]
-    part: slice
+    element: Element  # which
+    joint: int  # that it acts on, from 0
+    turns: tuple[float, ...]  # the angle that it depends on, per angle of each joint (n,)
+    part: slice  # where its parameters stand among the e of all elements
 
     def columns(self, q: Array) -> Array:
         """Return the columns (m, c) at joint positions (m, n)."""

@@ -328,21 +328,13 @@ def presliding_state(position: Array, distance: float) -> Array:
 
 
 class JointTerm(NamedTuple):
-    """A term of one joint or motor.
+    """A term of one joint or motor."""
 
-    Attributes:
-        name: of the parameter: ``f0_3``, or ``f0_m6`` of a motor.
-        term: which.
-        owner: which joint or motor, from 0.
-        motor: whether it acts on the speed of a motor that several joints turn.
-        unit: at the joint.
-    """
-
-    name: str
-    term: FrictionTerm
-    owner: int
-    motor: bool
-    unit: str
+    name: str  # of the parameter: ``f0_3``, or ``f0_m6`` of a motor
+    term: FrictionTerm  # which
+    owner: int  # which joint or motor, from 0
+    motor: bool  # whether it acts on the speed of a motor that several joints turn
+    unit: str  # at the joint
 
     @property
     def symbol(self) -> str:
@@ -488,15 +480,10 @@ class JointFriction:
 
 
 class Dissipation(NamedTuple):
-    """Coefficients ``f = combine @ g``, of which some g may not be negative.
+    """Coefficients ``f = combine @ g``, of which some g may not be negative."""
 
-    Attributes:
-        combine: (k, k), invertible.
-        not_negative: which of the g (k,).
-    """
-
-    combine: Array
-    not_negative: NDArray[np.bool_]
+    combine: Array  # (k, k), invertible
+    not_negative: NDArray[np.bool_]  # which of the g (k,)
 
 
 def dissipation(friction: JointFriction) -> Dissipation:

@@ -113,30 +113,20 @@ class LinkFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A tree of n revolute and prismatic joints on a fixed base.
+    """A tree of n revolute and prismatic joints on a fixed base."""
 
-    Attributes:
-        joint_names: n names, depth first.
-        parents: index of the parent joint, -1 for the base, shape (n,).
-        rotation: axes of joint frame i at q = 0 in its parent's frame, shape (n, 3, 3).
-        translation: origin of joint frame i in its parent's frame [m], shape (n, 3).
-        axis: unit joint axis in the joint's own frame, shape (n, 3).
-        revolute: False where the joint is prismatic, shape (n,).
-        inertial: the ten parameters per link (:data:`identification.model.regressor.LINK_SYMBOLS`)
-            about the joint frame's origin in its axes, as the description gives them (the nominal,
-            CAD values), shape (n, 10).
-        frames: by name the links of the description, what is fixed to the base included: the
-            joint that moves each (-1: none), and its axes (3, 3) and origin (3,) [m] in that
-            joint's frame.
-    """
-
-    joint_names: tuple[str, ...]
-    parents: NDArray[np.intp]
-    rotation: Array
-    translation: Array
-    axis: Array
-    revolute: NDArray[np.bool_]
+    joint_names: tuple[str, ...]  # n names, depth first
+    parents: NDArray[np.intp]  # index of the parent joint, -1 for the base, shape (n,)
+    rotation: Array  # axes of joint frame i at q = 0 in its parent's frame, shape (n, 3, 3)
+    translation: Array  # origin of joint frame i in its parent's frame [m], shape (n, 3)
+    axis: Array  # unit joint axis in the joint's own frame, shape (n, 3)
+    revolute: NDArray[np.bool_]  # False where the joint is prismatic, shape (n,)
+    # the ten parameters per link (:data:`identification.model.regressor.LINK_SYMBOLS`) about the
+    # joint frame's origin in its axes, as the description gives them (the nominal, CAD values),
+    # shape (n, 10)
     inertial: Array
+    # by name the links of the description, what is fixed to the base included: the joint that
+    # moves each (-1: none), and its axes (3, 3) and origin (3,) [m] in that joint's frame
     frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)
 
     @property

@@ -31,17 +31,11 @@ class NoMassError(IdentificationError, ValueError):
 
 
 class Body(NamedTuple):
-    """A rigid body as drawings give it.
+    """A rigid body as drawings give it."""
 
-    Attributes:
-        mass: [kg].
-        centre: centre of mass in the frame of the parameters [m], shape (3,).
-        inertia: tensor about the centre of mass, axes of that frame [kg m²], shape (3, 3).
-    """
-
-    mass: float
-    centre: Array
-    inertia: Array
+    mass: float  # [kg]
+    centre: Array  # centre of mass in the frame of the parameters [m], shape (3,)
+    inertia: Array  # tensor about the centre of mass, axes of that frame [kg m²], shape (3, 3)
 
 
 def pseudo_inertia(inertial: Array) -> Array:
@@ -127,17 +121,11 @@ _SOME_MASS: Final = 1.0  # kg
 
 
 class ReferenceBodies(NamedTuple):
-    """Reference of n links.
+    """Reference of n links."""
 
-    Attributes:
-        inertial: parameters, consistent with room to spare (n, 10).
-        frames: square roots C of the pseudo-inertias, ``J = C C'`` (n, 4, 4).
-        words: where each comes from (n,).
-    """
-
-    inertial: Array
-    frames: Array
-    words: tuple[str, ...]
+    inertial: Array  # parameters, consistent with room to spare (n, 10)
+    frames: Array  # square roots C of the pseudo-inertias, ``J = C C'`` (n, 4, 4)
+    words: tuple[str, ...]  # where each comes from (n,)
 
 
 def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:

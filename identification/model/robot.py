@@ -34,15 +34,11 @@ class StandardLayout:
     A coupling inertia ``I45`` is the entry (4, 5) of the rotors' inertia matrix in joint
     coordinates: its column is the acceleration of joint 5 in the row of joint 4, and the other
     way round. Motors that turn with several joints make it.
-
-    Attributes:
-        revolute: whether each of the n joints turns.
-        rotor_inertia: whether joints have rotor inertias.
-        pairs: joints (i, j), i < j from 0, that share a coupling inertia.
     """
 
-    revolute: tuple[bool, ...]
-    rotor_inertia: bool
+    revolute: tuple[bool, ...]  # whether each of the n joints turns
+    rotor_inertia: bool  # whether joints have rotor inertias
+    # joints (i, j), i < j from 0, that share a coupling inertia
     pairs: tuple[tuple[int, int], ...] = ()
 
     @property

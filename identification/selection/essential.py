@@ -66,23 +66,15 @@ _BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
 
 
 class EliminationStep(NamedTuple):
-    """The model after one more parameter was removed.
+    """The model after one more parameter was removed."""
 
-    Attributes:
-        removed: the parameter, None for the model it all begins with.
-        left: number of parameters left.
-        spread: largest over smallest relative standard deviation of those left.
-        largest_relative_std: of those left, classical; infinite with one that is not determined.
-        in_sample: relative torque error ||e|| / ||tau|| over all joints on the fitted motion.
-        held_out: the same on the motion that was held out.
-    """
-
-    removed: str | None
-    left: int
-    spread: float
+    removed: str | None  # the parameter, None for the model it all begins with
+    left: int  # number of parameters left
+    spread: float  # largest over smallest relative standard deviation of those left
+    # of those left, classical; infinite with one that is not determined
     largest_relative_std: float
-    in_sample: float
-    held_out: float
+    in_sample: float  # relative torque error ||e|| / ||tau|| over all joints on the fitted motion
+    held_out: float  # the same on the motion that was held out
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,17 +112,11 @@ class Elimination:
 
 
 class BlindChoice(NamedTuple):
-    """Parameters that were chosen inside the fitted motion, tried on the held-out motion.
+    """Parameters that were chosen inside the fitted motion, tried on the held-out motion."""
 
-    Attributes:
-        left: how many were chosen.
-        essential: relative torque error of these on the held-out motion.
-        full: that of all parameters.
-    """
-
-    left: int
-    essential: float
-    full: float
+    left: int  # how many were chosen
+    essential: float  # relative torque error of these on the held-out motion
+    full: float  # that of all parameters
 
 
 class EssentialChoice(NamedTuple):

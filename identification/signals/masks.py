@@ -55,17 +55,13 @@ REVERSAL: Final = "near a velocity reversal"
 
 @dataclass(frozen=True, eq=False)
 class RowMask:
-    """Rows that count, and for those that do not every reason.
+    """Rows that count, and for those that do not every reason."""
 
-    Attributes:
-        reasons: by reason in words, the rows it excludes (m, n); a row may have several.
-        shape: (m, n).
-        moving: rows (m, n) without any reason against them in which the joint moves, away from
-            its reversals: what a model of sliding friction is judged on.
-    """
-
+    # by reason in words, the rows it excludes (m, n); a row may have several
     reasons: Mapping[str, Rows]
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # (m, n)
+    # rows (m, n) without any reason against them in which the joint moves, away from its
+    # reversals: what a model of sliding friction is judged on
     moving: Rows
 
     @property

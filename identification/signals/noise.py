@@ -102,14 +102,10 @@ class RepetitionNoise(NamedTuple):
 
     Measurement noise, the tolerance of a smoothing spline; not friction that drifts, nor motion
     that a servo makes from noise.
-
-    Attributes:
-        position: (n,) [rad² or m²].
-        torque: (n,) [N²·m² or N²], None where no torque was recorded.
     """
 
-    position: Array
-    torque: Array | None
+    position: Array  # (n,) [rad² or m²]
+    torque: Array | None  # (n,) [N²·m² or N²], None where no torque was recorded
 
 
 def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
@@ -184,15 +180,10 @@ _LOW_PASSED: Final = 0.75
 
 
 class Spectrum(NamedTuple):
-    """Amplitude spectral density.
+    """Amplitude spectral density."""
 
-    Attributes:
-        frequency: (f,) [Hz], above zero and evenly spread on a logarithmic axis.
-        density: (f, c) [unit of the signals per √Hz].
-    """
-
-    frequency: Array
-    density: Array
+    frequency: Array  # (f,) [Hz], above zero and evenly spread on a logarithmic axis
+    density: Array  # (f, c) [unit of the signals per √Hz]
 
 
 def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:

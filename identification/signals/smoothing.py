@@ -36,19 +36,12 @@ _KNOT_OF_CUTOFF: Final = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SmoothingSpline:
-    """Quintic spline through c channels on uniform knots.
+    """Quintic spline through c channels on uniform knots."""
 
-    Attributes:
-        start: time of the first knot [s].
-        spacing: knot spacing [s].
-        coefficients: B-spline coefficients (intervals + 5, c).
-        bandwidth: frequency at which the smoothing halves a sine, per channel (c,) [Hz].
-    """
-
-    start: float
-    spacing: float
-    coefficients: Array
-    bandwidth: Array
+    start: float  # time of the first knot [s]
+    spacing: float  # knot spacing [s]
+    coefficients: Array  # B-spline coefficients (intervals + 5, c)
+    bandwidth: Array  # frequency at which the smoothing halves a sine, per channel (c,) [Hz]
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
         """Value or derivative at ``time`` (m,): (m, c), per second to the power ``derivative``.
@@ -247,16 +240,11 @@ _UNEVEN: Final = 0.01  # of a step
 
 @dataclass(frozen=True)
 class LowPassShape:
-    """How a low-pass falls off above its bandwidth.
+    """How a low-pass falls off above its bandwidth."""
 
-    Attributes:
-        order: number of poles, one way.
-        causal: run forwards only, as a controller does it, so that it lags; it then has
-            1/sqrt(2) of a sine at its bandwidth. Otherwise forwards and backwards, without phase:
-            one half.
-    """
-
-    order: int
+    order: int  # number of poles, one way
+    # run forwards only, as a controller does it, so that it lags; it then has 1/sqrt(2) of a sine
+    # at its bandwidth. Otherwise forwards and backwards, without phase: one half
     causal: bool = False
 
     def lag(self, bandwidth: float) -> float:

@@ -39,18 +39,12 @@ Refit = Callable[[Factor], Array]
 
 @dataclass(frozen=True, eq=False)
 class TorqueMeans:
-    """Means of [W | y] over B blocks of time of `BLOCK` seconds, rows at rest included.
+    """Means of [W | y] over B blocks of time of `BLOCK` seconds, rows at rest included."""
 
-    Attributes:
-        rows: (B, n, p + 1), last the torque; NaN where less than half of the block is known of the
-            joint.
-        block: place of each block since the origin of its motion (B,).
-        count: samples that were averaged (B, n).
-    """
-
+    # (B, n, p + 1), last the torque; NaN where less than half of the block is known of the joint
     rows: Array
-    block: NDArray[np.intp]
-    count: NDArray[np.intp]
+    block: NDArray[np.intp]  # place of each block since the origin of its motion (B,)
+    count: NDArray[np.intp]  # samples that were averaged (B, n)
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> TorqueMeans:
@@ -80,18 +74,12 @@ class Calibration:
 
     NaN stands for a joint without any, and for one whose intervals are not known: it moved in one
     stretch of time only.
-
-    Attributes:
-        blocks: held-out means that were compared with their interval.
-        inside: share of them that lie inside.
-        half_width: median of half the interval [N·m or N].
-        white_inside: share inside the intervals that white residuals would have.
     """
 
-    blocks: NDArray[np.intp]
-    inside: Array
-    half_width: Array
-    white_inside: Array
+    blocks: NDArray[np.intp]  # held-out means that were compared with their interval
+    inside: Array  # share of them that lie inside
+    half_width: Array  # median of half the interval [N·m or N]
+    white_inside: Array  # share inside the intervals that white residuals would have
 
     @property
     def overall(self) -> float:

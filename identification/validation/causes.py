@@ -60,29 +60,18 @@ _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
 class Part(NamedTuple):
-    """Some of the blocks of the fitted recordings.
+    """Some of the blocks of the fitted recordings."""
 
-    Attributes:
-        words: what it is: "A.mcap", or "A.mcap from 3 s on".
-        blocks: whether each belongs to it.
-    """
-
-    words: str
-    blocks: tuple[bool, ...]
+    words: str  # what it is: "A.mcap", or "A.mcap from 3 s on"
+    blocks: tuple[bool, ...]  # whether each belongs to it
 
 
 class Fault(NamedTuple):
-    """What may be wrong with recordings.
+    """What may be wrong with recordings."""
 
-    Attributes:
-        kind: of fault.
-        joints: whose; all of them if empty.
-        part: of the recordings that has it; None for all.
-    """
-
-    kind: Kind
-    joints: tuple[int, ...] = ()
-    part: Part | None = None
+    kind: Kind  # of fault
+    joints: tuple[int, ...] = ()  # whose; all of them if empty
+    part: Part | None = None  # of the recordings that has it; None for all
 
     @property
     def discrete(self) -> bool:
@@ -91,34 +80,22 @@ class Fault(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A fault that explains errors.
+    """A fault that explains errors."""
 
-    Attributes:
-        fault: what seems to be wrong.
-        ratio: error of predicted blocks with it mended over that without: geometric mean over the
-            joints.
-        size: how large it is, a delay [s], a factor less one or a mass [kg]; None of others.
-        std: standard deviation of that over the blocks.
-    """
-
-    fault: Fault
+    fault: Fault  # what seems to be wrong
+    # error of predicted blocks with it mended over that without: geometric mean over the joints
     ratio: float
+    # how large it is, a delay [s], a factor less one or a mass [kg]; None of others
     size: float | None
-    std: float
+    std: float  # standard deviation of that over the blocks
 
 
 class Causes(NamedTuple):
-    """Faults that were looked for in what was fitted.
+    """Faults that were looked for in what was fitted."""
 
-    Attributes:
-        found: the one that explains most first.
-        best: of all faults the one with the least error where nothing was found.
-        undecided: joints that might count either way for all that the recordings say.
-    """
-
-    found: tuple[Cause, ...]
-    best: Cause | None
-    undecided: tuple[int, ...]
+    found: tuple[Cause, ...]  # the one that explains most first
+    best: Cause | None  # of all faults the one with the least error where nothing was found
+    undecided: tuple[int, ...]  # joints that might count either way for all that the recordings say
 
 
 def find_causes(
@@ -284,18 +261,12 @@ class _Tables(NamedTuple):
     """Sums over the rows of B blocks of products of columns, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, torques of all joints (n).
-
-    Attributes:
-        gram: (B, n, q, q).
-        rows: that count (B, n).
-        recording: index of the one that each block is of (B,).
-        start: time at which each begins, since its recording began (B,) [s].
     """
 
-    gram: Array
-    rows: NDArray[np.intp]
-    recording: NDArray[np.intp]
-    start: Array
+    gram: Array  # (B, n, q, q)
+    rows: NDArray[np.intp]  # that count (B, n)
+    recording: NDArray[np.intp]  # index of the one that each block is of (B,)
+    start: Array  # time at which each begins, since its recording began (B,) [s]
 
     @property
     def width(self) -> int:

@@ -42,29 +42,21 @@ _NEGATIVE: Final = {
 
 @dataclass(frozen=True, eq=False)
 class ConsistencyCheck:
-    """A consistent estimate beside the unconstrained one, on motion that neither was fitted to.
+    """A consistent estimate beside the unconstrained one, on motion that neither was fitted to."""
 
-    Attributes:
-        consistent: the estimate.
-        held_out: its relative torque error on held-out motion.
-        unconstrained_held_out: that of the estimate without inequalities.
-        held_out_rise: rise of the relative error of each joint (n,), NaN for one without rows.
-        room: smallest second moment of each link over the nominal body's in the same direction
-            (n,): 1 where it is the nominal body, 0 at the edge of what is possible.
-        moved: names of the parameters that were moved by more than three standard deviations.
-        bounds: what the unconstrained estimate asks for and no machine has, in words, that of the
-            joint with the largest rise first.
-        judged_on: "held-out", or "in-sample" where that motion was fitted after all.
-    """
-
-    consistent: ConsistentEstimate
-    held_out: float
-    unconstrained_held_out: float
-    held_out_rise: Array
+    consistent: ConsistentEstimate  # the estimate
+    held_out: float  # its relative torque error on held-out motion
+    unconstrained_held_out: float  # that of the estimate without inequalities
+    held_out_rise: Array  # rise of the relative error of each joint (n,), NaN for one without rows
+    # smallest second moment of each link over the nominal body's in the same direction (n,): 1
+    # where it is the nominal body, 0 at the edge of what is possible
     room: Array
+    # names of the parameters that were moved by more than three standard deviations
     moved: tuple[str, ...]
+    # what the unconstrained estimate asks for and no machine has, in words, that of the joint
+    # with the largest rise first
     bounds: tuple[str, ...]
-    judged_on: str = "held-out"
+    judged_on: str = "held-out"  # "held-out", or "in-sample" where that motion was fitted after all
 
     @property
     def cost(self) -> float:

@@ -63,16 +63,12 @@ class GravityDirection:
 
     An arm on a wall or a tilted base, described as upright, spoils every axis that gravity loads,
     and looks like many wrong torque constants at once.
-
-    Attributes:
-        declared: gravity of the model (3,) [m/s²].
-        best: gravity that fits the training motion best, of the same size (3,) [m/s²].
-        ratio: squared error on unseen motion under `best` over that under `declared`: the
-            geometric mean over the joints that moved.
     """
 
-    declared: Array
-    best: Array
+    declared: Array  # gravity of the model (3,) [m/s²]
+    best: Array  # gravity that fits the training motion best, of the same size (3,) [m/s²]
+    # squared error on unseen motion under `best` over that under `declared`: the geometric mean
+    # over the joints that moved
     ratio: float
 
     @property
@@ -176,19 +172,13 @@ def repetition_noise(
 
 
 class CarriedLoad(NamedTuple):
-    """A body on the last link that the unseen motion asks for and the fitted one does not.
+    """A body on the last link that the unseen motion asks for and the fitted one does not."""
 
-    Attributes:
-        mass: how much more the arm carried there [kg].
-        explained: share of the error on unseen motion, beyond that of the fit, that it explains.
-        axes: number of joints whose error is far beyond that of the fit.
-        half_interval: of the mass, 95 % [kg]; infinite where the body explains little, or nothing
-            determines it.
-    """
-
-    mass: float
+    mass: float  # how much more the arm carried there [kg]
+    # share of the error on unseen motion, beyond that of the fit, that it explains
     explained: float
-    axes: int
+    axes: int  # number of joints whose error is far beyond that of the fit
+    # of the mass, 95 % [kg]; infinite where the body explains little, or nothing determines it
     half_interval: float = np.inf
 
 

@@ -12,22 +12,16 @@ Role = Literal["condition", "cause", "symptom"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Outcome of one check.
+    """Outcome of one check."""
 
-    Attributes:
-        check: what was looked at, in two or three words.
-        level: "wrong" is a reason not to use the model, "doubtful" is worth a word, "information"
-            is neither good nor bad.
-        words: what was found, in a sentence without its full stop.
-        next_step: what to do about it; empty where nothing needs doing.
-        role: a cause explains errors, and its step is always given; a symptom is an error, and its
-            step is a guess that is given only where no cause was found.
-    """
-
-    check: str
+    check: str  # what was looked at, in two or three words
+    # "wrong" is a reason not to use the model, "doubtful" is worth a word, "information" is
+    # neither good nor bad
     level: Level
-    words: str
-    next_step: str = ""
+    words: str  # what was found, in a sentence without its full stop
+    next_step: str = ""  # what to do about it; empty where nothing needs doing
+    # a cause explains errors, and its step is always given; a symptom is an error, and its step
+    # is a guess that is given only where no cause was found
     role: Role = "condition"
 
 

@@ -34,15 +34,11 @@ _OTHER_UNIT: Final = 3.0
 
 
 class NominalScale(NamedTuple):
-    """Measured over nominal torque, n axes.
+    """Measured over nominal torque, n axes."""
 
-    Attributes:
-        scale: (n,), NaN for an axis on which the nominal torque carries too little.
-        tolerance: what is no wonder in it (n,): half a 95 % interval, and what a wrong nominal
-            torque and a friction that its law does not describe may do; infinite likewise.
-    """
-
-    scale: Array
+    scale: Array  # (n,), NaN for an axis on which the nominal torque carries too little
+    # what is no wonder in it (n,): half a 95 % interval, and what a wrong nominal torque and a
+    # friction that its law does not describe may do; infinite likewise
     tolerance: Array
 
     @property
@@ -147,16 +143,12 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
 
 
 class InertiaRatio(NamedTuple):
-    """Controller's over identified inertia of each joint, rotors included, on the joint side.
+    """Controller's over identified inertia of each joint, rotors included, on the joint side."""
 
-    Attributes:
-        ratio: median over the postures (n,); NaN where the controller sends zero, or where the
-            data leave the model's own inertia open.
-        spread: standard deviation over the postures of the ratio (n,), NaN likewise.
-    """
-
+    # median over the postures (n,); NaN where the controller sends zero, or where the data leave
+    # the model's own inertia open
     ratio: Array
-    spread: Array
+    spread: Array  # standard deviation over the postures of the ratio (n,), NaN likewise
 
 
 def inertia_ratio(

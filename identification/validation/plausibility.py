@@ -26,14 +26,10 @@ _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
 
 class Implausible(NamedTuple):
-    """What is wrong with the signs of an estimate, in words.
+    """What is wrong with the signs of an estimate, in words."""
 
-    Attributes:
-        impossible: a wrong sign that the predictions rest on.
-        doubtful: a wrong sign whose whole torque is less than the error of the prediction.
-    """
-
-    impossible: tuple[str, ...]
+    impossible: tuple[str, ...]  # a wrong sign that the predictions rest on
+    # a wrong sign whose whole torque is less than the error of the prediction
     doubtful: tuple[str, ...]
 
 

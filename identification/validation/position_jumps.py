@@ -33,19 +33,12 @@ _NORMAL: Final = 1.4826  # a standard deviation over the median of absolute ones
 
 @dataclass(frozen=True)
 class PositionJump:
-    """One step.
+    """One step."""
 
-    Attributes:
-        recording: its name.
-        joint: name.
-        time: of the sample after the step [s], since the recording began.
-        size: of the step, apart from the motion [rad or m].
-    """
-
-    recording: str
-    joint: str
-    time: float
-    size: float
+    recording: str  # its name
+    joint: str  # name
+    time: float  # of the sample after the step [s], since the recording began
+    size: float  # of the step, apart from the motion [rad or m]
 
 
 def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:

@@ -134,18 +134,13 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
 
 
 class SlowError(NamedTuple):
-    """Slow error of a prediction, and what a change of friction explains of it.
+    """Slow error of a prediction, and what a change of friction explains of it."""
 
-    Attributes:
-        error: what is left.
-        friction_change: share by which each joint's friction torque would have to be larger than
-            predicted (n,), of any size.
-        apart: what would be left if all of that change were subtracted.
-    """
-
-    error: PredictionError
+    error: PredictionError  # what is left
+    # share by which each joint's friction torque would have to be larger than predicted (n,), of
+    # any size
     friction_change: Array
-    apart: PredictionError
+    apart: PredictionError  # what would be left if all of that change were subtracted
 
 
 def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:

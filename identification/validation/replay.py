@@ -35,17 +35,11 @@ _FOUND: Final = 1e-9
 
 
 class Simulated(NamedTuple):
-    """A model with parameters of V arms.
+    """A model with parameters of V arms."""
 
-    Attributes:
-        model: the robot.
-        standard: standard parameters (V, s); every link with a mass, or held by rotors.
-        values: parameters (V, p), of which friction, springs and balancers are read.
-    """
-
-    model: RobotModel
-    standard: Array
-    values: Array
+    model: RobotModel  # the robot
+    standard: Array  # standard parameters (V, s); every link with a mass, or held by rotors
+    values: Array  # parameters (V, p), of which friction, springs and balancers are read
 
 
 def replay(arms: Simulated, samples: Samples) -> Array:
@@ -87,17 +81,11 @@ def replay(arms: Simulated, samples: Samples) -> Array:
 
 
 class SlowResidual(NamedTuple):
-    """Torque that a model leaves out, averaged over a period of the feedback, joint by joint.
+    """Torque that a model leaves out, averaged over a period of the feedback, joint by joint."""
 
-    Attributes:
-        rms: (n,) [N·m or N].
-        constant: (n,) share of its square that a constant torque explains.
-        friction: (n,) what one in the direction of motion explains beyond that.
-    """
-
-    rms: Array
-    constant: Array
-    friction: Array
+    rms: Array  # (n,) [N·m or N]
+    constant: Array  # (n,) share of its square that a constant torque explains
+    friction: Array  # (n,) what one in the direction of motion explains beyond that
 
 
 def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual:

@@ -49,19 +49,12 @@ _MOST_LAGS: Final = 1000
 
 
 class BlockMean(NamedTuple):
-    """Means over blocks of time; every array has the shape of what was averaged.
+    """Means over blocks of time; every array has the shape of what was averaged."""
 
-    Attributes:
-        mean: NaN with fewer than `FEWEST_BLOCKS` blocks.
-        std: standard error, likewise.
-        rows: samples.
-        blocks: blocks with at least one sample.
-    """
-
-    mean: Array
-    std: Array
-    rows: Array
-    blocks: Indices
+    mean: Array  # NaN with fewer than `FEWEST_BLOCKS` blocks
+    std: Array  # standard error, likewise
+    rows: Array  # samples
+    blocks: Indices  # blocks with at least one sample
 
 
 def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
@@ -90,15 +83,11 @@ def block_index(samples: Samples) -> Indices:
 
 
 class Profile(NamedTuple):
-    """Mean residual of n joints in K bins of their own speed or position.
+    """Mean residual of n joints in K bins of their own speed or position."""
 
-    Attributes:
-        edges: of the bins, (n, K + 1) [rad/s, m/s, rad or m].
-        bins: mean and standard error of the residual (n, K) [N·m or N], NaN in a bin that too
-            few blocks of time have seen.
-    """
-
-    edges: Array
+    edges: Array  # of the bins, (n, K + 1) [rad/s, m/s, rad or m]
+    # mean and standard error of the residual (n, K) [N·m or N], NaN in a bin that too few blocks
+    # of time have seen
     bins: BlockMean
 
     @property
@@ -165,13 +154,9 @@ def _profile(
 
 
 class Ripple(NamedTuple):
-    """Residual of n joints that follows the angle of their motors.
+    """Residual of n joints that follows the angle of their motors."""
 
-    Attributes:
-        parts: mean cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N].
-    """
-
-    parts: BlockMean
+    parts: BlockMean  # mean cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N]
 
     @property
     def amplitude(self) -> Array:
@@ -210,19 +195,12 @@ def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> 
 
 
 class FrictionDrift(NamedTuple):
-    """By how much friction was higher than estimated, piece by piece in the order of recording.
+    """By how much friction was higher than estimated, piece by piece in the order of recording."""
 
-    Attributes:
-        share: (P, n), 0.05 for friction 5 % higher; NaN where a joint did not move.
-        change: of a straight line through the pieces from the first to the last (n,).
-        change_std: its standard error from the scatter about the line (n,).
-        freedom: degrees of freedom of that scatter.
-    """
-
-    share: Array
-    change: Array
-    change_std: Array
-    freedom: int
+    share: Array  # (P, n), 0.05 for friction 5 % higher; NaN where a joint did not move
+    change: Array  # of a straight line through the pieces from the first to the last (n,)
+    change_std: Array  # its standard error from the scatter about the line (n,)
+    freedom: int  # degrees of freedom of that scatter
 
     @property
     def significant(self) -> Rows:
@@ -265,17 +243,11 @@ def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
 
 
 class Outliers(NamedTuple):
-    """Samples of which the residual is beyond six robust deviations of its joint.
+    """Samples of which the residual is beyond six robust deviations of its joint."""
 
-    Attributes:
-        share: of the usable samples of each joint (n,).
-        power: their share of the squared residual (n,).
-        without: prediction error of all other samples.
-    """
-
-    share: Array
-    power: Array
-    without: PredictionError
+    share: Array  # of the usable samples of each joint (n,)
+    power: Array  # their share of the squared residual (n,)
+    without: PredictionError  # prediction error of all other samples
 
 
 def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
@@ -296,17 +268,11 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
 
 
 class Autocorrelation(NamedTuple):
-    """Autocorrelation of the residual of n joints at L + 1 lags.
+    """Autocorrelation of the residual of n joints at L + 1 lags."""
 
-    Attributes:
-        lag: (L + 1,) [s], from zero.
-        correlation: (L + 1, n), one at lag zero; NaN for a joint without rows.
-        rows: samples that were correlated (n,).
-    """
-
-    lag: Array
-    correlation: Array
-    rows: Indices
+    lag: Array  # (L + 1,) [s], from zero
+    correlation: Array  # (L + 1, n), one at lag zero; NaN for a joint without rows
+    rows: Indices  # samples that were correlated (n,)
 
     @property
     def time(self) -> Array:
@@ -357,29 +323,19 @@ def _products(values: Array, lags: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ResidualChecks:
-    """What the torque residual of all recordings follows.
+    """What the torque residual of all recordings follows."""
 
-    Attributes:
-        torque_rms: measured torque of the rows that count (n,) [N·m or N].
-        rms: residual of those rows (n,) [N·m or N].
-        colour: correlation in time, of what was fitted.
-        speed: mean residual against the joint's own speed.
-        position: against the joint's own position.
-        ripple: against the angle of the joint's motor; None where no gear ratio is known.
-        drift: change of friction over the fitted recordings; None where they are too few.
-        friction_share: friction torque of the fitted recordings over the measured one (n,).
-        outliers: of the unseen motion, or of the fitted one where there is no other.
-    """
-
-    torque_rms: Array
-    rms: Array
-    colour: Autocorrelation
-    speed: Profile
-    position: Profile
+    torque_rms: Array  # measured torque of the rows that count (n,) [N·m or N]
+    rms: Array  # residual of those rows (n,) [N·m or N]
+    colour: Autocorrelation  # correlation in time, of what was fitted
+    speed: Profile  # mean residual against the joint's own speed
+    position: Profile  # against the joint's own position
+    # against the angle of the joint's motor; None where no gear ratio is known
     ripple: Ripple | None
+    # change of friction over the fitted recordings; None where they are too few
     drift: FrictionDrift | None
-    friction_share: Array
-    outliers: Outliers
+    friction_share: Array  # friction torque of the fitted recordings over the measured one (n,)
+    outliers: Outliers  # of the unseen motion, or of the fitted one where there is no other
 
     def share(self, size: Array) -> Array:
         """A residual (n,) as a share of the joint's torque; zero for a joint without rows."""

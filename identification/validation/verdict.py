@@ -319,20 +319,13 @@ class _Row(NamedTuple):
 
     In words and step {name} is a fact, {joints} the joints of the condition, and <...> these joints
     with what stands inside, of each joint.
-
-    Attributes:
-        check: what was looked at.
-        levels: name of a condition by level.
-        words: template.
-        step: template.
-        role: of the finding.
     """
 
-    check: str
-    levels: Mapping[Level, str]
-    words: str
-    step: str = ""
-    role: Role = "condition"
+    check: str  # what was looked at
+    levels: Mapping[Level, str]  # name of a condition by level
+    words: str  # template
+    step: str = ""  # template
+    role: Role = "condition"  # of the finding
 
     def findings(self, facts: Facts, names: Sequence[str]) -> Iterator[Finding]:
         """Findings of the conditions that are known and hold."""

@@ -115,46 +115,28 @@ _MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # pinocchio'
 
 
 class Hull(NamedTuple):
-    """A cylinder swollen by a ball, about a shape; a sphere and a capsule are such themselves.
+    """A cylinder swollen by a ball, about a shape; a sphere and a capsule are such themselves."""
 
-    Attributes:
-        centre: middle of the cylinder, in the frame of the body's joint (3,) [m].
-        axis: unit vector along it (3,).
-        half_length, radius: of the cylinder [m].
-        ball: radius of the ball [m].
-        exact: whether this is the shape itself, not only something around it.
-    """
-
-    centre: Array
-    axis: Array
-    half_length: float
-    radius: float
-    ball: float
-    exact: bool
+    centre: Array  # middle of the cylinder, in the frame of the body's joint (3,) [m]
+    axis: Array  # unit vector along it (3,)
+    half_length: float  # of the cylinder [m]
+    radius: float  # of the cylinder [m]
+    ball: float  # radius of the ball [m]
+    exact: bool  # whether this is the shape itself, not only something around it
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A convex shape that moves with a link, or an obstacle.
+    """A convex shape that moves with a link, or an obstacle."""
 
-    Attributes:
-        name: of the link or obstacle.
-        shape_name: of this shape; the obstacle's own.
-        joint: the joint that moves it, -1 for what stands still.
-        shape: its geometry.
-        pose: in the frame of that joint.
-        hull: what holds it.
-        normal: outward normal of a half-space (3,), None for every other shape.
-        half_sides: of a box along the axes of the base (3,) [m], None for every other shape.
-    """
-
-    name: str
-    shape_name: str
-    joint: int
-    shape: coal.CollisionGeometry
-    pose: coal.Transform3s
-    hull: Hull
-    normal: Array | None = None
+    name: str  # of the link or obstacle
+    shape_name: str  # of this shape; the obstacle's own
+    joint: int  # the joint that moves it, -1 for what stands still
+    shape: coal.CollisionGeometry  # its geometry
+    pose: coal.Transform3s  # in the frame of that joint
+    hull: Hull  # what holds it
+    normal: Array | None = None  # outward normal of a half-space (3,), None for every other shape
+    # of a box along the axes of the base (3,) [m], None for every other shape
     half_sides: Array | None = None
 
 

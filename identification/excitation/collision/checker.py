@@ -163,17 +163,11 @@ class CollisionChecker(Scene):
 
 
 class Touch(NamedTuple):
-    """A pair of bodies closer than the margin at a sample.
+    """A pair of bodies closer than the margin at a sample."""
 
-    Attributes:
-        pair: of the scene.
-        sample: of the motion that it was looked for in.
-        distance: signed [m].
-    """
-
-    pair: int
-    sample: int
-    distance: float
+    pair: int  # of the scene
+    sample: int  # of the motion that it was looked for in
+    distance: float  # signed [m]
 
 
 class Near(NamedTuple):

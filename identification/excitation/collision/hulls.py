@@ -32,15 +32,10 @@ class Frames(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """Hulls of b bodies at m samples.
+    """Hulls of b bodies at m samples."""
 
-    Attributes:
-        centre: (3, b, m) [m].
-        axis: unit vectors (3, b, m).
-    """
-
-    centre: Array
-    axis: Array
+    centre: Array  # (3, b, m) [m]
+    axis: Array  # unit vectors (3, b, m)
 
 
 def frames(chain: Chain, q: Array) -> Frames:

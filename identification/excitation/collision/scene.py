@@ -64,19 +64,12 @@ class BuiltIn(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where everything is at m samples.
+    """Where everything is at m samples."""
 
-    Attributes:
-        q: the postures (m, n).
-        frames: of base and links.
-        bodies: their hulls.
-        gone: (b, m) how far each body has gone until there at most, in straight lines [m].
-    """
-
-    q: Array
-    frames: Frames
-    bodies: Bodies
-    gone: Array
+    q: Array  # the postures (m, n)
+    frames: Frames  # of base and links
+    bodies: Bodies  # their hulls
+    gone: Array  # (b, m) how far each body has gone until there at most, in straight lines [m]
 
 
 class Scene:

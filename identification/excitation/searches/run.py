@@ -301,17 +301,11 @@ class Evolution:
 
 @dataclass(frozen=True)
 class Goal:
-    """Which of two motions is the better one, or that all measures count (method "front").
+    """Which of two motions is the better one, or that all measures count (method "front")."""
 
-    Attributes:
-        settings: of the search.
-        p: number of parameters that are judged.
-        scale: units of the measures; None where it plays no part.
-    """
-
-    settings: SearchSettings
-    p: int
-    scale: Scale | None
+    settings: SearchSettings  # of the search
+    p: int  # number of parameters that are judged
+    scale: Scale | None  # units of the measures; None where it plays no part
 
     @property
     def single(self) -> bool:
