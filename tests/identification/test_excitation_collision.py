@@ -109,26 +109,6 @@ def test_shapes_that_were_read_are_let_go_of(arm):
     assert living() == before
 
 
-def test_clear_postures_are_those_where_pinocchio_finds_no_distance_below_zero(arm):
-    shapes = pin.buildGeomFromUrdfString(arm, urdf_text(), pin.GeometryType.COLLISION)
-    apart = [
-        (a, b)
-        for a, b in combinations(range(shapes.ngeoms), 2)
-        if abs(shapes.geometryObjects[a].parentJoint - shapes.geometryObjects[b].parentJoint) > 1
-    ]
-    for a, b in apart:
-        shapes.addCollisionPair(pin.CollisionPair(a, b))
-    data, places = arm.createData(), pin.GeometryData(shapes)
-    q = postures(arm, 2, 300)
-    expected = []
-    for row in q:
-        pin.computeDistances(arm, data, shapes, places, row)
-        expected.append(min(r.min_distance for r in places.distanceResults) >= 0.0)
-    clear = CollisionChecker(urdf_text(), NOWHERE).clear(q)
-    np.testing.assert_array_equal(clear, expected)
-    assert 0.1 < np.mean(clear) < 0.95
-
-
 @pytest.fixture(scope="module")
 def brute(arm):
     """The least distance of all that may meet, floor included, posture by posture."""
@@ -160,6 +140,9 @@ def test_the_deepest_contact_is_that_of_looking_at_every_sample(arm, brute, seed
     q = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(ends)])
     distances = brute(q)
     contact = checkers(margin).deepest_contact(q)
+    certain = np.abs(distances - margin) > 1e-5
+    clear = checkers(margin).clear(q)
+    np.testing.assert_array_equal(clear[certain], (distances >= margin)[certain])
     if distances.min() >= margin:
         assert contact is None
     else:
@@ -389,27 +372,25 @@ def test_every_pair_that_can_meet_is_looked_at():
     for name in links[1:]:
         assert frozenset((name, "floor")) in pairs
     assert frozenset(("base_link", "floor")) not in pairs
+    for wider in (0.2, 0.5):
+        assert checkers(wider).pairs == checkers(0.05).pairs
 
 
 def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
     assert ("link_0", "link_2") not in wrist.pairs
-    # Four joints between base and tip: always touching is a fault, and is reported as one.
-    far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
-    contact = far.deepest_contact(np.zeros((1, 4)))
-    assert contact is not None
-    assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
-    assert contact.distance < 0.0
-
-
-def test_what_is_built_in_is_named_shape_by_shape():
-    wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
     (pair,) = wrist.built_in
     assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
     assert pair.nearest <= pair.farthest < 0.0
     assert "link_0_0 and link_2_0" in str(wrist.exceptions)
     assert checkers(0.05).built_in == ()
     assert checkers(0.05).exceptions is None
+    # Four joints between base and tip: always touching is a fault, and is reported as one.
+    far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
+    contact = far.deepest_contact(np.zeros((1, 4)))
+    assert contact is not None
+    assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
+    assert contact.distance < 0.0
 
 
 @pytest.mark.parametrize("limit", ['lower="-2" upper="2"', "", 'lower="-0.02" upper="0.02"'])
@@ -466,7 +447,9 @@ def test_a_first_link_that_swings_towards_the_floor_is_checked():
         assert checker.built_in == ()
 
 
-def test_limits_of_another_arm_are_refused():
+def test_limits_and_postures_of_another_arm_are_refused():
+    with pytest.raises(ShapeError):
+        checkers(0.05).deepest_contact(np.zeros((3, 5)))
     with pytest.raises(ShapeError, match="limits"):
         CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
 
@@ -480,29 +463,34 @@ def test_postures_that_are_no_numbers_are_refused(value):
             look(q)
 
 
-@pytest.mark.parametrize("ramp", [0.0, 1e-9, 1e-5, 1e-3, 0.1, 2.5])
-@pytest.mark.parametrize(("size", "pace"), [(1e-9, 1e5), (1e-3, 30.0), (0.2, 3.0), (3.0, 50.0)])
-def test_the_most_violent_sines_are_told_in_no_time(ramp, size, pace):
-    motion = FourierSeries(
+def violent_sines(size, pace, ramp):
+    return FourierSeries(
         offset=np.array([0.0, -1.2, 2.0, 0.0, 0.0, 0.0]),
         amplitude=np.full((6, 2), size),
         frequency=np.array([[pace, 1.3 * pace]] * 6),
         length=5.0,
         ramp=ramp,
     )
-    began = time.process_time()
-    checkers(0.05).deepest_along(motion, sampled(motion))
-    assert time.process_time() - began < 3.0
 
 
-@pytest.mark.parametrize("jerk", [1e3, 1e6, 1e9, 1e12])
-def test_the_most_violent_pieces_are_told_in_no_time(jerk):
+def violent_pieces(jerk):
     random = np.random.default_rng(3)
-    knots = np.linspace(0.0, 5.0, 501)
-    table = np.array(
-        [random.uniform(-1.0, 1.0, (500, 4)) * [1.0, 3.0, 9.0, jerk] for _ in range(6)]
-    )
-    motion = PiecewiseCubic(tuple(knots for _ in range(6)), tuple(table))
+    scale = [1.0, 3.0, 9.0, jerk]
+    table = np.array([random.uniform(-1.0, 1.0, (500, 4)) * scale for _ in range(6)])
+    return PiecewiseCubic(tuple(np.linspace(0.0, 5.0, 501) for _ in range(6)), tuple(table))
+
+
+SIZES = [(1e-9, 1e5), (1e-3, 30.0), (0.2, 3.0), (3.0, 50.0)]
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        *(violent_sines(*own, ramp) for own in SIZES for ramp in (0.0, 1e-9, 1e-3, 2.5)),
+        *map(violent_pieces, (1e3, 1e6, 1e9, 1e12)),
+    ],
+)
+def test_the_most_violent_motions_are_looked_at_in_no_time(motion):
     began = time.process_time()
     checkers(0.05).deepest_along(motion, sampled(motion))
     assert time.process_time() - began < 3.0
@@ -517,11 +505,6 @@ def test_a_long_motion_is_looked_at_part_by_part_and_not_otherwise(monkeypatch):
         assert (again is None) == (contact is None)
         if contact is not None:
             assert again.distance == pytest.approx(contact.distance, abs=0.006)
-
-
-def test_a_wider_margin_checks_no_fewer_pairs():
-    pairs = [CollisionChecker(urdf_text(), Workspace(margin=m)).pairs for m in (0.05, 0.2, 0.5)]
-    assert pairs[0] == pairs[1] == pairs[2]
 
 
 def test_a_mesh_counts_as_its_convex_hull(tmp_path):
@@ -564,11 +547,6 @@ def test_a_description_without_usable_shapes_is_refused(shape):
         CollisionChecker(urdf, Workspace())
 
 
-def test_postures_of_another_arm_are_refused():
-    with pytest.raises(ShapeError):
-        checkers(0.05).deepest_contact(np.zeros((3, 5)))
-
-
 @pytest.mark.parametrize(
     "build",
     [
@@ -585,8 +563,8 @@ def test_obstacles_that_mean_nothing_are_refused(build):
         build()
 
 
-def test_base_and_shoulder_of_a_ur5_are_not_checked_against_the_floor() -> None:
-    """Base and shoulder stand there in every posture; what can reach the floor is checked."""
+def test_the_floor_under_a_ur5_is_checked_but_for_what_its_mounting_leaves() -> None:
+    """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
     path = urdf_path("ur5_robot.urdf")
     checker = CollisionChecker(
         path.read_text(), Workspace(floor=0.0), mesh_folders=(str(path.parents[4]),)
@@ -594,14 +572,6 @@ def test_base_and_shoulder_of_a_ur5_are_not_checked_against_the_floor() -> None:
     near = {first for first, second in checker.pairs if second == "floor"}
     assert not near & {"base_link", "shoulder_link"}
     assert {"upper_arm_link", "forearm_link", "wrist_3_link"} <= near
-
-
-def test_the_upper_arm_of_a_ur5_on_the_floor_keeps_what_its_mounting_leaves() -> None:
-    """Its shoulder turns 3 cm above the floor, less than the margin, in every posture."""
-    path = urdf_path("ur5_robot.urdf")
-    checker = CollisionChecker(
-        path.read_text(), Workspace(floor=0.0), mesh_folders=(str(path.parents[4]),)
-    )
     upright = np.array([0.0, -1.57, 0.0, -1.57, 0.0, 0.0])
     level = np.array([0.0, -0.05, 0.0, -1.57, 0.0, 0.0])
     bowed = np.array([0.0, 0.1, -0.6, -1.57, 0.0, 0.0])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.metadata
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +10,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from hil.importers import Robot, import_rosbag2
-from hil.recordings import open_recording
 from identification.errors import IdentificationError
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
-from identification.model.friction import FrictionLaw
-from identification.model.robot import RobotModel
 from identification.signals.samples import Samples, prepare
 from identification.validation.prediction import prediction_error
 from tests.identification.two_link import (
@@ -31,6 +26,7 @@ from tests.identification.two_link import (
     recording,
     truth,
 )
+from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 LOSSES = [Huber(), Tukey()]
@@ -221,16 +217,8 @@ def test_no_rows_are_an_error() -> None:
         robust_estimate(MODEL, [empty])
 
 
-def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(
-    shared_data: Path, tmp_path: Path
-) -> None:
-    folder = shared_data / "ur10_unisa"
-    files = importlib.metadata.files("example-robot-data") or ()
-    urdf = next(Path(str(f.locate())) for f in files if f.name == "ur10_robot.urdf")
-    bag = folder / "ur10_exciting_trajectory.db3"
-    import_rosbag2(bag, tmp_path / "ur10.mcap", robot=Robot.from_urdf(urdf))
-    recorded = open_recording(tmp_path / "ur10.mcap")
-    model = RobotModel.from_urdf(urdf.read_text(), friction=FrictionLaw(offset=True))
+def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(shared_data: Path) -> None:
+    model, recorded = ur10(shared_data)
     cut = round(0.7 * recorded.n_samples)
     first = prepare(recorded.between(0, cut), model)
     last = prepare(recorded.between(cut, recorded.n_samples), model)
