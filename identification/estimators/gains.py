@@ -40,21 +40,13 @@ _CONVERGED: Final = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of n motors.
+    """Gains of n motors."""
 
-    Attributes:
-        motor_names: (n,).
-        values: torque per current (n,) [N·m/A or N/A], NaN where not determined.
-        std: standard deviations, cluster-robust (n,); infinite likewise.
-        reasons: per motor why its gain is not determined, None where it is.
-        interval_factor: standard deviations in half a 95 % interval.
-    """
-
-    motor_names: tuple[str, ...]
-    values: Array
-    std: Array
-    reasons: tuple[str | None, ...]
-    interval_factor: float
+    motor_names: tuple[str, ...]  #: (n,)
+    values: Array  #: torque per current (n,) [N·m/A or N/A], NaN where not determined
+    std: Array  #: standard deviations, cluster-robust (n,); infinite likewise
+    reasons: tuple[str | None, ...]  #: per motor why its gain is not determined, None where it is
+    interval_factor: float  #: standard deviations in half a 95 % interval
 
     @property
     def determined(self) -> NDArray[np.bool_]:

@@ -163,18 +163,12 @@ _PARTICIPATION: Final = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class InstrumentalEstimate:
-    """Estimate with instrumental variables, beside that of least squares on the same rows.
+    """Estimate with instrumental variables, beside that of least squares on the same rows."""
 
-    Attributes:
-        estimate: by instrumental variables, with cluster-robust covariance.
-        least_squares: of the same rows and weights, likewise.
-        weights: per joint (n,).
-        weak: names of parameters whose instrument is too weak for the estimate to be trusted.
-    """
-
-    estimate: Estimate
-    least_squares: Estimate
-    weights: Array
+    estimate: Estimate  #: by instrumental variables, with cluster-robust covariance
+    least_squares: Estimate  #: of the same rows and weights, likewise
+    weights: Array  #: per joint (n,)
+    #: names of parameters whose instrument is too weak for the estimate to be trusted
     weak: tuple[str, ...]
 
 

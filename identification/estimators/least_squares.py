@@ -80,22 +80,15 @@ Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
 
 @dataclass(frozen=True, eq=False)
 class RepeatedEstimate:
-    """Estimates over R repetitions of one motion.
+    """Estimates over R repetitions of one motion."""
 
-    Attributes:
-        pooled: from all samples at once. This is the result. Its covariance is clustered by
-            time of the motion, so that an error of the model that repeats is not averaged away.
-        repetitions: from each alone, with the covariance of its own blocks.
-        phase: sum of all factors, by time of the motion.
-        factor: the same without regard to time.
-        classical_std: of weighted least squares on all samples if residuals were white (p,).
-    """
-
+    #: from all samples at once. This is the result. Its covariance is clustered by time of the
+    #: motion, so that an error of the model that repeats is not averaged away
     pooled: Estimate
-    repetitions: tuple[Estimate, ...]
-    phase: PhaseFactor
-    factor: Factor
-    classical_std: Array
+    repetitions: tuple[Estimate, ...]  #: from each alone, with the covariance of its own blocks
+    phase: PhaseFactor  #: sum of all factors, by time of the motion
+    factor: Factor  #: the same without regard to time
+    classical_std: Array  #: of weighted least squares on all samples if residuals were white (p,)
 
     @classmethod
     def of(

@@ -37,12 +37,9 @@ class Huber(Loss):
 
     Has one minimum, whatever the start. An outlier counts as much as `tuning` deviations,
     however far out it is; many of one sign still shift the result a little.
-
-    Attributes:
-        tuning: 1.345 keeps 95 % of the efficiency on Gaussian noise.
     """
 
-    tuning: float = 1.345
+    tuning: float = 1.345  #: 1.345 keeps 95 % of the efficiency on Gaussian noise
 
     @property
     def name(self) -> str:
@@ -63,12 +60,9 @@ class Tukey(Loss):
     """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974).
 
     Has more than one minimum and must be started close to the right one, from Huber's.
-
-    Attributes:
-        tuning: 4.685 keeps 95 % of the efficiency on Gaussian noise.
     """
 
-    tuning: float = 4.685
+    tuning: float = 4.685  #: 4.685 keeps 95 % of the efficiency on Gaussian noise
 
     @property
     def name(self) -> str:

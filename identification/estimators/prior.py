@@ -43,17 +43,11 @@ _FEWEST_ROWS: Final = 2  # per parameter: fewer do not tell noise from fit
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """What is believed before the data: ``root @ (pi - mean)`` is standard Gaussian.
+    """What is believed before the data: ``root @ (pi - mean)`` is standard Gaussian."""
 
-    Attributes:
-        mean: (p,).
-        root: (k, p); directions that it does not see are flat: nothing is believed of them.
-        words: where it comes from.
-    """
-
-    mean: Array
-    root: Array
-    words: str
+    mean: Array  #: (p,)
+    root: Array  #: (k, p); directions that it does not see are flat: nothing is believed of them
+    words: str  #: where it comes from
 
     @classmethod
     def of_combinations(
@@ -97,21 +91,13 @@ class GaussianPrior:
 
 @dataclass(frozen=True, eq=False)
 class PosteriorEstimate:
-    """Estimate from prior and data, and who said what.
+    """Estimate from prior and data, and who said what."""
 
-    Attributes:
-        estimate: its covariance is the posterior's.
-        prior_mean: (p,).
-        prior_std: (p,), infinite where nothing was believed.
-        words: where the prior comes from.
-        design_effect: by how much coloured residuals make the variance larger than white ones.
-    """
-
-    estimate: Estimate
-    prior_mean: Array
-    prior_std: Array
-    words: str
-    design_effect: float
+    estimate: Estimate  #: its covariance is the posterior's
+    prior_mean: Array  #: (p,)
+    prior_std: Array  #: (p,), infinite where nothing was believed
+    words: str  #: where the prior comes from
+    design_effect: float  #: by how much coloured residuals make the variance larger than white ones
 
     @property
     def ratio(self) -> Array:

@@ -48,19 +48,14 @@ _SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
 
 @dataclass(frozen=True, eq=False)
 class RobustEstimate:
-    """A robust fit and what it made of the rows.
+    """A robust fit and what it made of the rows."""
 
-    Attributes:
-        estimate: values and cluster-robust covariance; `noise_std` is the robust scale per joint.
-        outlying: share of a joint's rows more than `OUTLYING` scales off (n,), NaN without rows.
-        iterations: passes over the samples.
-        converged: whether the last one changed nothing more.
-    """
-
+    #: values and cluster-robust covariance; `noise_std` is the robust scale per joint
     estimate: Estimate
+    #: share of a joint's rows more than `OUTLYING` scales off (n,), NaN without rows
     outlying: Array
-    iterations: int
-    converged: bool
+    iterations: int  #: passes over the samples
+    converged: bool  #: whether the last one changed nothing more
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:

@@ -60,26 +60,17 @@ class CurrentModel:
 
     Torque of the joints and current of the motors belong together as
     ``tau = motor_from_joint^T (torque_constant * current)``.
-
-    Attributes:
-        model: the robot.
-        values: (p,) its nominal parameters.
-        motor_from_joint: (n, n) motor rad per joint rad; gears and coupling.
-        torque_constant: (n,) on the motor side [N·m/A].
-        current_limit: (n,) largest |current| of each motor [A].
-        uncertainty: share by which the real torques may be larger than the nominal ones.
-        torque_limit: (n,) largest |torque| of each joint [N·m], where one is set besides.
-        usable: share of the current limits that a motion may use.
     """
 
-    model: RobotModel
-    values: Array
-    motor_from_joint: Array
-    torque_constant: Array
-    current_limit: Array
-    uncertainty: float = 0.0
+    model: RobotModel  #: the robot
+    values: Array  #: (p,) its nominal parameters
+    motor_from_joint: Array  #: (n, n) motor rad per joint rad; gears and coupling
+    torque_constant: Array  #: (n,) on the motor side [N·m/A]
+    current_limit: Array  #: (n,) largest |current| of each motor [A]
+    uncertainty: float = 0.0  #: share by which the real torques may be larger than the nominal ones
+    #: (n,) largest |torque| of each joint [N·m], where one is set besides
     torque_limit: Array | None = None
-    usable: float = 1.0
+    usable: float = 1.0  #: share of the current limits that a motion may use
 
     def torque(self, motion: Motion) -> Array:
         """Return the joint torques (m, n) [N·m] that a motion needs at most, payload included."""
@@ -138,21 +129,17 @@ class Constraints:
 
     Everything is looked at whatever else is broken: only then do the excesses of two motions
     compare, and a motion that is mended in one respect is not found broken in another.
-
-    Attributes:
-        limits: joint limits, respected at every instant.
-        min_duration, max_duration: of the motion [s].
-        checker: floor, walls, boxes and the arm itself; None to look at none of them.
-        currents: nominal torques and currents with their uncertainty; None to look at neither.
-        at_rest: whether a motion must begin and end at rest. A bare series of sines does not: it
-            can be designed and looked at, and cannot be run.
     """
 
-    limits: JointLimits
-    min_duration: float = 0.0
-    max_duration: float = 20.0
+    limits: JointLimits  #: joint limits, respected at every instant
+    min_duration: float = 0.0  #: of the motion [s]
+    max_duration: float = 20.0  #: of the motion [s]
+    #: floor, walls, boxes and the arm itself; None to look at none of them
     checker: CollisionChecker | None = None
+    #: nominal torques and currents with their uncertainty; None to look at neither
     currents: CurrentModel | None = None
+    #: whether a motion must begin and end at rest. A bare series of sines does not: it can be
+    #: designed and looked at, and cannot be run
     at_rest: bool = True
 
     def violations(

@@ -142,25 +142,17 @@ def condition_number(gram: Array, *, scaled: bool) -> float:
 
 @dataclass(frozen=True)
 class Criteria:
-    """How well a motion excites the parameters (paper, eqs. 5, 7 and 9).
+    """How well a motion excites the parameters (paper, eqs. 5, 7 and 9)."""
 
-    Attributes:
-        log10_det: log10 of det(Phi^T Phi) / N^p; depends on units.
-        coupling_index: I_c, the smaller the better.
-        fitness: eq. 7 as printed, with the paper's weights 0.7 and 0.3.
-        n_samples: N of eq. 9, the time samples of the motion. Of a motion that adds to earlier
-            archives it is theirs alone, counted every 8 ms: what divides the determinant must not
-            depend on the motion then (see :class:`~identification.excitation.Objective`).
-        condition: condition number of Phi; depends on units.
-        scaled_condition: the same with columns of unit length. Both are None where nobody
-            computed them.
-    """
-
-    log10_det: float
-    coupling_index: float
-    fitness: float
+    log10_det: float  #: log10 of det(Phi^T Phi) / N^p; depends on units
+    coupling_index: float  #: I_c, the smaller the better
+    fitness: float  #: eq. 7 as printed, with the paper's weights 0.7 and 0.3
+    #: N of eq. 9, the time samples of the motion. Of a motion that adds to earlier archives it is
+    #: theirs alone, counted every 8 ms: what divides the determinant must not depend on the
+    #: motion then (see :class:`~identification.excitation.Objective`)
     n_samples: int
-    condition: float | None = None
+    condition: float | None = None  #: condition number of Phi; depends on units
+    #: the same with columns of unit length. Both are None where nobody computed them
     scaled_condition: float | None = None
 
     @property

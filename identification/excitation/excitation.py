@@ -22,19 +22,12 @@ _FIRST_METHOD: Final = "random"
 
 @dataclass(frozen=True, eq=False)
 class DrawnMotion:
-    """A motion, and what it was planned from.
+    """A motion, and what it was planned from."""
 
-    Attributes:
-        via_points: (n_points, n) [rad], home at both ends included.
-        speed: (n,) share of each joint's velocity limit.
-        fly: how far corners are rounded, 0 to 1.
-        trajectory: the motion planned from these.
-    """
-
-    via_points: Array
-    speed: Array
-    fly: float
-    trajectory: PiecewiseCubic
+    via_points: Array  #: (n_points, n) [rad], home at both ends included
+    speed: Array  #: (n,) share of each joint's velocity limit
+    fly: float  #: how far corners are rounded, 0 to 1
+    trajectory: PiecewiseCubic  #: the motion planned from these
 
     @property
     def moves(self) -> tuple[Move, ...]:
@@ -50,29 +43,19 @@ def moves_through(via_points: Array, speed: Array, fly: float) -> tuple[Move, ..
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """The best motion of a search, and how it was found.
+    """The best motion of a search, and how it was found."""
 
-    Attributes:
-        trajectory: the motion; pieces planned through via points, or a sum of sines.
-        criteria: how good it is.
-        method: name of the search that found it.
-        seed: of the search.
-        tried: how many motions were looked at.
-        rejected: how many of them were not feasible, by kind of constraint.
-        via_points: (n_points, n) [rad], both ends included; None for sines, as the next two.
-        speed: (n,) share of each joint's velocity limit.
-        fly: how far corners are rounded, 0 to 1.
-    """
-
+    #: the motion; pieces planned through via points, or a sum of sines
     trajectory: PiecewiseCubic | FourierSeries
-    criteria: Criteria
-    method: str
-    seed: int
-    tried: int
-    rejected: Mapping[str, int]
+    criteria: Criteria  #: how good it is
+    method: str  #: name of the search that found it
+    seed: int  #: of the search
+    tried: int  #: how many motions were looked at
+    rejected: Mapping[str, int]  #: how many of them were not feasible, by kind of constraint
+    #: (n_points, n) [rad], both ends included; None for sines, as the next two
     via_points: Array | None = None
-    speed: Array | None = None
-    fly: float | None = None
+    speed: Array | None = None  #: (n,) share of each joint's velocity limit
+    fly: float | None = None  #: how far corners are rounded, 0 to 1
 
     @property
     def moves(self) -> tuple[Move, ...] | None:

@@ -73,25 +73,21 @@ class ViaPointGenome:
 
     Genes are the via points' coordinates, point by point, then one speed for each joint: K n + n
     numbers.
-
-    Attributes:
-        limits: joint limits of the plan; via points reach from one end of a range to the other.
-        n_via: K, without home.
-        fly: how far corners are rounded, 0 to 1.
-        slowest: share of a joint's velocity limit, above 0, that gene 0 means; gene 1 means 1.
-        range_share: share of each joint's range, about its middle, that via points lie in.
-        home: posture (n,) [rad] within the limits where the motion begins and ends; None: it leads
-            from the first via point to the last.
-        checker: clearance that the straight ways between the points of a first population keep;
-            None: its points are uniform in the range, as the paper's.
     """
 
+    #: joint limits of the plan; via points reach from one end of a range to the other
     limits: JointLimits
-    n_via: int
-    fly: float = 0.5
+    n_via: int  #: K, without home
+    fly: float = 0.5  #: how far corners are rounded, 0 to 1
+    #: share of a joint's velocity limit, above 0, that gene 0 means; gene 1 means 1
     slowest: float = 0.3
+    #: share of each joint's range, about its middle, that via points lie in
     range_share: float = 1.0
+    #: posture (n,) [rad] within the limits where the motion begins and ends; None: it leads from
+    #: the first via point to the last
     home: Array | None = None
+    #: clearance that the straight ways between the points of a first population keep; None: its
+    #: points are uniform in the range, as the paper's
     checker: CollisionChecker | None = None
 
     def __post_init__(self) -> None:
@@ -186,28 +182,23 @@ class SineGenome:
     degrees. Velocity and jerk, and with a ramp acceleration too, are not bounded by the genes and
     have to be checked (appendix; Calafiore et al., 2001).
 
-    Attributes:
-        limits: joint limits.
-        length: of the whole motion [s].
-        harmonics: W.
-        ramp: time over which the sines grow and fade [s]; with 0 the motion starts at full speed,
-            and no controller can execute it.
-        offset: posture (n,) [rad] about which the joints swing, and where a motion with a ramp
-            begins and ends; None: the middle of each range.
-        slowest: frequencies that gene 0 means (n,) [rad/s]; None: one period in `length`.
-        fastest: frequencies that gene 1 means (n,) [rad/s]; None: the appendix's
-            sqrt(qdd_max / q_max), which keeps the acceleration limit where there is no ramp.
-
     Raises:
         DesignError: an offset outside the limits, or a slowest frequency above the fastest.
     """
 
-    limits: JointLimits
-    length: float
-    harmonics: int = 3
+    limits: JointLimits  #: joint limits
+    length: float  #: of the whole motion [s]
+    harmonics: int = 3  #: W
+    #: time over which the sines grow and fade [s]; with 0 the motion starts at full speed, and no
+    #: controller can execute it
     ramp: float = 0.0
+    #: posture (n,) [rad] about which the joints swing, and where a motion with a ramp begins and
+    #: ends; None: the middle of each range
     offset: Array | None = None
+    #: frequencies that gene 0 means (n,) [rad/s]; None: one period in `length`
     slowest: Array | None = None
+    #: frequencies that gene 1 means (n,) [rad/s]; None: the appendix's sqrt(qdd_max / q_max),
+    #: which keeps the acceleration limit where there is no ramp
     fastest: Array | None = None
 
     def __post_init__(self) -> None:

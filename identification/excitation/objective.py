@@ -30,25 +30,21 @@ class Objective:
     theirs alone, and a motion that says more about everything never counts for less. Its
     duration is bounded by the constraints instead. As a fit leaves out what stands
     (:meth:`RobotModel.moving`), so do the rows of a motion beside `earlier`.
-
-    Attributes:
-        model: the robot, with p parameters.
-        parameters: indices of the essential ones (e,): the others are assumed to be zero, so that
-            their columns are left out. None for all.
-        joint_weights: 1 / variance of each joint's torque (n,). None leaves joints unweighted.
-        earlier: Gram matrix (p, p) of earlier archives, all parameters, weighted alike, and as
-            if sampled every SAMPLE_PERIOD: one of 1 kHz is to be divided by 8. A second of the
-            new motion counts like one of theirs, however densely it is sampled.
-        earlier_samples: N, the time samples in it, at the same rate.
-        repetitions: how often the new motion is going to be run. It matters beside `earlier`
-            only: repeating everything changes neither criterion (section 3.2).
     """
 
-    model: RobotModel
+    model: RobotModel  #: the robot, with p parameters
+    #: indices of the essential ones (e,): the others are assumed to be zero, so that their
+    #: columns are left out. None for all
     parameters: NDArray[np.intp] | None = None
+    #: 1 / variance of each joint's torque (n,). None leaves joints unweighted
     joint_weights: Array | None = None
+    #: Gram matrix (p, p) of earlier archives, all parameters, weighted alike, and as if sampled
+    #: every SAMPLE_PERIOD: one of 1 kHz is to be divided by 8. A second of the new motion counts
+    #: like one of theirs, however densely it is sampled
     earlier: Array | None = None
-    earlier_samples: int = 0
+    earlier_samples: int = 0  #: N, the time samples in it, at the same rate
+    #: how often the new motion is going to be run. It matters beside `earlier` only: repeating
+    #: everything changes neither criterion (section 3.2)
     repetitions: int = 1
 
     @property

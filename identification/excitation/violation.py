@@ -28,27 +28,18 @@ KINDS: Final[tuple[Kind, ...]] = tuple(_UNITS)
 
 @dataclass(frozen=True)
 class Violation:
-    """One constraint that a motion breaks, at its worst instant.
+    """One constraint that a motion breaks, at its worst instant."""
 
-    Attributes:
-        kind: which constraint.
-        subject: joint, motor ("motor of joint_3"), or the pair that comes too close.
-        value: what it reaches (a distance for a collision), SI.
-        bound: what it may reach at most (for a collision and a too short motion: at least), SI.
-        time: when [s]; None where no instant is to blame.
-        posture: joint positions there [rad]; empty where they play no part.
-        scale: how far beyond the bound counts as an excess of 1, SI; None for the bound's own size.
-        remedy: what to do about it, where that is known.
-    """
-
-    kind: Kind
-    subject: str
-    value: float
+    kind: Kind  #: which constraint
+    subject: str  #: joint, motor ("motor of joint_3"), or the pair that comes too close
+    value: float  #: what it reaches (a distance for a collision), SI
+    #: what it may reach at most (for a collision and a too short motion: at least), SI
     bound: float
-    time: float | None
-    posture: tuple[float, ...] = ()
+    time: float | None  #: when [s]; None where no instant is to blame
+    posture: tuple[float, ...] = ()  #: joint positions there [rad]; empty where they play no part
+    #: how far beyond the bound counts as an excess of 1, SI; None for the bound's own size
     scale: float | None = None
-    remedy: str = ""
+    remedy: str = ""  #: what to do about it, where that is known
 
     @property
     def excess(self) -> float:

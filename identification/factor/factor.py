@@ -33,19 +33,12 @@ _PARTICIPATION: Final = 1e-3
 
 
 class NormalEquations(NamedTuple):
-    """``A pi = b`` of a weighted least-squares problem.
+    """``A pi = b`` of a weighted least-squares problem."""
 
-    Attributes:
-        A: sum of the weighted ``W^T W``, shape (p, p).
-        b: sum of the weighted ``W^T y``, shape (p,).
-        yy: sum of the weighted ``y^T y``.
-        n: number of rows (one joint at one instant) in the sums.
-    """
-
-    A: Array
-    b: Array
-    yy: float = 0.0
-    n: int = 0
+    A: Array  #: sum of the weighted ``W^T W``, shape (p, p)
+    b: Array  #: sum of the weighted ``W^T y``, shape (p,)
+    yy: float = 0.0  #: sum of the weighted ``y^T y``
+    n: int = 0  #: number of rows (one joint at one instant) in the sums
 
     def part(self, chosen: NDArray[np.intp]) -> NormalEquations:
         """Those of some parameters (k,), the others zero."""
@@ -68,17 +61,11 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Rows of [W | y], reduced joint by joint to their Gram matrices.
+    """Rows of [W | y], reduced joint by joint to their Gram matrices."""
 
-    Attributes:
-        matrices: (n, p + 1, p + 1).
-        samples: rows per joint (n,).
-        parameter_names: the p columns of W.
-    """
-
-    matrices: Array
-    samples: NDArray[np.intp]
-    parameter_names: tuple[str, ...]
+    matrices: Array  #: (n, p + 1, p + 1)
+    samples: NDArray[np.intp]  #: rows per joint (n,)
+    parameter_names: tuple[str, ...]  #: the p columns of W
 
     words: ClassVar[str] = ""
     """Behind the name of an estimator."""
@@ -372,31 +359,20 @@ def inverse_variance(variance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Parameters and how well they are known.
+    """Parameters and how well they are known."""
 
-    Attributes:
-        names: (p,).
-        units: (p,).
-        values: (p,).
-        covariance: (p, p); the variance of an undetermined parameter is infinite.
-        noise_std: standard deviation of the torque residual per joint (n,) [N·m or N].
-        samples: rows per joint (n,).
-        method: how it was made, in words, and what the covariance assumes.
-        condition: condition number of the weighted regressor with columns of unit length.
-        undetermined: parameters the data say nothing about, alone or as part of a combination.
-        interval_factor: standard deviations in half a 95 % interval: 1.96, more where the
-            covariance itself comes from few data.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Array
-    covariance: Array
-    noise_std: Array
-    samples: NDArray[np.intp]
-    method: str
-    condition: float
+    names: tuple[str, ...]  #: (p,)
+    units: tuple[str, ...]  #: (p,)
+    values: Array  #: (p,)
+    covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
+    noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
+    samples: NDArray[np.intp]  #: rows per joint (n,)
+    method: str  #: how it was made, in words, and what the covariance assumes
+    condition: float  #: condition number of the weighted regressor with columns of unit length
+    #: parameters the data say nothing about, alone or as part of a combination
     undetermined: tuple[str, ...] = ()
+    #: standard deviations in half a 95 % interval: 1.96, more where the covariance itself comes
+    #: from few data
     interval_factor: float = 1.96
 
     @property

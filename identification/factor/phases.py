@@ -35,18 +35,14 @@ class PhaseFactor:
     """Factors of B short blocks of time since the motion's origin.
 
     They add at equal times since the origin: repetitions of a motion block by block.
-
-    Attributes:
-        gram: per joint j over its columns, and last the torque, (B, c_j + 1, c_j + 1).
-        columns: per joint the parameter index of each of its columns (c_j,).
-        samples: rows that count (B, n).
-        parameter_names: (p,).
     """
 
+    #: per joint j over its columns, and last the torque, (B, c_j + 1, c_j + 1)
     gram: tuple[Array, ...]
+    #: per joint the parameter index of each of its columns (c_j,)
     columns: tuple[NDArray[np.intp], ...]
-    samples: NDArray[np.intp]
-    parameter_names: tuple[str, ...]
+    samples: NDArray[np.intp]  #: rows that count (B, n)
+    parameter_names: tuple[str, ...]  #: (p,)
 
     @classmethod
     def zero(cls, model: RobotModel) -> PhaseFactor:

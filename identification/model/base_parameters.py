@@ -26,26 +26,18 @@ _UNSPEAKABLE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Which standard parameters are independent, and what is grouped into each.
+    """Which standard parameters are independent, and what is grouped into each."""
 
-    Attributes:
-        names: names of the independent parameters, shape (b,): each stands for its group.
-        pivots: indices of the independent standard parameters, rising, shape (b,).
-        grouping: ``base_values = grouping @ standard_values``, shape (b, s).
-        standard_names: names of all standard parameters, shape (s,).
-        smallest_pivot: how much of an independent column those before it leave unexplained, as a
-            share of the longest column of its unit; the smallest over all of them.
-        largest_dropped: the same, the largest over all dropped: zero but for rounding.
-        shares: the same of each standard parameter, shape (s,).
-    """
-
+    #: names of the independent parameters, shape (b,): each stands for its group
     names: tuple[str, ...]
-    pivots: NDArray[np.intp]
-    grouping: Array
-    standard_names: tuple[str, ...]
+    pivots: NDArray[np.intp]  #: indices of the independent standard parameters, rising, shape (b,)
+    grouping: Array  #: ``base_values = grouping @ standard_values``, shape (b, s)
+    standard_names: tuple[str, ...]  #: names of all standard parameters, shape (s,)
+    #: how much of an independent column those before it leave unexplained, as a share of the
+    #: longest column of its unit; the smallest over all of them
     smallest_pivot: float
-    largest_dropped: float
-    shares: Array
+    largest_dropped: float  #: the same, the largest over all dropped: zero but for rounding
+    shares: Array  #: the same of each standard parameter, shape (s,)
 
     @property
     def rank(self) -> int:

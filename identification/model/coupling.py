@@ -23,18 +23,13 @@ _UNCOUPLED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """How motors turn with joints, and what of it is to be identified.
+    """How motors turn with joints, and what of it is to be identified."""
 
-    Attributes:
-        motor_from_joint: motor angle per joint angle (n, n), gears and signs included or not:
-            only the ratios within a row matter.
-        inertia: give each pair of coupled joints its coupling inertia.
-        friction: give each coupled motor Coulomb and viscous friction of its own.
-    """
-
+    #: motor angle per joint angle (n, n), gears and signs included or not: only the ratios within
+    #: a row matter
     motor_from_joint: Array
-    inertia: bool = True
-    friction: bool = True
+    inertia: bool = True  #: give each pair of coupled joints its coupling inertia
+    friction: bool = True  #: give each coupled motor Coulomb and viscous friction of its own
 
     def __post_init__(self) -> None:
         matrix = np.array(self.motor_from_joint, dtype=np.float64)

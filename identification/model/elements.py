@@ -76,18 +76,13 @@ class Element(ABC):
 class Anchors:
     """Two anchors in the plane of a joint, one on the base side and one on the link side.
 
-    Attributes:
-        base: distance of the anchor on the base side from the axis [m].
-        link: that of the anchor on the link side [m].
-        angle: between the two, seen from the axis, at joint angle zero [rad].
-
     Raises:
         ModelError: a distance is not positive, or both are the same.
     """
 
-    base: float
-    link: float
-    angle: float
+    base: float  #: distance of the anchor on the base side from the axis [m]
+    link: float  #: that of the anchor on the link side [m]
+    angle: float  #: between the two, seen from the axis, at joint angle zero [rad]
 
     def __post_init__(self) -> None:
         _require_positive("distance of an anchor from the axis", "m", self.base, self.link)
@@ -299,13 +294,9 @@ class PlacedElement(NamedTuple):
 
 @dataclass(frozen=True)
 class JointElements:
-    """All elements of an arm: e identified parameters, element by element.
+    """All elements of an arm: e identified parameters, element by element."""
 
-    Attributes:
-        placed: in the order of the parameters.
-    """
-
-    placed: tuple[PlacedElement, ...] = ()
+    placed: tuple[PlacedElement, ...] = ()  #: in the order of the parameters
 
     @classmethod
     def of(

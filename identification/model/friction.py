@@ -172,36 +172,30 @@ ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0, "tanh": 0.
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Which friction terms a joint has.
+    """Which friction terms a joint has."""
 
-    Attributes:
-        coulomb: ``f0 sgn(v)``.
-        viscous: ``f1 v``.
-        third: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none.
-        offset: constant ``fo``, also the zero error of a torque or current measurement.
-        standstill: speed [rad/s, m/s] below which a joint counts as at rest. Stiction can take
-            any value there; see `zone`.
-        stribeck: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which
-            friction is larger at low speed; none without it.
-        tanh: fixed speed v_t [rad/s, m/s] of ``f0 tanh(v / v_t)`` in place of ``f0 sgn(v)``; none
-            for the latter.
-        asymmetric: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is
-            f0 + fo forwards and f0 - fo backwards: its asymmetry is the constant column of the
-            offset, which is there then too, and the two cannot be distinguished.
-        presliding: displacement d [rad, m] over which dry friction reverses; zero for a jump.
-        zone: what becomes of rows slower than standstill. "exclude": they are not fitted, see
-            :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill.
-    """
-
-    coulomb: bool = True
-    viscous: bool = True
+    coulomb: bool = True  #: ``f0 sgn(v)``
+    viscous: bool = True  #: ``f1 v``
+    #: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none
     third: ThirdTerm | None = "quadratic"
-    offset: bool = False
+    offset: bool = False  #: constant ``fo``, also the zero error of a torque or current measurement
+    #: speed [rad/s, m/s] below which a joint counts as at rest. Stiction can take any value
+    #: there; see `zone`
     standstill: float = 0.01
+    #: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which friction
+    #: is larger at low speed; none without it
     stribeck: float | None = None
+    #: fixed speed v_t [rad/s, m/s] of ``f0 tanh(v / v_t)`` in place of ``f0 sgn(v)``; none for
+    #: the latter
     tanh: float | None = None
+    #: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is f0 + fo
+    #: forwards and f0 - fo backwards: its asymmetry is the constant column of the offset, which
+    #: is there then too, and the two cannot be distinguished
     asymmetric: bool = False
+    #: what becomes of rows slower than standstill. "exclude": they are not fitted, see
+    #: :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill
     zone: Zone = "exclude"
+    #: displacement d [rad, m] over which dry friction reverses; zero for a jump
     presliding: float = 0.0
 
     def __post_init__(self) -> None:
@@ -344,16 +338,11 @@ class JointTerm(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointFriction:
-    """Friction of n joints: k coefficients, term by term (all f0, all f1, ...), then motors.
+    """Friction of n joints: k coefficients, term by term (all f0, all f1, ...), then motors."""
 
-    Attributes:
-        laws: of each joint (n,).
-        revolute: whether each joint turns (n,), for units.
-        coupling: motors that turn with several joints; None where each joint has its own.
-    """
-
-    laws: tuple[FrictionLaw, ...]
-    revolute: tuple[bool, ...]
+    laws: tuple[FrictionLaw, ...]  #: of each joint (n,)
+    revolute: tuple[bool, ...]  #: whether each joint turns (n,), for units
+    #: motors that turn with several joints; None where each joint has its own
     coupling: Coupling | None = None
 
     @property

@@ -11,21 +11,14 @@ Array = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """Positions and their derivatives at m instants (rad or m, per s, per s²).
+    """Positions and their derivatives at m instants (rad or m, per s, per s²)."""
 
-    Attributes:
-        time: shape (m,), seconds.
-        position: q, shape (m, n).
-        velocity: qd, shape (m, n).
-        acceleration: qdd, shape (m, n).
-        direction: of dry friction, shape (m, n + k), joints and then k coupled motors, from -1 to
-            1; None for the sign of the velocity. See :meth:`JointFriction.direction`.
-    """
-
-    time: Array
-    position: Array
-    velocity: Array
-    acceleration: Array
+    time: Array  #: shape (m,), seconds
+    position: Array  #: q, shape (m, n)
+    velocity: Array  #: qd, shape (m, n)
+    acceleration: Array  #: qdd, shape (m, n)
+    #: of dry friction, shape (m, n + k), joints and then k coupled motors, from -1 to 1; None for
+    #: the sign of the velocity. See :meth:`JointFriction.direction`
     direction: Array | None = None
 
     def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:

@@ -24,21 +24,17 @@ _MOST = 1e9
 class Payload:
     """A body of known mass.
 
-    Attributes:
-        mass: [kg].
-        centre: its centre of mass in the frame (3,) [m].
-        inertia: tensor about the centre of mass, in the axes of the frame: xx, xy, xz, yy, yz,
-            zz [kg m²]; a point without it.
-        frame: link of the robot description whose frame that is, such as "tool0"; without it the
-            frame of the last joint.
-
     Raises:
         ModelError: no body has this mass, or a figure is not finite, or beyond 1e9.
     """
 
-    mass: float
-    centre: tuple[float, float, float]
+    mass: float  #: [kg]
+    centre: tuple[float, float, float]  #: its centre of mass in the frame (3,) [m]
+    #: tensor about the centre of mass, in the axes of the frame: xx, xy, xz, yy, yz, zz [kg m²];
+    #: a point without it
     inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    #: link of the robot description whose frame that is, such as "tool0"; without it the frame of
+    #: the last joint
     frame: str | None = None
 
     def __post_init__(self) -> None:

@@ -115,14 +115,10 @@ _GRAIN = 128
 
 
 class Regressor(NamedTuple):
-    """Regressor of m samples, joint by joint, without the columns that are zero by structure.
+    """Regressor of m samples, joint by joint, without the columns that are zero by structure."""
 
-    Attributes:
-        blocks: per joint j the columns that act on it, shape (m, c_j).
-        columns: per joint the parameter index of each of its columns, shape (c_j,).
-    """
-
-    blocks: tuple[Array, ...]
+    blocks: tuple[Array, ...]  #: per joint j the columns that act on it, shape (m, c_j)
+    #: per joint the parameter index of each of its columns, shape (c_j,)
     columns: tuple[NDArray[np.intp], ...]
 
     def dense(self, p: int) -> Array:

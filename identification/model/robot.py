@@ -151,35 +151,24 @@ class RobotModel:
     mass, ``I`` the inertia tensor, ``I3m`` the rotor of joint 3 seen from the link side, ``I45``
     the coupling inertia of joints 4 and 5. A payload is known: its torque is no part of W pi, nor
     is that of springs and balancers of which the figures are given.
-
-    Attributes:
-        chain: geometry and nominal inertia as read from the URDF.
-        gravity: acceleration of gravity in base axes [m/s²], shape (3,).
-        layout: where the s standard parameters stand.
-        friction: of every joint, and of coupled motors.
-        base: the b base parameters and their grouping.
-        parameter_names: the p parameters: base, then friction (all f0, all f1, ...), then those
-            of springs and balancers.
-        units: unit of each parameter, shape (p,).
-        plan: how the regressor is made.
-        locked: position [rad or m] of joints of the description that are held.
-        coupling: motors that turn with several joints; None where each joint has its own.
-        payload: what the arm carries; None for nothing.
-        elements: springs and balancers.
     """
 
-    chain: Chain
-    gravity: Array
-    layout: StandardLayout
-    friction: JointFriction
-    base: BaseParameters
+    chain: Chain  #: geometry and nominal inertia as read from the URDF
+    gravity: Array  #: acceleration of gravity in base axes [m/s²], shape (3,)
+    layout: StandardLayout  #: where the s standard parameters stand
+    friction: JointFriction  #: of every joint, and of coupled motors
+    base: BaseParameters  #: the b base parameters and their grouping
+    #: the p parameters: base, then friction (all f0, all f1, ...), then those of springs and
+    #: balancers
     parameter_names: tuple[str, ...]
-    units: tuple[str, ...]
-    plan: RegressorPlan = field(repr=False)
+    units: tuple[str, ...]  #: unit of each parameter, shape (p,)
+    plan: RegressorPlan = field(repr=False)  #: how the regressor is made
+    #: position [rad or m] of joints of the description that are held
     locked: Mapping[str, float] = field(default_factory=dict)
+    #: motors that turn with several joints; None where each joint has its own
     coupling: Coupling | None = None
-    payload: Payload | None = None
-    elements: JointElements = field(default_factory=JointElements)
+    payload: Payload | None = None  #: what the arm carries; None for nothing
+    elements: JointElements = field(default_factory=JointElements)  #: springs and balancers
     _load: Load | None = field(default=None, repr=False)
 
     @classmethod

@@ -79,26 +79,20 @@ class EliminationStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """All steps down to one parameter, and where to stop.
+    """All steps down to one parameter, and where to stop."""
 
-    Attributes:
-        steps: the path: step k has k removals. Behind the cut parameters go on being removed by
-            relative standard deviation alone, to show what that costs.
-        cut: the step chosen.
-        refused: parameters that the held-out motion did not let go before the cut, in order.
-        reason: why the cut is there, in words.
-        estimate: of the parameters left at the cut, with their names and the cluster-robust
-            covariance, which is that of a model with exactly these parameters: it takes no
-            account of their having been chosen.
-        values: the same for the full model (p,), zero for what was removed.
-    """
-
+    #: the path: step k has k removals. Behind the cut parameters go on being removed by relative
+    #: standard deviation alone, to show what that costs
     steps: tuple[EliminationStep, ...]
-    cut: int
+    cut: int  #: the step chosen
+    #: parameters that the held-out motion did not let go before the cut, in order
     refused: tuple[str, ...]
-    reason: str
+    reason: str  #: why the cut is there, in words
+    #: of the parameters left at the cut, with their names and the cluster-robust covariance,
+    #: which is that of a model with exactly these parameters: it takes no account of their having
+    #: been chosen
     estimate: Estimate
-    values: Array
+    values: Array  #: the same for the full model (p,), zero for what was removed
 
     @property
     def removed(self) -> tuple[str, ...]:

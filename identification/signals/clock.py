@@ -45,30 +45,18 @@ _CUBIC: Final = np.array([-2, -1, 1, 2])  # samples beside
 
 @dataclass(frozen=True)
 class TimeBase:
-    """What the clock of a recording did.
+    """What the clock of a recording did."""
 
-    Attributes:
-        samples: number of them.
-        duration: from the first to the last [s].
-        step: mean step of the clock; repeats, drops and gaps aside [s].
-        jitter: standard deviation of the steps that are no drop and no gap, in such steps.
-        largest_deviation: of one of them, in such steps.
-        repeated: samples with the time stamp of the one before.
-        backward: samples with an earlier time stamp than the one before.
-        dropped: samples that are missing where the clock steps by at most
-            `GAP_STEPS` usual steps.
-        gaps: longer steps, and gaps that were reported.
-    """
-
-    samples: int
-    duration: float
-    step: float
-    jitter: float
-    largest_deviation: float
-    repeated: int
-    backward: int
+    samples: int  #: number of them
+    duration: float  #: from the first to the last [s]
+    step: float  #: mean step of the clock; repeats, drops and gaps aside [s]
+    jitter: float  #: standard deviation of the steps that are no drop and no gap, in such steps
+    largest_deviation: float  #: of one of them, in such steps
+    repeated: int  #: samples with the time stamp of the one before
+    backward: int  #: samples with an earlier time stamp than the one before
+    #: samples that are missing where the clock steps by at most `GAP_STEPS` usual steps
     dropped: int
-    gaps: int
+    gaps: int  #: longer steps, and gaps that were reported
 
     @property
     def rate(self) -> float:

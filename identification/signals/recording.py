@@ -30,31 +30,23 @@ class RecordingError(IdentificationError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Measured joint motion and torque, m samples of n joints, joint side.
+    """Measured joint motion and torque, m samples of n joints, joint side."""
 
-    Attributes:
-        time: (m,) [s], the controller's clock.
-        position: measured (m, n) [rad or m].
-        joint_names: n names, in the order of the columns.
-        velocity: measured (m, n) [rad/s or m/s], None where it was not.
-        torque: joint torque or force (m, n) [N·m or N], None where only currents are known.
-        motor_current: (m, n) [A]; no use is made of it here but to carry it along.
-        commanded_position: (m, n) [rad or m], NaN where nothing was commanded.
-        gap_before: (m,) True at a sample before which samples are known to be missing.
-        held_joints: joints that are known to be clamped or switched off, so that a constant
-            position is no fault.
-        provenance: where the recording comes from, in words.
-    """
-
-    time: Array
-    position: Array
-    joint_names: tuple[str, ...]
+    time: Array  #: (m,) [s], the controller's clock
+    position: Array  #: measured (m, n) [rad or m]
+    joint_names: tuple[str, ...]  #: n names, in the order of the columns
+    #: joint torque or force (m, n) [N·m or N], None where only currents are known
     torque: Array | None = None
-    velocity: Array | None = None
+    velocity: Array | None = None  #: measured (m, n) [rad/s or m/s], None where it was not
+    #: (m, n) [A]; no use is made of it here but to carry it along
     motor_current: Array | None = None
-    commanded_position: Array | None = None
+    commanded_position: Array | None = None  #: (m, n) [rad or m], NaN where nothing was commanded
+    #: (m,) True at a sample before which samples are known to be missing
     gap_before: NDArray[np.bool_] | None = None
+    #: joints that are known to be clamped or switched off, so that a constant position is no
+    #: fault
     held_joints: tuple[str, ...] = ()
+    #: where the recording comes from, in words
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

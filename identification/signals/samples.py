@@ -40,38 +40,33 @@ VelocitySource = Literal["position", "measured"]
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How a recording is turned into samples.
+    """How a recording is turned into samples."""
 
-    Attributes:
-        rigid_bandwidth: widest bandwidth of the smoothed positions [Hz], however little noise
-            they have. A rigid model has nothing to say above the first resonance of the arm,
-            where motors accelerate without their links; and a wide one lets ripple that has
-            found a resonance pass for inertia.
-        velocity: where the velocity comes from: the slope of the smoothed position, or the
-            measured velocity, smoothed alike, whose slope is then the acceleration. Recordings
-            without a measured velocity take the position's.
-        left_out: which rows do not count for being slow, see
-            :func:`identification.signals.masks.mask_rows`. By default "rests" where dry friction
-            has a presliding state in every joint, "slow" where it jumps: no sgn(v) is right there.
-        smooth_torque: the paper's way. The torque is smoothed, and the regressor goes through the
-            same linear smoother. By default the torque is left as measured: least squares
-            averages it better.
-        torque_bandwidth: with `smooth_torque` the bandwidth of that smoother [Hz]; None smooths
-            until the mean squared residual is the torque's noise variance. Without, the bandwidth
-            of a low-pass that the torque has come through before it was logged, as many
-            controllers do it: the regressor then goes through the same low-pass and the torque
-            is left alone. None: it has come through none.
-        torque_shape: how that low-pass falls off; `smooth_torque` is always by the spline's.
-        torque_delay: time by which the recorded torque lags the recorded position [s], beside
-            the lag of a causal low-pass.
-    """
-
+    #: widest bandwidth of the smoothed positions [Hz], however little noise they have. A rigid
+    #: model has nothing to say above the first resonance of the arm, where motors accelerate
+    #: without their links; and a wide one lets ripple that has found a resonance pass for inertia
     rigid_bandwidth: float = RIGID_BANDWIDTH
+    #: where the velocity comes from: the slope of the smoothed position, or the measured
+    #: velocity, smoothed alike, whose slope is then the acceleration. Recordings without a
+    #: measured velocity take the position's
     velocity: VelocitySource = "position"
+    #: which rows do not count for being slow, see :func:`identification.signals.masks.mask_rows`.
+    #: By default "rests" where dry friction has a presliding state in every joint, "slow" where
+    #: it jumps: no sgn(v) is right there
     left_out: LeftOut | None = None
+    #: the paper's way. The torque is smoothed, and the regressor goes through the same linear
+    #: smoother. By default the torque is left as measured: least squares averages it better
     smooth_torque: bool = False
+    #: with `smooth_torque` the bandwidth of that smoother [Hz]; None smooths until the mean
+    #: squared residual is the torque's noise variance. Without, the bandwidth of a low-pass that
+    #: the torque has come through before it was logged, as many controllers do it: the regressor
+    #: then goes through the same low-pass and the torque is left alone. None: it has come through
+    #: none
     torque_bandwidth: float | None = None
+    #: how that low-pass falls off; `smooth_torque` is always by the spline's
     torque_shape: LowPassShape = SMOOTHER
+    #: time by which the recorded torque lags the recorded position [s], beside the lag of a
+    #: causal low-pass
     torque_delay: float = 0.0
 
     def __post_init__(self) -> None:
@@ -83,33 +78,25 @@ class Preprocessing:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """m samples of n joints, ready for a fit, in the rows of the recording they come from.
+    """m samples of n joints, ready for a fit, in the rows of the recording they come from."""
 
-    Attributes:
-        motion: smoothed positions and their derivatives, at the instants the torque belongs to.
-        torque: (m, n) [N·m or N].
-        usable: (m, n) rows that count: moving, and away from gaps, ends and reversals.
-        segments: stretches without a gap.
-        origin: time at which the planned motion begins [s]; repetitions are compared at equal
-            times since then.
-        position_bandwidth: of the smoothing, per joint (n,) [Hz].
-        torque_bandwidth: of the low-pass the torque has come through, per joint (n,) [Hz]; the
-            regressor has to go through it as well. None: it has come through none.
-        torque_shape: of that low-pass.
-        mask: why rows do not count; None where nobody asked.
-        whole: the samples that these are part of, and which part: a low-pass reads what comes
-            before and after. None where they are all there is.
-    """
-
+    #: smoothed positions and their derivatives, at the instants the torque belongs to
     motion: Motion
-    torque: Array
+    torque: Array  #: (m, n) [N·m or N]
+    #: (m, n) rows that count: moving, and away from gaps, ends and reversals
     usable: NDArray[np.bool_]
-    segments: tuple[slice, ...]
+    segments: tuple[slice, ...]  #: stretches without a gap
+    #: time at which the planned motion begins [s]; repetitions are compared at equal times since
+    #: then
     origin: float
-    position_bandwidth: Array
+    position_bandwidth: Array  #: of the smoothing, per joint (n,) [Hz]
+    #: of the low-pass the torque has come through, per joint (n,) [Hz]; the regressor has to go
+    #: through it as well. None: it has come through none
     torque_bandwidth: Array | None = None
-    torque_shape: LowPassShape = SMOOTHER
-    mask: RowMask | None = None
+    torque_shape: LowPassShape = SMOOTHER  #: of that low-pass
+    mask: RowMask | None = None  #: why rows do not count; None where nobody asked
+    #: the samples that these are part of, and which part: a low-pass reads what comes before and
+    #: after. None where they are all there is
     whole: tuple[Samples, slice] | None = None
 
     def between(self, start: int, stop: int) -> Samples:

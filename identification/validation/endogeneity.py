@@ -38,34 +38,25 @@ _SAME: Final = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EndogeneityTest:
-    """Result of the test.
+    """Result of the test."""
 
-    Attributes:
-        statistic: F of the hypothesis that least squares is not biased; NaN if there is nothing
-            to test.
-        p_value: probability of a larger one if the hypothesis is true, NaN likewise.
-        freedom: degrees of freedom of the F.
-        coefficient: of each joint's column (n,): minus the share of it that is noise of
-            measurement; NaN where there is none.
-        noise: torque V pi that stands for what the instruments do not explain of the regressor,
-            as a share of each joint's torque (n,), both as RMS.
-        shift: least squares less instrumental variables (p,).
-        shifted: names of the parameters that differ by more than chance (all of them together
-            5 %).
-        predicted: torque that the two estimates predict differently on the fitted motion, as a
-            share of each joint's torque (n,).
-        words: the answer in words.
-    """
-
+    #: F of the hypothesis that least squares is not biased; NaN if there is nothing to test
     statistic: float
-    p_value: float
-    freedom: tuple[int, int]
+    p_value: float  #: probability of a larger one if the hypothesis is true, NaN likewise
+    freedom: tuple[int, int]  #: degrees of freedom of the F
+    #: of each joint's column (n,): minus the share of it that is noise of measurement; NaN where
+    #: there is none
     coefficient: Array
+    #: torque V pi that stands for what the instruments do not explain of the regressor, as a
+    #: share of each joint's torque (n,), both as RMS
     noise: Array
-    shift: Array
+    shift: Array  #: least squares less instrumental variables (p,)
+    #: names of the parameters that differ by more than chance (all of them together 5 %)
     shifted: tuple[str, ...]
+    #: torque that the two estimates predict differently on the fitted motion, as a share of each
+    #: joint's torque (n,)
     predicted: Array
-    words: str
+    words: str  #: the answer in words
 
     @property
     def biased(self) -> bool:

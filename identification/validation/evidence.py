@@ -260,54 +260,40 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a verdict is given on; None is what was not measured or looked for.
+    """What a verdict is given on; None is what was not measured or looked for."""
 
-    Attributes:
-        estimate: the result.
-        held_out: its error on motion that was not used for fitting.
-        training: its error on the motion it was fitted to.
-        systematic: error on unseen motion below 10 Hz that neither noise nor what warm gears
-            excuse explains, as a share of the torque (n,); NaN for a joint that was not tested,
-            None without repetitions, which tell noise from error.
-        systematic_apart: the same apart from all change of friction.
-        friction_change: share by which friction was higher on an unseen motion than estimated,
-            of all motions the one with the largest change, per joint (n,); None likewise.
-        noise_floor: what no model can predict of the torque (n,) [N·m or N]: the residual above
-            the band of the motion, and what differs between repetitions.
-        disagreement: of the repetitions' own estimates with the pooled one, the worst of them,
-            as a share of each axis's torque (n,); None without repetitions.
-        causes: faults that explain errors of the fit.
-        gravity: the direction of gravity that fits best.
-        load: a body that the arm seems to carry on unseen motion only.
-        loaded: joints that gravity can load (n,).
-        nominal: error of the nominal (CAD) model on the same unseen motion.
-        implausible: what is physically impossible about the estimate.
-        residuals: what is left over, and what it follows.
-        coupling: index I_c of how far the parameters' estimates move together (paper, eq. 5),
-            infinite where a parameter is undetermined, and I_c,max of as many parameters.
-        surroundings: limits, saturation and the controller's own model.
-        prismatic: indices of the joints that slide.
-        in_sample: whether nothing was held out, so that all errors are those of the fit.
-    """
-
-    estimate: Estimate
-    held_out: PredictionError
-    training: PredictionError
+    estimate: Estimate  #: the result
+    held_out: PredictionError  #: its error on motion that was not used for fitting
+    training: PredictionError  #: its error on the motion it was fitted to
+    #: error on unseen motion below 10 Hz that neither noise nor what warm gears excuse explains,
+    #: as a share of the torque (n,); NaN for a joint that was not tested, None without
+    #: repetitions, which tell noise from error
     systematic: Array | None = None
-    systematic_apart: Array | None = None
+    systematic_apart: Array | None = None  #: the same apart from all change of friction
+    #: share by which friction was higher on an unseen motion than estimated, of all motions the
+    #: one with the largest change, per joint (n,); None likewise
     friction_change: Array | None = None
+    #: what no model can predict of the torque (n,) [N·m or N]: the residual above the band of the
+    #: motion, and what differs between repetitions
     noise_floor: Array | None = None
+    #: of the repetitions' own estimates with the pooled one, the worst of them, as a share of
+    #: each axis's torque (n,); None without repetitions
     disagreement: Array | None = None
-    causes: Causes | None = None
-    gravity: GravityDirection | None = None
-    load: CarriedLoad | None = None
-    loaded: NDArray[np.bool_] | None = None
+    causes: Causes | None = None  #: faults that explain errors of the fit
+    gravity: GravityDirection | None = None  #: the direction of gravity that fits best
+    load: CarriedLoad | None = None  #: a body that the arm seems to carry on unseen motion only
+    loaded: NDArray[np.bool_] | None = None  #: joints that gravity can load (n,)
+    #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
-    implausible: Implausible = _PLAUSIBLE
-    residuals: ResidualChecks | None = None
+    implausible: Implausible = _PLAUSIBLE  #: what is physically impossible about the estimate
+    residuals: ResidualChecks | None = None  #: what is left over, and what it follows
+    #: index I_c of how far the parameters' estimates move together (paper, eq. 5), infinite where
+    #: a parameter is undetermined, and I_c,max of as many parameters
     coupling: tuple[float, float] | None = None
+    #: limits, saturation and the controller's own model
     surroundings: Surroundings = Surroundings()
-    prismatic: tuple[int, ...] = ()
+    prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
+    #: whether nothing was held out, so that all errors are those of the fit
     in_sample: bool = False
 
     def revolute(self, joint: int) -> bool:

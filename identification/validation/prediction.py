@@ -25,22 +25,14 @@ class PredictionError:
     """Sums over the rows of a prediction error e = measured - predicted, per joint (n,).
 
     They are sums, so that runs add up: the error over all runs is the sum of theirs.
-
-    Attributes:
-        rows: rows that counted.
-        absolute: sum of |e|.
-        signed: sum of e.
-        squared: sum of e².
-        torque_sum: sum of measured torque.
-        torque_squared: sum of measured torque².
     """
 
-    rows: NDArray[np.intp]
-    absolute: Array
-    signed: Array
-    squared: Array
-    torque_sum: Array
-    torque_squared: Array
+    rows: NDArray[np.intp]  #: rows that counted
+    absolute: Array  #: sum of |e|
+    signed: Array  #: sum of e
+    squared: Array  #: sum of e²
+    torque_sum: Array  #: sum of measured torque
+    torque_squared: Array  #: sum of measured torque²
 
     def __str__(self) -> str:
         """As a person reads it: relative errors over all joints and of each, and of what."""

@@ -40,25 +40,18 @@ _JUMPS_SHOWN: Final = 3
 
 @dataclass(frozen=True)
 class Verdict:
-    """Answer to "is the result good?".
+    """Answer to "is the result good?"."""
 
-    Attributes:
-        good: whether the model may be used.
-        line: one sentence: whether it predicts unseen motion well, and by how much.
-        reasons: what is wrong, in words; empty if good.
-        warnings: what is not as it should be, but too small or too uncertain to say no.
-        next_steps: what to do: first about what explains errors, then about the reasons. About
-            other warnings only where there is no reason, since what is wrong makes warnings of its
-            own; about mere errors only where nothing was found that explains them.
-        findings: every check with its outcome.
-    """
-
-    good: bool
-    line: str
-    reasons: tuple[str, ...]
+    good: bool  #: whether the model may be used
+    line: str  #: one sentence: whether it predicts unseen motion well, and by how much
+    reasons: tuple[str, ...]  #: what is wrong, in words; empty if good
+    #: what is not as it should be, but too small or too uncertain to say no
     warnings: tuple[str, ...] = ()
+    #: what to do: first about what explains errors, then about the reasons. About other warnings
+    #: only where there is no reason, since what is wrong makes warnings of its own; about mere
+    #: errors only where nothing was found that explains them
     next_steps: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  #: every check with its outcome
 
 
 def judge(

@@ -26,14 +26,10 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane with free space on one side: points x with ``normal · x >= offset``.
+    """A plane with free space on one side: points x with ``normal · x >= offset``."""
 
-    Attributes:
-        normal: direction into the free space, base axes; any length but zero.
-        offset: for a normal of length 1, the plane's distance from the base's origin along it [m].
-    """
-
-    normal: Vector
+    normal: Vector  #: direction into the free space, base axes; any length but zero
+    #: for a normal of length 1, the plane's distance from the base's origin along it [m]
     offset: float
 
     def __post_init__(self) -> None:
@@ -61,19 +57,12 @@ class Box:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Obstacles in the base frame of the URDF, and the distance to keep from them.
+    """Obstacles in the base frame of the URDF, and the distance to keep from them."""
 
-    Attributes:
-        floor: height of the floor [m]; None where there is none.
-        walls: planes.
-        boxes: solid boxes.
-        margin: least distance [m] between the arm and anything, itself included.
-    """
-
-    floor: float | None = 0.0
-    walls: tuple[Wall, ...] = ()
-    boxes: tuple[Box, ...] = ()
-    margin: float = 0.05
+    floor: float | None = 0.0  #: height of the floor [m]; None where there is none
+    walls: tuple[Wall, ...] = ()  #: planes
+    boxes: tuple[Box, ...] = ()  #: solid boxes
+    margin: float = 0.05  #: least distance [m] between the arm and anything, itself included
 
     def __post_init__(self) -> None:
         if self.floor is not None and not np.isfinite(self.floor):

@@ -42,22 +42,14 @@ _MOST_GAPS: Final = 1000
 
 
 class Contact(NamedTuple):
-    """The arm closer to something than the margin.
+    """The arm closer to something than the margin."""
 
-    Attributes:
-        first, second: the two links, or a link and an obstacle ("floor", "wall 0", "box 1").
-        sample: index of the posture, among those that it was found in.
-        time: when [s]; None on a way that has no times.
-        posture: joint positions there [rad].
-        distance: between them [m], negative where they overlap: how far they would have to be
-            moved to part.
-    """
-
-    first: str
-    second: str
-    sample: int
-    time: float | None
-    posture: tuple[float, ...]
+    first: str  #: the two links, or a link and an obstacle ("floor", "wall 0", "box 1")
+    second: str  #: the two links, or a link and an obstacle ("floor", "wall 0", "box 1")
+    sample: int  #: index of the posture, among those that it was found in
+    time: float | None  #: when [s]; None on a way that has no times
+    posture: tuple[float, ...]  #: joint positions there [rad]
+    #: between them [m], negative where they overlap: how far they would have to be moved to part
     distance: float
 
 

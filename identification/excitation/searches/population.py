@@ -27,51 +27,38 @@ Method = Literal["a", "b", "balanced", "front"]
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """What is sought, and with how much effort.
+    """What is sought, and with how much effort."""
 
-    Attributes:
-        method: "a": the largest log10 det (D-optimal, eq. 9); "b": the largest fitness by eq. 7
-            as printed; "balanced": both measures in units of their spread over random motions;
-            "front": all compromises between the two at once (NSGA-II), the knee is chosen.
-        population: individuals in a generation.
-        generations: how many generations are scored, the first, random one among them:
-            150 x 120 are 18 000 individuals.
-        crossover: probability that a pair of parents is crossed (Table 1: "cross-over rate").
-        mutation: probability that a gene of a child is changed (Table 1: "mutation").
-        weights: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced").
-        seed: the same seed gives the same design, to the last bit.
-        polish: evaluations of a local search from the winner; 0 for none.
-        crossover_eta: how close children stay to their parents (SBX), the larger the closer.
-        mutation_eta: how close a changed gene stays to what it was, the larger the closer.
-    """
-
+    #: "a": the largest log10 det (D-optimal, eq. 9); "b": the largest fitness by eq. 7 as
+    #: printed; "balanced": both measures in units of their spread over random motions; "front":
+    #: all compromises between the two at once (NSGA-II), the knee is chosen
     method: Method = "front"
-    population: int = 150
+    population: int = 150  #: individuals in a generation
+    #: how many generations are scored, the first, random one among them: 150 x 120 are 18 000
+    #: individuals
     generations: int = 120
+    #: probability that a pair of parents is crossed (Table 1: "cross-over rate")
     crossover: float = 0.9
-    mutation: float = 0.01
+    mutation: float = 0.01  #: probability that a gene of a child is changed (Table 1: "mutation")
+    #: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced")
     weights: tuple[float, float] = (0.7, 0.3)
-    seed: int = 0
-    polish: int = 0
+    seed: int = 0  #: the same seed gives the same design, to the last bit
+    polish: int = 0  #: evaluations of a local search from the winner; 0 for none
+    #: how close children stay to their parents (SBX), the larger the closer
     crossover_eta: float = 15.0
+    #: how close a changed gene stays to what it was, the larger the closer
     mutation_eta: float = 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Finds the scores of motions given by genes.
+    """Finds the scores of motions given by genes."""
 
-    Attributes:
-        genome: what genes mean.
-        objective: how good a motion is.
-        constraints: what it must keep.
-        period: motions are sampled this often [s] while searching: in the middle of such steps
-            for the objective, at their ends for the constraints.
-    """
-
-    genome: Genome
-    objective: Objective
-    constraints: Constraints
+    genome: Genome  #: what genes mean
+    objective: Objective  #: how good a motion is
+    constraints: Constraints  #: what it must keep
+    #: motions are sampled this often [s] while searching: in the middle of such steps for the
+    #: objective, at their ends for the constraints
     period: float = SAMPLE_PERIOD
 
     def score(self, genes: Array) -> Scores:

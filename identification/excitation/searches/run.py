@@ -29,62 +29,44 @@ Fitness = Callable[[Scores], Array]
 
 
 class Progress(NamedTuple):
-    """How far a search is.
+    """How far a search is."""
 
-    Attributes:
-        phase: "sample" of random motions that give the scale, "search", "polish".
-        generation: generations scored so far, of `generations`.
-        generations: of the search.
-        evaluated: motions scored so far in all phases, of `total`.
-        total: how many there are going to be at most.
-        feasible: how many of them keep every constraint.
-        best: `CRITERIA` of the best motion so far, nan before there is one. With the method
-            "front" it is the knee so far.
-    """
-
-    phase: Phase
-    generation: int
-    generations: int
-    evaluated: int
-    total: int
-    feasible: int
+    phase: Phase  #: "sample" of random motions that give the scale, "search", "polish"
+    generation: int  #: generations scored so far, of `generations`
+    generations: int  #: of the search
+    evaluated: int  #: motions scored so far in all phases, of `total`
+    total: int  #: how many there are going to be at most
+    feasible: int  #: how many of them keep every constraint
+    #: `CRITERIA` of the best motion so far, nan before there is one. With the method "front" it
+    #: is the knee so far
     best: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The motion that a search chose, and what it chose from.
+    """The motion that a search chose, and what it chose from."""
 
-    Attributes:
-        settings: of the search.
-        genes: (n_genes,) of the chosen motion.
-        excitation: the motion, with its criteria at 1 ms, and how many motions were scored.
-        front: the best compromises of everything that the search itself scored, with measures at
-            the search's own period. A polish looks for one motion, not for compromises, and is
-            left out.
-        chosen: which motion of the front it is; None where the polish found a better one.
-        origin: which motion of the front it is or, polished, grew from.
-        origin_criteria: those of that motion, at 1 ms as well. The chosen motion is not worse: in
-            its fitness, with the method "front" in neither measure. A polished one that is, at
-            1 ms and against what the search saw at its own period, is not chosen.
-        history: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion so
-            far, nan before there is one. With the method "front" the fitness is nan and the
-            measures are the best of each, of different motions.
-        complete: whether the search ran to its end.
-        exhausted: whether that end came before its last generation, as mating brought nothing new.
-        scale: units of the balanced fitness and of the knee; None where they play no part.
-    """
-
-    settings: SearchSettings
-    genes: Array
+    settings: SearchSettings  #: of the search
+    genes: Array  #: (n_genes,) of the chosen motion
+    #: the motion, with its criteria at 1 ms, and how many motions were scored
     excitation: Excitation
+    #: the best compromises of everything that the search itself scored, with measures at the
+    #: search's own period. A polish looks for one motion, not for compromises, and is left out
     front: Front
-    chosen: int | None
-    origin: int
+    chosen: int | None  #: which motion of the front it is; None where the polish found a better one
+    origin: int  #: which motion of the front it is or, polished, grew from
+    #: those of that motion, at 1 ms as well. The chosen motion is not worse: in its fitness, with
+    #: the method "front" in neither measure. A polished one that is, at 1 ms and against what the
+    #: search saw at its own period, is not chosen
     origin_criteria: Criteria
+    #: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion so far, nan
+    #: before there is one. With the method "front" the fitness is nan and the measures are the
+    #: best of each, of different motions
     history: Array
-    complete: bool
+    complete: bool  #: whether the search ran to its end
+    #: whether that end came before its last generation, as mating brought nothing new
     exhausted: bool
+    #: units of the balanced fitness and of the knee; None where they play no part
     scale: Scale | None
 
 

@@ -22,17 +22,12 @@ ROW: Final = _MEASURES + 1 + len(KINDS)
 
 
 class Scores(NamedTuple):
-    """Scores of m motions. `len` is that of a tuple: there are `len(scores.duration)` motions.
+    """Scores of m motions. `len` is that of a tuple: there are `len(scores.duration)` motions."""
 
-    Attributes:
-        measures: (m, d) each of `CRITERIA`; the worst without excitation or without a motion.
-        duration: (m,) [s]; nan where there is no motion.
-        excess: (m, n_kinds) largest excess of each of `KINDS`, 0 where it is satisfied; inf of the
-            first one, "planning", without a motion: anything that moves is nearer to feasible.
-    """
-
-    measures: Array
-    duration: Array
+    measures: Array  #: (m, d) each of `CRITERIA`; the worst without excitation or without a motion
+    duration: Array  #: (m,) [s]; nan where there is no motion
+    #: (m, n_kinds) largest excess of each of `KINDS`, 0 where it is satisfied; inf of the first
+    #: one, "planning", without a motion: anything that moves is nearer to feasible
     excess: Array
 
     def measure(self, name: str) -> Array:
@@ -98,14 +93,10 @@ class Scale(NamedTuple):
     median over random motions of the same genome, in units of their interquartile range: with
     equal weights all matter alike. Other units of the parameters, or another normalisation by N,
     add a constant to log10 det, which drops out.
-
-    Attributes:
-        centre: medians (d,).
-        spread: interquartile ranges (d,).
     """
 
-    centre: tuple[float, ...]
-    spread: tuple[float, ...]
+    centre: tuple[float, ...]  #: medians (d,)
+    spread: tuple[float, ...]  #: interquartile ranges (d,)
 
     @classmethod
     def of(cls, scores: Scores) -> Self:
@@ -155,16 +146,11 @@ class Front:
     Motions that are alike in every measure are one: the shortest, then the one whose genes come
     first. It is therefore a function of the set of motions alone: neither their order nor their
     way into it, all at once or by parts that are merged, changes anything.
-
-    Attributes:
-        genes: (k, n_genes), within [0, 1].
-        measures: (k, d).
-        duration: (k,) [s].
     """
 
-    genes: Array
-    measures: Array
-    duration: Array
+    genes: Array  #: (k, n_genes), within [0, 1]
+    measures: Array  #: (k, d)
+    duration: Array  #: (k,) [s]
 
     @classmethod
     def empty(cls, n_genes: int) -> Self:
