@@ -18,7 +18,6 @@ from mcap.records import Channel, Schema
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import Record
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     CHUNKS,
@@ -34,7 +33,8 @@ from hil.archive.header import (
     motion_name,
 )
 from hil.archive.reader import open_archive
-from hil.archive.repair import Survey, is_indexed, survey
+from hil.archive.repair import is_indexed, survey
+from hil.archive.scan import Scan
 from hil.errors import NotAnArchiveError
 
 ASPECTS = {
@@ -102,12 +102,12 @@ def check_archive(path: str | PathLike[str]) -> Check:
     faults = checker.faults
     found = survey(path, checker.visit)
     outcome = found.outcome
-    if not found.faults and found.header is not None and not is_indexed(found):
+    if not found.faults and found.header is not None and not is_indexed(path, found):
         text = "the message indexes or the index at the end do not fit what is there"
         faults["index"].append(text)
     if found.metadata is None:
         if not any(fault.aspect == "metadata" for fault in found.faults):
-            raise _another_kind(found)
+            raise _another_kind(path, found)
         described = ["without the record hil the rest cannot be checked"]
     else:
         described = _description_faults(path, found.metadata)
@@ -132,14 +132,14 @@ def check_archive(path: str | PathLike[str]) -> Check:
     )
 
 
-def _another_kind(found: Survey) -> NotAnArchiveError:
+def _another_kind(path: Path, found: Scan) -> NotAnArchiveError:
     if found.size == 0:
-        return NotAnArchiveError(found.path, "is empty")
-    if found.written_by is None:
-        return NotAnArchiveError(found.path, "is not an MCAP file")
-    profile, library = found.written_by
+        return NotAnArchiveError(path, "is empty")
+    if found.expected.written_by is None:
+        return NotAnArchiveError(path, "is not an MCAP file")
+    profile, library = found.expected.written_by
     return NotAnArchiveError(
-        found.path,
+        path,
         f"is an MCAP file of profile {profile!r} written by {library!r}, but not an archive of hil",
         remedy="import it first",
     )
@@ -184,12 +184,12 @@ class _Checker:
         self._layouts: dict[str, MessageLayout | None] = {}
         self._gaps = 0
 
-    def visit(self, found: Survey, record: Record, messages: Mapping[str, Messages]) -> None:
+    def visit(self, found: Scan, messages: Mapping[str, Messages], offset: int) -> None:
         """Check the next chunk."""
         if found.header is None:
             return
-        place = f"the chunk at byte {record.offset}"
-        compression = container.chunk(record).compression
+        place = f"the chunk at byte {offset}"
+        compression = container.chunk(found.record).compression
         if compression != "zstd":
             text = f"{place} is compressed with {compression or 'nothing'}, not zstd"
             self.faults["chunks"].append(text)
@@ -212,7 +212,7 @@ class _Checker:
         if schema.CYCLE in rows and set(rows[schema.CYCLE].dtype.names or ()) >= _CYCLE_FIELDS:
             self._check_cycles(found.header.period, messages, rows, place)
 
-    def finish(self, found: Survey) -> None:
+    def finish(self, found: Scan) -> None:
         """Check channels and outcome."""
         header, outcome, parser = found.header, found.outcome, found.parser
         assert header is not None
@@ -247,7 +247,7 @@ class _Checker:
         if not _extends(text, profile.definition, fixed=topic != schema.CYCLE):
             self.faults["schemas"].append(f"that of {topic} is not the text of the profile")
 
-    def _rows(self, found: Survey, topic: str, messages: Messages) -> Rows:
+    def _rows(self, found: Scan, topic: str, messages: Messages) -> Rows:
         """The messages as a structured array; a `LayoutError` where one has another layout."""
         assert found.header is not None
         if topic not in self._layouts:
@@ -370,7 +370,7 @@ def overview(path: str | PathLike[str]) -> Overview:
         NotAnArchiveError: another kind of file.
         ArchiveError: it cannot be read.
     """
-    archive, found = open_archive(path, fields=()), survey(path)
+    archive, found = open_archive(path, fields=()), survey(Path(path))
     header, outcome, stamp = archive.header, archive.outcome, archive.columns["stamp"]
     ended, lost = _ended(outcome)
     further = {

@@ -46,8 +46,7 @@ _FARTHEST = 1 << 62  # bytes, less than the end of any file
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
 SUMMARY_OFFSET, DATA_END = 14, 15
-EVERY_OPCODE = frozenset(range(256))
-BUT_INDEXES = EVERY_OPCODE - {MESSAGE_INDEX}
+BUT_INDEXES = frozenset(range(256)) - {MESSAGE_INDEX}
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
@@ -188,7 +187,8 @@ def records(
     stream: BinaryIO,
     size: int,
     *,
-    only: Collection[int] = EVERY_OPCODE,
+    only: Collection[int] = BUT_INDEXES,
+    skip: Collection[int] = (),
     check_end: bool = True,
 ) -> Iterator[Record]:
     """Walk the records of the data section, DataEnd included; then check the end of the file.
@@ -197,6 +197,7 @@ def records(
         stream: the file, at its beginning.
         size: its length.
         only: opcodes of the records that are read; others are passed over.
+        skip: places of records of which only the head is read.
         check_end: whether to check summary and footer.
 
     Raises:
@@ -220,6 +221,9 @@ def records(
         if opcode not in only and length <= _SMALL:
             read(length)
         elif opcode not in only:
+            seek(length, os.SEEK_CUR)
+        elif offset in skip:
+            yield Record(offset, opcode, b"")
             seek(length, os.SEEK_CUR)
         elif length > LARGEST_RECORD:
             raise Damage(offset, f"claims {length} bytes of content")
@@ -374,13 +378,11 @@ class Summary:
         return [item(record) for record in self.records if record.opcode == opcode]
 
     @property
-    def others(self) -> list[tuple[int, int]]:
-        """Offset and length of metadata and attachments, in the order of the file."""
-        found = [*self.entries(METADATA_INDEX), *self.entries(ATTACHMENT_INDEX)]
-        return sorted((entry.offset, entry.length) for entry in found)
-
-    @property
     def places(self) -> list[tuple[int, int]]:
-        """The same of all records in an index."""
+        """Offset and length of the records in an index, in the order of the file."""
+        others = [*self.entries(METADATA_INDEX), *self.entries(ATTACHMENT_INDEX)]
         chunks = self.entries(CHUNK_INDEX)
-        return sorted([*self.others, *((c.chunk_start_offset, c.chunk_length) for c in chunks)])
+        return sorted(
+            [(one.offset, one.length) for one in others]
+            + [(one.chunk_start_offset, one.chunk_length) for one in chunks]
+        )

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import errno
-import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from hil.archive import container, schema
+from hil.archive import schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import Messages
-from hil.archive.container import Damage, Record, Summary
+from hil.archive.container import Damage
 from hil.archive.events import ArchivedEvent
-from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome, is_known
-from hil.archive.scan import NUMBERS, Expected, Scan
+from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome
+from hil.archive.scan import ALWAYS, NUMBERS, Scan
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import json_of, opened
 
-_ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and beyond every stamp
-_BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _COLUMN_OF: Final = {"effort": "torque"}  # where a message has another word for it than we
 _REMEDIES: Final = {
     errno.ENOENT: "see whether it was moved or removed",
@@ -204,7 +201,7 @@ class _Columns:
     def append(self, messages: Messages, times: tuple[int, int]) -> None:
         """Append those of a range of times [ns]."""
         stamps = messages.stamps
-        chosen = None if times == _ALWAYS else (stamps >= times[0]) & (stamps < times[1])
+        chosen = None if times == ALWAYS else (stamps >= times[0]) & (stamps < times[1])
         begin = 0
         for data in messages.data:
             part = slice(begin, begin + len(data))
@@ -235,8 +232,8 @@ class _Columns:
         self._raw = {name: np.resize(raw, room) for name, raw in self._raw.items()}
 
 
-class _Content(Scan):
-    """What is selected of a file, up to its first damage; see `open_archive` for the arguments.
+class _Content:
+    """What is selected of a file; see `open_archive` for the arguments.
 
     Attributes:
         events: what happened, in the order of writing.
@@ -247,96 +244,25 @@ class _Content(Scan):
         fields: Collection[str] | None,
         topics: Collection[str] | None,
         times: tuple[int, int],
-        expected: Expected,
-        *,
-        gapless: bool,
     ) -> None:
-        super().__init__(expected, gapless=gapless, batch=_BATCH)
         self.events: list[ArchivedEvent] = []
         self._fields = fields
         self._topics = topics
         self._times = times
         self._columns: dict[str, _Columns] = {}
 
-    @property
-    def topics(self) -> Collection[str]:
-        """The channels wanted."""
-        if self._topics is not None:
-            return self._topics
-        own = CYCLE in self.parser.topics
-        return (CYCLE, EVENTS) if own else (schema.MEASURED, schema.MOTOR_CURRENT, EVENTS)
-
-    def collect(self, records: Iterable[Record], size: int) -> Damage | None:
-        """Take records up to their end or the first damage, which is returned.
-
-        Args:
-            records: of the data section, in the order of the file.
-            size: length of the file.
-        """
-        damage = None
-        try:
-            for record in records:
-                self.take(record)
-                if record.opcode == container.METADATA:
-                    self._check_metadata(record.offset)
-        except Damage as found:
-            damage = found
-        try:
-            self.flush()
-            if damage is None and self._gapless and self.header is not None:
-                for _, text in self.shortfalls():
-                    raise Damage(size, f"is not there: {text}")
-        except Damage as found:  # in an earlier record
-            damage = found
-        return damage
-
-    def by_index(self, stream: BinaryIO, summary: Summary) -> bool:
-        """Take what is selected from where the summary says; False where that is damaged."""
-        try:
-            for definition in summary.definitions:
-                self.parser.define(definition)
-            others, chunks = summary.others, summary.entries(container.CHUNK_INDEX)
-        except Damage:
-            return False
-        # A chunk that has other samples than those wanted is to be seen, too.
-        topics = {*self.topics, *(NUMBERS if self._topics is None else ())}
-        wanted = {one.id for one in self.parser.channels.values() if one.topic in topics}
-        chunks = [chunk for chunk in chunks if chunk.message_index_offsets.keys() & wanted]
-        start, stop = self._times
-        within = [
-            one for one in chunks if one.message_start_time < stop and one.message_end_time >= start
-        ]
-        # Where nothing falls into the range, one chunk still tells what columns there are.
-        places = [(one.chunk_start_offset, one.chunk_length) for one in within or chunks[:1]]
-        records = (container.record_at(stream, *place) for place in sorted([*others, *places]))
-        return self.collect(records, 0) is None and self.metadata is not None
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """The columns read, all of the same length."""
-        joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
-        for columns in self._columns.values():
-            joined |= columns.finished()
-        return joined
-
-    def _check_metadata(self, offset: int) -> None:
-        """Header and outcome must be of what can be read here, and of one recording."""
-        if self.metadata is not None and not is_known(self.metadata):
-            raise Damage(offset, "is of another version")
-        if self.unusable is not None:
-            raise Damage(offset, f"(metadata {METADATA!r}) cannot be used: {self.unusable}")
-        if self.outcome is not None and not self.outcome.belongs_to(self.header):
-            self.outcome = None
-            raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
-
-    def visit(self, found: Mapping[str, Messages], offset: int) -> None:
+    def visit(self, scan: Scan, found: Mapping[str, Messages], offset: int) -> None:
         """Decode messages; nothing of them is held before all are verified."""
-        wanted = [topic for topic in self.topics if topic in found and topic != EVENTS]
+        own = CYCLE in scan.parser.topics
+        usual = (CYCLE, EVENTS) if own else (schema.MEASURED, schema.MOTOR_CURRENT, EVENTS)
+        topics = usual if self._topics is None else self._topics
+        wanted = [topic for topic in topics if topic in found and topic != EVENTS]
         if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
-        columns = {topic: self._columns_of(topic, found[topic], offset) for topic in wanted}
+        columns = {topic: self._columns_of(scan, topic, found[topic], offset) for topic in wanted}
         for topic in wanted:
             columns[topic].check(found[topic], offset)
-        if EVENTS in self.topics and EVENTS in found:
+        if EVENTS in topics and EVENTS in found:
             try:
                 events = [ArchivedEvent.decode(message) for message in found[EVENTS].all()]
             except LayoutError as error:
@@ -348,17 +274,24 @@ class _Content(Scan):
         for topic in wanted:
             columns[topic].append(found[topic], self._times)
 
-    def _columns_of(self, topic: str, messages: Messages, offset: int) -> _Columns:
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns read, all of the same length."""
+        joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
+        for columns in self._columns.values():
+            joined |= columns.finished()
+        return joined
+
+    def _columns_of(self, scan: Scan, topic: str, messages: Messages, offset: int) -> _Columns:
         """The columns of a topic, begun by its schema or by its first message."""
         if topic in self._columns:
             return self._columns[topic]
-        assert self.header is not None
-        record, first = self.parser.schema(topic), bytes(messages.data[0][0])
+        assert scan.header is not None
+        record, first = scan.parser.schema(topic), bytes(messages.data[0][0])
         try:
-            layout = schema.message_layout(topic, self.header.joint_names, record, first)
+            layout = schema.message_layout(topic, scan.header.joint_names, record, first)
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-        room = self.expected.samples if self._times == _ALWAYS else 0
+        room = scan.expected.samples if self._times == ALWAYS else 0
         return _Columns(layout, self._fields, room)
 
 
@@ -373,9 +306,9 @@ def open_archive(
     """Read an archive.
 
     A file that was cut off or damaged is read up to its last whole chunk before the damage; what
-    is read is what was written, or the archive says what it lost. Where only some channels or
-    times are wanted and the index of the file is whole, the rest is not even read, and its damages
-    go unnoticed.
+    is read is what was written, or the archive says what it lost. Where only some times are wanted
+    and the index of the file is whole, other chunks are not even read, and their damages go
+    unnoticed.
 
     Args:
         path: the file.
@@ -396,21 +329,13 @@ def open_archive(
         names = ", ".join(sorted(alike))
         raise ValueError(f"columns of {names} have the same names: open one at a time")
     times = (
-        _ALWAYS[0] if start is None else round(start * 1e9),
-        _ALWAYS[1] if stop is None else round(stop * 1e9),
+        ALWAYS[0] if start is None else round(start * 1e9),
+        ALWAYS[1] if stop is None else round(stop * 1e9),
     )
+    content = _Content(fields, topics, times)
     try:
         with opened(path) as stream:
-            size, damage = os.fstat(stream.fileno()).st_size, None
-            summary = Summary.read(stream, size)
-            expected = Expected.read(stream, size, summary)
-            content = _Content(fields, topics, times, expected, gapless=False)
-            partial = topics is not None or times != _ALWAYS
-            if not partial or summary is None or not content.by_index(stream, summary):
-                stream.seek(0)
-                content = _Content(fields, topics, times, expected, gapless=True)
-                walk = container.records(stream, size, only=container.BUT_INDEXES)
-                damage = content.collect(walk, size)
+            scan = Scan(stream, content.visit, times=times)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -418,56 +343,58 @@ def open_archive(
         raise ArchiveError(
             path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
         ) from error
-    if content.header is None:
-        raise _unreadable(path, size, content, damage)
-    recorded = sorted(content.parser.topics)
+    damage = scan.damage
+    if scan.header is None:
+        raise _unreadable(path, scan)
+    recorded = sorted(scan.parser.topics)
     unknown = [topic for topic in topics or () if topic not in recorded]
     if damage is None and recorded and unknown:
         remedy = f"it has {', '.join(recorded)}"
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
     columns, lost = content.columns(), None
     if damage is not None:
-        dropped, stamp = size - damage.offset, columns["stamp"]
+        dropped, stamp = scan.size - damage.offset, columns["stamp"]
         text = f"the record at byte {damage.offset} {damage.reason}"
         text += f" ({dropped} bytes from there on are unused)"
         if fields is None or fields:  # else nobody counts them
             duration = 1e-9 * float(stamp[-1] - stamp[0]) if len(stamp) else 0.0
             text += f"; {len(stamp)} samples ({duration:.6g} s) could be read"
-        text += "; the outcome is missing" if content.outcome is None else ""
+        text += "; the outcome is missing" if scan.outcome is None else ""
         lost = ArchiveDamage(damage.offset, dropped, text)
     return Archive(
         path=path,
-        header=content.header,
-        outcome=content.outcome,
-        attachments=content.attachments,
+        header=scan.header,
+        outcome=scan.outcome,
+        attachments=scan.attachments,
         columns=columns,
         events=tuple(content.events),
         damage=lost,
     )
 
 
-def _unreadable(path: Path, size: int, content: _Content, damage: Damage | None) -> ArchiveError:
+def _unreadable(path: Path, scan: Scan) -> ArchiveError:
     """Why a file without a header that can be used is refused."""
-    if content.unusable is not None:
-        field, problem = next(iter(content.unusable.problems.items()))
+    if scan.unusable is not None:
+        field, problem = next(iter(scan.unusable.problems.items()))
         remedy = f"what wrote this archive does not keep the profile: its record {METADATA!r} "
         return ArchiveError(path, problem, field=field, remedy=f"{remedy}must be mended there")
-    if content.metadata is not None:
-        version = content.metadata.get("format_version")
+    if scan.metadata is not None:
+        version = scan.metadata.get("format_version")
         return ArchiveVersionError(
             path,
             f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
             remedy="install a newer hil",
         )
     remedy = "record it again"
-    if size == 0:
+    if scan.size == 0:
         problem = "is empty: the recording ended before anything was written"
-    elif damage is None:
+    elif scan.damage is None:
         problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
         remedy = "name a file that hil recorded or imported"
-    elif damage.offset == 0:
+    elif scan.damage.offset == 0:
         problem = "is not an MCAP file"
         remedy = "name a file that hil recorded, or import this one first"
     else:
-        problem = f"is torn before its first data: the record at byte {damage.offset} {damage}"
+        place = f"the record at byte {scan.damage.offset} {scan.damage}"
+        problem = f"is torn before its first data: {place}"
     return NotAnArchiveError(path, problem, remedy=remedy)

@@ -11,197 +11,38 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
-
-from mcap.records import Header
+from typing import BinaryIO
 
 from hil.archive import container, header, schema
 from hil.archive.chunk import ChunkParser, Messages
-from hil.archive.container import Damage, Record, Summary
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.mcap_writer import McapWriter, entries_of, span
 from hil.archive.reader import open_archive
-from hil.archive.scan import NUMBERS, Expected, Scan
+from hil.archive.scan import Scan
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.files import replacing, sync_folder
 from hil.reading import opened
 
-_ASPECTS = {
-    container.METADATA: "metadata",
-    container.ATTACHMENT: "attachments",
-    container.CHUNK: "chunks",
-}
-_CONTENT = (*_ASPECTS, container.SCHEMA, container.CHANNEL)
+Visit = Callable[[Scan, Mapping[str, Messages], int], None]
 
 
-class Fault(NamedTuple):
-    """Something that is not as it must be.
-
-    Attributes:
-        aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
-        text: what is wrong, as a sentence without its end.
-        loss: whether content is lost by it; otherwise it follows from what is there.
-    """
-
-    aspect: str
-    text: str
-    loss: bool
-
-
-Visit = Callable[["Survey", Record, Mapping[str, Messages]], None]
-
-
-class Survey(Scan):
-    """What can be believed of a file; message indexes and summary are not looked at.
-
-    Args:
-        path: the file.
-        stream: the same, open.
-        visit: called with each sound chunk.
-
-    Attributes:
-        path: the file.
-        size: its length.
-        written_by: profile and library, None where the record is damaged.
-        pieces: sound records, but for header and outcome, in the order of the file: opcode, offset
-            and length with the head.
-        faults: what is wrong.
-    """
-
-    def __init__(self, path: Path, stream: BinaryIO, visit: Visit | None) -> None:
-        self.path = path
-        self.size = os.fstat(stream.fileno()).st_size
-        self.written_by: tuple[str, str] | None = None
-        self.pieces: list[tuple[int, int, int]] = []
-        self.faults: list[Fault] = []
-        self._visit = visit
-        self._record = Record(0, 0, b"")  # the one that is examined
-        self._lost_since = False
-        # Found from head to head, since a chunk of another length may have come before it.
-        walk = container.records(stream, self.size, only=(container.DATA_END,), check_end=False)
-        try:
-            end: int | None = next(walk).end
-        except Damage:
-            end = None
-        summary = Summary.read(stream, self.size, start=end)
-        super().__init__(
-            Expected.read(stream, self.size, summary),
-            gapless=False,
-            definitions=summary.definitions if summary else (),
-        )
-        self._run(stream, summary)
-
-    @property
-    def losses(self) -> list[str]:
-        """What is lost, and where; empty if everything that was written is there."""
-        if not any(fault.loss for fault in self.faults):
-            return []
-        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
-
-    @property
-    def mixed(self) -> bool:
-        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
-        return self.outcome is not None and not self.outcome.belongs_to(self.header)
-
-    @property
-    def samples(self) -> int:
-        """Samples that are sound."""
-        return max(self.counts.get(topic, 0) for topic in NUMBERS)
-
-    @property
-    def samples_lost(self) -> int | None:
-        """Samples that are not, None where nobody can say."""
-        if not self.losses:
-            return 0
-        stated = self.outcome.samples if self.outcome else None
-        return None if stated is None else max(0, stated - self.samples)
-
-    def _run(self, stream: BinaryIO, summary: Summary | None) -> None:
-        seen: set[int] = set()
-        stream.seek(0)
-        only = container.BUT_INDEXES
-        try:
-            for record in container.records(stream, self.size, only=only, check_end=False):
-                seen.add(record.offset)
-                self._examine(record)
-        except Damage as damage:
-            self._lost_since = True  # and what is lost, counts and outcome will tell
-            self._fault("container", damage, loss=False)
-        try:
-            places = summary.places if summary else []
-        except Damage:
-            places = []
-        for place in places:
-            if place[0] not in seen:  # the walk did not get there
-                seen.add(place[0])
-                try:
-                    self._examine(container.record_at(stream, *place))
-                except Damage as damage:
-                    self._fault("container", damage, loss=True)
-        if self.metadata is not None:
-            if self.written_by != (schema.PROFILE, schema.LIBRARY):
-                self._fault("container", "the header is not that of the profile", loss=False)
-            if self.mixed:
-                self._fault("outcome", "the outcome is that of another recording", loss=True)
-            for aspect, text in self.shortfalls():
-                self._fault(aspect, text, loss=True)
-
-    def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
-        self._lost_since |= loss
-        if isinstance(problem, Damage):
-            problem = f"the record at byte {problem.offset} {problem.reason}"
-        fault = Fault(aspect, problem, loss)
-        if fault not in self.faults:
-            self.faults.append(fault)
-
-    def _examine(self, record: Record) -> None:
-        self._record, ours = record, (self.metadata, self.outcome)
-        try:
-            if record.opcode == container.HEADER:
-                head = container.parsed(Header, record)
-                self.written_by = head.profile, head.library
-            self.take(record)
-        except Damage as damage:
-            aspect = _ASPECTS.get(record.opcode, "container")
-            self._fault(aspect, damage, loss=record.opcode != container.HEADER)
-            return
-        is_ours = ours != (self.metadata, self.outcome)
-        if record.opcode in _CONTENT and not is_ours and self.metadata is not None:
-            self.pieces.append((record.opcode, record.offset, record.size))
-
-    def visit(self, found: Mapping[str, Messages], offset: int) -> None:  # noqa: ARG002
-        """Have a chunk checked."""
-        self._lost_since = False
-        if self._visit is not None:
-            self._visit(self, self._record, found)
-
-    def missing(self, topics: Collection[str], offset: int) -> None:
-        """Note that messages are missing; a gap in samples must show in the samples behind it."""
-        if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
-            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
-        if not self._lost_since and not self.expected.repaired:
-            damage = Damage(offset, "(chunk) does not continue the one before")
-            self._fault("sequence", damage, loss=True)
-
-
-def survey(path: str | PathLike[str], visit: Visit | None = None) -> Survey:
+def survey(path: Path, visit: Visit = lambda *_: None) -> Scan:
     """Go through a whole file, past its damages.
 
     Args:
         path: the file.
-        visit: called with each sound chunk, with its messages by topic.
+        visit: called with each sound chunk, with its messages by topic and its offset.
 
     Raises:
         ArchiveError: it cannot be read.
     """
-    path = Path(path)
     try:
         with opened(path) as stream:
-            return Survey(path, stream, visit)
+            return Scan(stream, visit, past_damage=True)
     except OSError as error:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
 
@@ -265,10 +106,10 @@ def repair(
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
-    whole = not found.faults and is_indexed(found)
+    whole = not found.faults and is_indexed(path, found)
     written = None
     if not whole or (output is not None and not in_place):
-        _rewrite(found, target)
+        _rewrite(path, found, target)
         written = target
     return Repair(path, written, whole, tuple(found.losses), found.samples, found.samples_lost)
 
@@ -288,19 +129,21 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
         ArchiveError: it is no whole archive.
         ArchiveWriteError: the disk refuses; the archive is as it was.
     """
+    path = Path(path)
     found = survey(path)
-    if found.faults or found.metadata is None or found.outcome is None or not is_indexed(found):
-        raise ArchiveError(found.path, "is not whole", remedy="repair it with `hil archive repair`")
-    _rewrite(found, found.path, {"outcome": outcome, "reason": reason})
+    if found.faults or found.header is None or found.outcome is None or not is_indexed(path, found):
+        raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
+    _rewrite(path, found, path, {"outcome": outcome, "reason": reason})
 
 
-def is_indexed(found: Survey) -> bool:
+def is_indexed(path: Path, found: Scan) -> bool:
     """Whether message indexes, summary and all else that follows from a sound content fit it.
 
     Args:
-        found: of a file whose content has no fault.
+        path: the file.
+        found: what is in it, without a fault.
     """
-    with opened(found.path) as stream, opened(found.path) as other:
+    with opened(path) as stream, opened(path) as other:
         same = True
 
         def compare(data: bytes) -> None:
@@ -311,13 +154,16 @@ def is_indexed(found: Survey) -> bool:
         return same and not other.read(1)
 
 
-def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = None) -> None:
-    """Make an archive of what stands of another; `target` is at any moment what it was, or whole.
+def _rewrite(
+    path: Path, found: Scan, target: Path, outcome: Mapping[str, str] | None = None
+) -> None:
+    """Make an archive of what is sound of another; `target` is always what it was, or whole.
 
     File and folder are on the disk when this returns, and the file has the mode of its source.
 
     Args:
-        found: what stands of it.
+        path: the source.
+        found: what is sound of it.
         target: the file to write or to replace, which may be the source.
         outcome: entries of its outcome that are to be others than before.
 
@@ -326,7 +172,7 @@ def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = No
         ArchiveError: what was written cannot be read back; it is thrown away.
     """
     try:
-        with found.path.open("rb") as stream, replacing(target) as temporary:
+        with path.open("rb") as stream, replacing(target) as temporary:
             with temporary.open("xb") as output:
                 os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
                 _copy(found, stream, output.write, outcome)
@@ -335,7 +181,7 @@ def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = No
             back = open_archive(temporary, fields=())
             if not back.complete:
                 raise ArchiveError(
-                    found.path,
+                    path,
                     f"cannot be written anew: {back.damage}",
                     remedy="it is as it was, and what opens of it can be read: restore it from a "
                     "copy, or record again",
@@ -351,7 +197,7 @@ def _rewrite(found: Survey, target: Path, outcome: Mapping[str, str] | None = No
 
 
 def _copy(
-    found: Survey,
+    found: Scan,
     stream: BinaryIO,
     write: Callable[[bytes], object],
     outcome: Mapping[str, str] | None = None,
@@ -383,7 +229,7 @@ def _copy(
     writer.finish()
 
 
-def _description(found: Survey) -> dict[str, str]:
+def _description(found: Scan) -> dict[str, str]:
     """The ``hil`` record: as it was, without the attachments that are lost."""
     assert found.metadata is not None and found.header is not None
     names = [name for name in found.header.attachments if name in found.attachments]
@@ -392,7 +238,7 @@ def _description(found: Survey) -> dict[str, str]:
     return {**found.metadata, "attachments": json.dumps(names)}
 
 
-def _outcome(found: Survey, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
+def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
     """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
     chunk_list = {header.CHUNKS: header.chunk_list(chunks)}
     if not found.losses and found.outcome is not None:

@@ -1,20 +1,17 @@
 """Goes through an archive record by record, and verifies that each is one that was written.
 
-The reader stops at the first damage (`hil.archive.reader`), checks and repairs go on behind it
-(`hil.archive.repair`).
-
-The checksum of a chunk says that it is whole, not that it is of this recording: a file system may
-put a chunk of another archive in its place. The outcome has the checksums of all chunks in order,
-so that each is known by its own. Archives of earlier versions have no such list, torn ones no
-outcome: there the cycles must do, which grow from the first to the last that the outcome names.
+The reader stops at the first damage, checks and repairs go on behind it. The checksum of a chunk
+says that it is whole, not that it is of this recording: a file system may put a chunk of another
+archive in its place. The outcome has the checksums of all chunks in order, so that each is known by
+its own; where there is no such list, the cycles must do, which grow.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
 from mcap.records import Header
@@ -35,25 +32,33 @@ from hil.archive.header import (
 
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
 """Channels that have one message of each sample."""
+ALWAYS: Final = -(1 << 63), 1 << 63
+"""ns, before and beyond every stamp."""
 
+_BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
+_ASPECTS = {
+    container.METADATA: "metadata",
+    container.ATTACHMENT: "attachments",
+    container.CHUNK: "chunks",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What a file must hold, as its end says.
+    """What a file must hold, as its begin and its end say.
 
     Attributes:
+        written_by: profile and library, None where the record is damaged.
         chunks: their checksums in order, shape (k,); None where nothing says so.
-        ends: stamps of the first and the last cycle [ns].
         mixed: whether that end is of another recording than the beginning.
         repaired: whether messages were lost before the file was written as it is.
         samples: how many were written, but no more than fit into the file.
     """
 
+    written_by: tuple[str, str] | None = None
     chunks: NDArray[np.uint32] | None = None
-    ends: tuple[int, int] | None = None
     mixed: bool = False
     repaired: bool = False
     samples: int = 0
@@ -61,7 +66,15 @@ class Expected:
     @classmethod
     def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Expected:
         """Find it, where the summary says or from head to head; the stream is left anywhere."""
-        found = {}
+        found, by = {}, None
+        stream.seek(0)
+        try:
+            record = next(container.records(stream, size, check_end=False))
+            if record.opcode == container.HEADER:
+                head = container.parsed(Header, record)
+                by = head.profile, head.library
+        except Damage:
+            pass
         if summary is not None:
             entries = summary.entries(container.METADATA_INDEX)
             found = _ours(container.record_at(stream, one.offset, one.length) for one in entries)
@@ -72,30 +85,14 @@ class Expected:
         try:
             header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
         except (HeaderError, KeyError):
-            return cls()
+            return cls(by)
         if not outcome.belongs_to(header):
-            return cls(mixed=True)
+            return cls(by, mixed=True)
         # Another program that copies a file may cut its chunks anew, and then names itself.
-        has_list = outcome.chunks is not None and _library(stream, size) == schema.LIBRARY
+        has_list = outcome.chunks is not None and by is not None and by[1] == schema.LIBRARY
         chunks = np.array(outcome.chunks, np.uint32) if has_list else None
-        first, last, ends = outcome.first_cycle, outcome.last_cycle, None
-        # What was repaired may lack either end; earlier versions took two sessions.
-        step = (header.period or 0.0) * 1e9
-        if step and first is not None and last is not None and not outcome.repaired:
-            ends = (round(first * step), round(last * step)) if first <= last else None
         samples = min(outcome.samples or 0, size // _LEAST)
-        return cls(chunks, ends, repaired=outcome.repaired, samples=samples)
-
-
-def _library(stream: BinaryIO, size: int) -> str | None:
-    """The program that the header of a file names."""
-    stream.seek(0)
-    try:
-        record = next(container.records(stream, size, check_end=False))
-        found = container.parsed(Header, record).library
-    except Damage:
-        return None
-    return found if record.opcode == container.HEADER else None
+        return cls(by, chunks, repaired=outcome.repaired, samples=samples)
 
 
 def _ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
@@ -112,36 +109,59 @@ def _ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
     return found
 
 
-class Scan(ABC):
-    """What has been verified of an archive so far.
-
-    Args:
-        expected: what must come.
-        gapless: whether every chunk comes; otherwise some are left out.
-        batch: bytes of chunks that are decoded at once; 0 to decode each by itself.
-        definitions: schemas and channels for chunks with messages of unknown channels.
+class Fault(NamedTuple):
+    """Something that is not as it must be.
 
     Attributes:
+        aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
+        text: what is wrong, as a sentence without its end.
+        loss: whether content is lost by it; otherwise it follows from what is there.
+    """
+
+    aspect: str
+    text: str
+    loss: bool
+
+
+class Scan:
+    """What has been verified of an archive.
+
+    Args:
+        stream: the file.
+        visit: uses verified messages by topic, of the chunk at an offset (and of some behind it
+            where damage ends the scan); raises `Damage` where they cannot be used, and then nothing
+            of them counts.
+        times: range of the stamps wanted [ns]; chunks that lie outside, by the index, are not read.
+        past_damage: whether to go on behind damages, `faults`, or to end at the first, `damage`.
+
+    Attributes:
+        size: of the file.
+        expected: what must come.
         metadata: entries of the ``hil`` record, None before it came.
         header: the same, parsed; None where they cannot be used, or are of another version.
         unusable: why not.
         outcome: the ``hil.outcome`` record, None before it came.
         attachments: content by file name.
         parser: of the chunks.
+        definitions: schema and channel records of the summary.
         counts: messages by topic.
-        chunks: how many chunks were taken.
+        chunks: how many chunks were accepted.
+        pieces: sound records, but for header and outcome, in the order of the file: opcode, offset
+            and length with the head.
+        record: the one that is examined.
+        damage: the first damage, where the scan ends at it.
+        faults: what is wrong, where it goes on; message indexes and summary are not looked at.
     """
 
     def __init__(
         self,
-        expected: Expected,
+        stream: BinaryIO,
+        visit: Callable[[Scan, Mapping[str, Messages], int], None],
         *,
-        gapless: bool,
-        batch: int = 0,
-        definitions: Sequence[Record] = (),
+        times: tuple[int, int] = ALWAYS,
+        past_damage: bool = False,
     ) -> None:
-        self.expected = expected
-        self.definitions = definitions
+        self.size = os.fstat(stream.fileno()).st_size
         self.metadata: dict[str, str] | None = None
         self.header: ArchiveHeader | None = None
         self.unusable: HeaderError | None = None
@@ -150,61 +170,191 @@ class Scan(ABC):
         self.parser = ChunkParser()
         self.counts: dict[str, int] = {}
         self.chunks = 0
-        self._gapless = gapless
-        self._buffer = memoryview(bytearray(batch))  # content of the chunks that wait
-        self._waiting: list[tuple[int, slice]] = []  # offset of each, and its place in the buffer
+        self.pieces: list[tuple[int, int, int]] = []
+        self.record = Record(0, 0, b"")
+        self.damage: Damage | None = None
+        self.faults: list[Fault] = []
+        self._visit = visit
+        self._past_damage = past_damage
+        self._gap = False  # whether chunks were left out, or lost, behind the last one
+        self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
+        self._waiting: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
         self._place = 0  # place in the list of the chunk that comes next
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._newest = -1  # stamp of a cycle [ns]
+        start = _data_end(stream, self.size) if past_damage else None
+        summary = Summary.read(stream, self.size, start=start)
+        self.expected = Expected.read(stream, self.size, summary)
+        self.definitions = summary.definitions if summary else []
+        stream.seek(0)
+        if past_damage:
+            self._survey(stream, summary)
+        else:
+            self._read(stream, _outside(summary, times))
 
     @property
-    def topics(self) -> Collection[str] | None:
-        """Channels whose messages are verified, None for all."""
-        return None
+    def mixed(self) -> bool:
+        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
+        return self.outcome is not None and not self.outcome.belongs_to(self.header)
 
-    @abstractmethod
-    def visit(self, found: Mapping[str, Messages], offset: int) -> None:
-        """Use verified messages by topic, of the chunk at `offset` and maybe of some behind it.
+    @property
+    def samples(self) -> int:
+        """Samples that are sound."""
+        return max(self.counts.get(topic, 0) for topic in NUMBERS)
 
-        Raises:
-            Damage: they cannot be used; then nothing of them counts.
-        """
+    @property
+    def losses(self) -> list[str]:
+        """What is lost, and where; empty if everything that was written is there."""
+        if not any(fault.loss for fault in self.faults):
+            return []
+        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
 
-    def missing(self, topics: Collection[str], offset: int) -> None:  # noqa: ARG002
-        """Messages of these topics are missing before those of the chunk at `offset`.
+    @property
+    def samples_lost(self) -> int | None:
+        """Samples that are not sound, None where nobody can say."""
+        if not self.losses:
+            return 0
+        stated = self.outcome.samples if self.outcome else None
+        return None if stated is None else max(0, stated - self.samples)
 
-        Raises:
-            Damage: that is the end.
-        """
-        if self._gapless and not self.expected.repaired:
-            reason = "(chunk) does not continue the one before it: a chunk is missing"
-            raise Damage(offset, reason)
+    def _read(self, stream: BinaryIO, outside: Collection[int]) -> None:
+        """Take records up to their end or the first damage."""
+        walk = container.records(stream, self.size, skip=outside)
+        try:
+            try:
+                for record in walk:
+                    if record.offset in outside:
+                        self._flush()
+                        self._place, self._gap = self._place + 1, True
+                        continue
+                    self._take(record)
+                    if record.opcode == container.METADATA:
+                        self._require_ours(record.offset)
+            except Damage as damage:
+                self.damage = damage
+            self._flush()
+            if self.damage is None and not outside and self.header is not None:
+                for _, text in self._shortfalls():
+                    raise Damage(self.size, f"is not there: {text}")
+        except Damage as damage:  # in an earlier record
+            self.damage = damage
 
-    def take(self, record: Record) -> None:
+    def _require_ours(self, offset: int) -> None:
+        """Header and outcome must be of what can be read here, and of one recording."""
+        if self.metadata is not None and not is_known(self.metadata):
+            raise Damage(offset, "is of another version")
+        if self.unusable is not None:
+            raise Damage(offset, f"(metadata {METADATA!r}) cannot be used: {self.unusable}")
+        if self.mixed:
+            self.outcome = None
+            raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+
+    def _survey(self, stream: BinaryIO, summary: Summary | None) -> None:
+        """Take all records that are sound, also those that only the index leads to."""
+        seen: set[int] = set()
+        try:
+            for record in container.records(stream, self.size, check_end=False):
+                seen.add(record.offset)
+                self._examine(record)
+        except Damage as damage:
+            self._gap = True  # and what is lost, counts and outcome will tell
+            self._fault("container", damage, loss=False)
+        try:
+            places = summary.places if summary else []
+        except Damage:
+            places = []
+        for place in places:
+            if place[0] not in seen:
+                seen.add(place[0])
+                try:
+                    self._examine(container.record_at(stream, *place))
+                except Damage as damage:
+                    self._fault("container", damage, loss=True)
+        if self.metadata is not None:
+            if self.expected.written_by != (schema.PROFILE, schema.LIBRARY):
+                self._fault("container", "the header is not that of the profile", loss=False)
+            if self.mixed:
+                self._fault("outcome", "the outcome is that of another recording", loss=True)
+            for aspect, text in self._shortfalls():
+                self._fault(aspect, text, loss=True)
+
+    def _examine(self, record: Record) -> None:
+        try:
+            self._take(record)
+        except Damage as damage:
+            self._fault(_ASPECTS.get(record.opcode, "container"), damage, loss=True)
+
+    def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
+        self._gap |= loss
+        if isinstance(problem, Damage):
+            problem = f"the record at byte {problem.offset} {problem.reason}"
+        fault = Fault(aspect, problem, loss)
+        if fault not in self.faults:
+            self.faults.append(fault)
+
+    def _take(self, record: Record) -> None:
         """Verify the next record, and take what it holds.
 
         Raises:
             Damage: it is not one that was written, or not the next.
         """
-        offset = record.offset
+        self.record, offset = record, record.offset
         if record.opcode == container.CHUNK:
-            if self.metadata is not None:  # else some other MCAP file
-                head = container.chunk(record)
-                data = container.chunk_data(head, offset)
-                self._check_order(head.uncompressed_crc, offset)
-                self._take_chunk(data, offset)
+            if self.metadata is None:
+                return  # some other MCAP file
+            head = container.chunk(record)
+            data = container.chunk_data(head, offset)
+            self._check_order(head.uncompressed_crc, offset)
+            self._take_chunk(data, offset)
         elif record.opcode == container.ATTACHMENT:
             attachment = container.attachment(record)
             if attachment.name in self.attachments:
                 raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode == container.METADATA:
-            self._take_metadata(record)
-        else:
+            if self._take_metadata(record):
+                return
+        elif record.opcode in (container.SCHEMA, container.CHANNEL):
             self.parser.define(record)
+        else:
+            return
+        if self.metadata is not None:
+            self.pieces.append((record.opcode, offset, record.size))
 
-    def flush(self) -> None:
+    def _take_metadata(self, record: Record) -> bool:
+        """Take header or outcome; whether the record is one of them."""
+        name, entries = container.metadata(record)
+        if name not in (METADATA, OUTCOME):
+            return False
+        if entries.pop("checksum", None) != checksum(entries):
+            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
+        if (self.metadata if name == METADATA else self.outcome) is not None:
+            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
+        if name == OUTCOME:
+            self.outcome = ArchiveOutcome.of(entries)
+            return True
+        self.metadata = entries
+        try:
+            self.header = ArchiveHeader.of(entries) if is_known(entries) else None
+        except HeaderError as error:
+            self.unusable = error
+        return True
+
+    def _take_chunk(self, data: bytes, offset: int) -> None:
+        """Decode the content of a chunk, or have it wait for others."""
+        begin = self._waiting[-1][1].stop if self._waiting else 0
+        if begin + len(data) >= len(self._buffer):
+            self._flush()
+            begin = 0
+        if len(data) >= len(self._buffer):
+            self._decode(data, offset)
+            self.chunks += 1
+        else:
+            self._waiting.append((offset, slice(begin, begin + len(data))))
+            self._buffer[begin : begin + len(data)] = data
+
+    def _flush(self) -> None:
         """Decode the chunks that wait: all at once, or one by one where that fails.
 
         Raises:
@@ -222,20 +372,7 @@ class Scan(ABC):
             self._decode(self._buffer[place], offset)
             self.chunks += 1
 
-    def _take_chunk(self, data: bytes, offset: int) -> None:
-        """Decode the content of a chunk, or have it wait for others."""
-        begin = self._waiting[-1][1].stop if self._waiting else 0
-        if begin + len(data) >= len(self._buffer):
-            self.flush()
-            begin = 0
-        if len(data) >= len(self._buffer):
-            self._decode(data, offset)
-            self.chunks += 1
-        else:
-            self._waiting.append((offset, slice(begin, begin + len(data))))
-            self._buffer[begin : begin + len(data)] = data
-
-    def shortfalls(self) -> Iterator[tuple[str, str]]:
+    def _shortfalls(self) -> Iterator[tuple[str, str]]:
         """What the file says that it holds and does not: aspect of the profile, and sentence."""
         for name in self.header.attachments if self.header else ():
             if name not in self.attachments:
@@ -244,40 +381,21 @@ class Scan(ABC):
         if outcome is None:
             yield "outcome", "the outcome is missing"
             return
-        found: dict[str, tuple[int | None, int]] = {}
-        counts = {"samples": NUMBERS, "events": (schema.EVENTS,), "packets": (schema.PACKETS,)}
-        for key, topics in counts.items():
-            known = key != "packets" or key in outcome.record
-            if known and (self.topics is None or not set(topics).isdisjoint(self.topics)):
-                count = max(self.counts.get(topic, 0) for topic in topics)
-                found[key] = getattr(outcome, key), count
+        found = {
+            "samples": (outcome.samples, self.samples),
+            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
+        }
+        if "packets" in outcome.record:
+            found["packets"] = outcome.packets, self.counts.get(schema.PACKETS, 0)
         if self.expected.chunks is not None:
             found["chunks"] = len(self.expected.chunks), self.chunks
         for key, (stated, count) in found.items():
             if stated != count:
                 yield "outcome", f"{stated} {key} were written, {count} are there"
 
-    def _take_metadata(self, record: Record) -> None:
-        """Take header or outcome; another record's name is passed over."""
-        name, entries = container.metadata(record)
-        if name not in (METADATA, OUTCOME):
-            return
-        if entries.pop("checksum", None) != checksum(entries):
-            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
-        if (self.metadata if name == METADATA else self.outcome) is not None:
-            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
-        if name == OUTCOME:
-            self.outcome = ArchiveOutcome.of(entries)
-            return
-        self.metadata = entries
-        try:
-            self.header = ArchiveHeader.of(entries) if is_known(entries) else None
-        except HeaderError as error:
-            self.unusable = error
-
     def _check_order(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum is the next of those that were written."""
-        if self.expected.mixed and self._gapless:
+        if self.expected.mixed and not self._past_damage:
             reason = "(chunk) may be of either of two: the outcome is that of another recording"
             raise Damage(offset, reason)
         chunks = self.expected.chunks
@@ -290,7 +408,7 @@ class Scan(ABC):
         if not len(places) or places[-1] < self._place:
             why = "comes after one that followed it" if len(places) else "is of another recording"
             raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
-        if self._gapless:
+        if not self._past_damage:
             raise Damage(offset, "(chunk) does not continue the one before")
         self._place = int(places[-1]) + 1
 
@@ -306,23 +424,22 @@ class Scan(ABC):
             if unknown := by_number.keys() - parser.channels.keys():
                 raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
             found = {parser.channels[number].topic: one for number, one in by_number.items()}
-            wanted = found.keys() if self.topics is None else self.topics
             numbers = found.keys() & set(NUMBERS)
             if numbers and self._numbers not in (set(), numbers):
                 reason = "(chunk) has samples in other channels than those before"
                 raise Damage(offset, reason)
-            verified = {topic: one for topic, one in found.items() if topic in wanted}
-            missing = self._check_sequences(verified, offset)
-            newest = self._check_times(verified, offset)
+            missing = self._check_sequences(found, offset)
+            newest = self._check_times(found, offset)
             if missing:
-                self.missing(missing, offset)
-            self.visit(found, offset)
+                self._check_gap(missing, offset)
+            self._visit(self, found, offset)
         except Damage:
             parser.schemas, parser.channels = before  # what it says goes with it
             raise
+        self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
-        for topic, messages in verified.items():
+        for topic, messages in found.items():
             self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
 
@@ -339,6 +456,19 @@ class Scan(ABC):
         if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
         return [topic for topic, gap in gaps.items() if gap]
+
+    def _check_gap(self, topics: Collection[str], offset: int) -> None:
+        """Messages of these topics are missing in front of the chunk at `offset`."""
+        if not self._past_damage:
+            if not self._gap and not self.expected.repaired:
+                reason = "(chunk) does not continue the one before it: a chunk is missing"
+                raise Damage(offset, reason)
+            return
+        if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
+            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
+        if not self._gap and not self.expected.repaired:
+            damage = Damage(offset, "(chunk) does not continue the one before")
+            self._fault("sequence", damage, loss=True)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles follow those before and are of this recording.
@@ -360,11 +490,36 @@ class Scan(ABC):
             return -1
         if (np.diff(stamp) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not grow")
-        first, last = self.expected.ends or (int(stamp[0]), int(stamp[-1]))
-        begins = int(found[timed[0]].of_heads("sequence")[0]) == 0
-        if stamp[0] < first or stamp[-1] > last or (begins and stamp[0] != first):
-            reason = "(chunk) has cycles of another recording: the outcome names others"
-            raise Damage(offset, reason)
         if stamp[0] <= self._newest:
             raise Damage(offset, "(chunk) has cycles that do not follow those before")
         return int(stamp[-1])
+
+
+def _data_end(stream: BinaryIO, size: int) -> int | None:
+    """Where the data section ends, from head to head: not where its index says if records moved."""
+    walk = container.records(stream, size, only=(container.DATA_END,), check_end=False)
+    try:
+        return next(walk).end
+    except Damage:
+        return None
+
+
+def _outside(summary: Summary | None, times: tuple[int, int]) -> Collection[int]:
+    """Where chunks begin that hold nothing of these times, by the index.
+
+    Where none does, the first is read all the same: it says what columns there are.
+    """
+    if summary is None or times == ALWAYS:
+        return ()
+    try:
+        chunks = summary.entries(container.CHUNK_INDEX)
+    except Damage:
+        return ()
+    start, stop = times
+    within = {
+        one.chunk_start_offset
+        for one in chunks
+        if one.message_start_time < stop and one.message_end_time >= start
+    }
+    known = {one.chunk_start_offset for one in chunks}
+    return known - (within or {min(known, default=0)})

@@ -81,7 +81,7 @@ class Written:
 def records_of(path: Path) -> list[Record]:
     """The records of a file up to DataEnd."""
     with path.open("rb") as stream:
-        return list(container.records(stream, path.stat().st_size))
+        return list(container.records(stream, path.stat().st_size, only=range(256)))
 
 
 def write(
