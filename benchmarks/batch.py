@@ -76,7 +76,7 @@ def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
         first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
         hands.close()
         first_cpu = first_own + _children()
-        second, second_wall, second_own = _timed(places, Path(cache), "ols", hands)
+        second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
         hands.close()
         second_cpu = first_own + second_own + _children() - first_cpu
         kept = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())

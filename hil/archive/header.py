@@ -226,16 +226,21 @@ class ArchiveHeader(BaseModel):
             return cls.model_validate({**entries, "entries": entries})
         except ValidationError as error:
             raise HeaderError(
-                {str(one["loc"][0]): _problem(one, entries) for one in error.errors()}
+                {
+                    (name := str(one["loc"][0])): f"cannot be used: {one['msg']}"
+                    if name in entries
+                    else "is missing"
+                    for one in error.errors(include_url=False)
+                }
             ) from error
 
     @field_validator("joint_names")
     @classmethod
     def _check_joints(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if "" in names or len(set(names)) != len(names):
-            raise ValueError("is no JSON list of different names")
+            raise ValueError("some are empty or alike")
         if len(names) > MOST_JOINTS:
-            raise ValueError(f"names {len(names)} joints, known are {MOST_JOINTS}")
+            raise ValueError(f"{len(names)} joints, known are {MOST_JOINTS}")
         return names
 
     @field_validator("motor_from_joint")
@@ -245,7 +250,7 @@ class ArchiveHeader(BaseModel):
     ) -> tuple[tuple[float, ...], ...] | None:
         n = len(info.data.get("joint_names", ()))
         if rows is not None and [len(row) for row in rows] != [n] * n:
-            raise ValueError(f"is no JSON matrix of {n} by {n} numbers")
+            raise ValueError(f"is no matrix of {n} by {n} numbers")
         return rows
 
     @property
@@ -262,21 +267,6 @@ class ArchiveHeader(BaseModel):
     def serves_as(self) -> str:
         """The kind that identification takes it for."""
         return self.use if self.kind == "imported" else self.kind
-
-
-def _problem(error: Any, entries: Mapping[str, str]) -> str:
-    """What is wrong with an entry, to stand behind its name."""
-    name = str(error["loc"][0])
-    if name not in entries:
-        return "is missing"
-    if error["type"] == "value_error" and len(error["loc"]) == 1:
-        return str(error["ctx"]["error"])
-    shown = entries[name] if len(entries[name]) <= 40 else f"{entries[name][:40]}..."
-    return {
-        "joint_names": "is no JSON list of different names",
-        "motor_from_joint": "is no JSON matrix of numbers",
-        "period": f"is {shown!r}, not a time in seconds",
-    }.get(name, "is no JSON list of names")
 
 
 class ArchiveOutcome(BaseModel):

@@ -174,64 +174,6 @@ class Archive:
         return rows
 
 
-class _Columns:
-    """The fields wanted of the messages of a channel, appended batch by batch.
-
-    Args:
-        layout: of the messages.
-        fields: columns wanted, None for all.
-        room: samples that are expected.
-    """
-
-    def __init__(self, layout: MessageLayout, fields: Collection[str] | None, room: int) -> None:
-        self._layout = layout
-        self._count = 0
-        self._stamps = np.empty(room, np.int64)
-        self._raw: dict[str, Rows] = {}  # copied as bytes, which is faster
-        for name in layout.dtype.names or ():
-            wanted = fields is None or _COLUMN_OF.get(name, name) in fields
-            if wanted and name not in ("sec", "nanosec"):
-                self._raw[name] = np.empty(room, f"V{layout.dtype[name].itemsize}")
-
-    def check(self, messages: Messages, offset: int) -> None:
-        """Check that messages are like those before."""
-        if not all(map(self._layout.holds_in, messages.data)):
-            raise Damage(offset, "(chunk) has messages that differ from those before")
-
-    def append(self, messages: Messages, times: tuple[int, int]) -> None:
-        """Append those of a range of times [ns]."""
-        stamps = messages.stamps
-        chosen = None if times == ALWAYS else (stamps >= times[0]) & (stamps < times[1])
-        begin = 0
-        for data in messages.data:
-            part = slice(begin, begin + len(data))
-            begin, stamp = part.stop, stamps[part]
-            if chosen is not None:
-                data, stamp = data[chosen[part]], stamp[chosen[part]]
-            now = slice(self._count, self._count + len(stamp))
-            if now.stop > len(self._stamps):
-                self._resize(2 * now.stop)
-            self._stamps[now] = stamp
-            for name, raw in self._raw.items():
-                _, start, *_ = self._layout.dtype.fields[name]  # type: ignore[index]
-                raw[now] = data[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
-            self._count = now.stop
-
-    def finished(self) -> dict[str, NDArray[Any]]:
-        """The columns by our names, contiguous and read-only."""
-        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
-        for name, raw in self._raw.items():
-            base, shape = (dtype := self._layout.dtype[name]).subdtype or (dtype, ())
-            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
-        for column in columns.values():
-            column.flags.writeable = False
-        return columns
-
-    def _resize(self, room: int) -> None:
-        self._stamps = np.resize(self._stamps, room)
-        self._raw = {name: np.resize(raw, room) for name, raw in self._raw.items()}
-
-
 class _Content:
     """What is selected of a file; see `open_archive` for the arguments.
 
@@ -249,7 +191,10 @@ class _Content:
         self._fields = fields
         self._topics = topics
         self._times = times
-        self._columns: dict[str, _Columns] = {}
+        self._layouts: dict[str, MessageLayout] = {}
+        self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
+        self._stamps = np.zeros(0, np.int64)
+        self._count = 0
 
     def visit(self, scan: Scan, found: Mapping[str, Messages], offset: int) -> None:
         """Decode messages; nothing of them is held before all are verified."""
@@ -259,40 +204,81 @@ class _Content:
         wanted = [topic for topic in topics if topic in found and topic != EVENTS]
         if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
-        columns = {topic: self._columns_of(scan, topic, found[topic], offset) for topic in wanted}
-        for topic in wanted:
-            columns[topic].check(found[topic], offset)
+        layouts = {topic: self._layout(scan, topic, found[topic], offset) for topic in wanted}
+        for topic, layout in layouts.items():
+            if not all(map(layout.holds_in, found[topic].data)):
+                raise Damage(offset, "(chunk) has messages that differ from those before")
+        start, stop = self._times
         if EVENTS in topics and EVENTS in found:
             try:
                 events = [ArchivedEvent.decode(message) for message in found[EVENTS].all()]
             except LayoutError as error:
                 problem = f"(chunk) has an event that cannot be read: {error}"
                 raise Damage(offset, problem) from error
-            start, stop = self._times
             self.events += [event for event in events if start <= event.stamp < stop]
-        self._columns |= columns
+        if not wanted:
+            return
+        room = scan.expected.samples if self._times == ALWAYS else 0
+        for topic in layouts.keys() - self._layouts.keys():
+            self._begin(topic, layouts[topic], max(room, len(self._stamps)))
+        stamps, chosen = found[wanted[0]].stamps, None
+        if self._times != ALWAYS:
+            chosen = (stamps >= start) & (stamps < stop)
+            stamps = stamps[chosen]
+        begin, self._count = self._count, self._count + len(stamps)
+        if self._count > len(self._stamps):
+            self._stamps = np.resize(self._stamps, 2 * self._count)
+            self._raw = {key: np.resize(raw, 2 * self._count) for key, raw in self._raw.items()}
+        self._stamps[begin : self._count] = stamps
         for topic in wanted:
-            columns[topic].append(found[topic], self._times)
+            self._append(topic, found[topic], begin, chosen)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """The columns read, all of the same length."""
-        joined: dict[str, NDArray[Any]] = {"stamp": np.zeros(0, np.int64)}
-        for columns in self._columns.values():
-            joined |= columns.finished()
-        return joined
+        """The columns by our names, contiguous and read-only, all of the same length."""
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for (topic, name), raw in self._raw.items():
+            dtype = self._layouts[topic].dtype[name]
+            base, shape = dtype.subdtype or (dtype, ())
+            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
+        for column in columns.values():
+            column.flags.writeable = False
+        return columns
 
-    def _columns_of(self, scan: Scan, topic: str, messages: Messages, offset: int) -> _Columns:
-        """The columns of a topic, begun by its schema or by its first message."""
-        if topic in self._columns:
-            return self._columns[topic]
+    def _layout(self, scan: Scan, topic: str, messages: Messages, offset: int) -> MessageLayout:
+        """How the messages of a topic are laid out, by its schema or by the first of them."""
+        if topic in self._layouts:
+            return self._layouts[topic]
         assert scan.header is not None
         record, first = scan.parser.schema(topic), bytes(messages.data[0][0])
         try:
-            layout = schema.message_layout(topic, scan.header.joint_names, record, first)
+            return schema.message_layout(topic, scan.header.joint_names, record, first)
         except LayoutError as error:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-        room = scan.expected.samples if self._times == ALWAYS else 0
-        return _Columns(layout, self._fields, room)
+
+    def _begin(self, topic: str, layout: MessageLayout, room: int) -> None:
+        """Begin the columns of a topic, with room for so many samples."""
+        self._layouts[topic], self._stamps = layout, np.resize(self._stamps, room)
+        for name in layout.dtype.names or ():
+            wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
+            if wanted and name not in ("sec", "nanosec"):
+                self._raw[topic, name] = np.empty(room, f"V{layout.dtype[name].itemsize}")
+
+    def _append(
+        self, topic: str, messages: Messages, at: int, chosen: NDArray[np.bool_] | None
+    ) -> None:
+        """Put messages, or those chosen of them (k,), into the columns from a place on."""
+        fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
+        columns = [(raw, fields[name][1]) for (own, name), raw in self._raw.items() if own == topic]
+        begin = 0
+        for data in messages.data:
+            part = slice(begin, begin + len(data))
+            begin = part.stop
+            if chosen is not None:
+                data = data[chosen[part]]
+            now = slice(at, at + len(data))
+            at = now.stop
+            for raw, start in columns:
+                raw[now] = data[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
 
 def open_archive(

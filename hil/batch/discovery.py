@@ -289,7 +289,7 @@ def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
     if ref.use not in USES:
         return ref
     cell, store = cell_in(archive), where.store(place.location)
-    key, nominal = json_digest([cell.text, cell.urdf]), cell.file.nominal
+    key = json_digest([cell.text, cell.urdf])
     if not store.has(key):
         store.put(key, [cell.text, cell.urdf])
     drives = archive.attachments.get("drive_train.json")
@@ -298,7 +298,6 @@ def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
         arm=arm_digest(cell, drives, simulated=ref.simulated),
         cell=key,
         setup=setup_of(cell),
-        belief="" if nominal is None else json_digest(nominal.model_dump(mode="json")),
     )
 
 

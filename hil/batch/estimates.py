@@ -11,8 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.cell import Cell
-from hil.identify.estimating import cad_prior, fit_of, required
+from hil.identify.estimating import fit_of
 from hil.identify.settings import Settings
 from identification import IdentificationError
 from identification.estimators.consistent import (
@@ -22,8 +21,7 @@ from identification.estimators.consistent import (
     fit_shrunk,
 )
 from identification.estimators.delay import with_uncertain_delay
-from identification.estimators.least_squares import Weighting, no_narrower
-from identification.estimators.prior import with_prior
+from identification.estimators.least_squares import no_narrower
 from identification.factor.factor import (
     QR_CONDITION,
     Estimate,
@@ -96,18 +94,11 @@ def plus(one: Any, other: Any) -> Any:
 
 
 class Estimator:
-    """One of the estimators, for one arm; its cell has the law of its settings.
+    """One of the estimators, for one arm; its model has the law of its settings."""
 
-    Raises:
-        InputError: the estimator needs a prior, and the cell has none.
-    """
-
-    def __init__(self, name: BatchEstimator, cell: Cell, settings: Settings) -> None:
-        self.name, self.delay_variance = name, settings.delay_variance
-        self.model: RobotModel = cell.model
+    def __init__(self, name: BatchEstimator, model: RobotModel, settings: Settings) -> None:
+        self.name, self.model, self.delay_variance = name, model, settings.delay_variance
         self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
-        self._prior = required(cad_prior(cell)) if name == "prior" else None
-        self._weighting: Weighting = "ordinary" if name == "ols" else "weighted"
 
     def centre(self, phase: PhaseFactor) -> Array | None:
         """What estimates from a sum and its archives are shrunk towards (p,); None for nothing.
@@ -123,7 +114,7 @@ class Estimator:
         weight = self._shrinkage.prior_weight
         try:
             found = consistent_estimate(
-                self.model, total, weights=self.weights(total), prior_weight=weight
+                self.model, total, weights=joint_weights(total), prior_weight=weight
             )
         except SolverError:
             return None  # least squares, as `hil identify` does it
@@ -133,25 +124,27 @@ class Estimator:
         """The estimate from one archive alone, shrunk towards the centre of all.
 
         Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise. A summary has no blocks of time: with a prior the covariance is
-        that of white residuals times the design effect, and of what is shrunk it is that of the
-        free estimate, shrunk alike.
+        repetitions is about noise. A summary has no blocks of time: the covariance of what is
+        shrunk is that of the free estimate, shrunk alike.
+
+        Raises:
+            ValueError: the archive was not fitted.
         """
-        own, total = summary.fits[self._weighting], summary.total.total
-        effect, weights = max(1.0, summary.design_effects[self._weighting]), self.weights(total)
-        if self._prior is not None:
-            found = with_prior(self.model, total, self._prior, weights, design_effect=effect)
-            return replace(found.estimate, interval_factor=own.interval_factor)
+        own, total = summary.fit, summary.total.total
+        if own is None:
+            raise ValueError(f"{summary.ref.location} was not fitted")
         if centre is None or math.isinf(self._shrinkage.strength):
             return own
         shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
-        equations = total.weighted(weights)
+        equations = total.weighted(joint_weights(total))
         prior = self._shrinkage.strength * np.diag(equations.A)
         solution = solve(equations._replace(A=equations.A + np.diag(prior)))
         share = solution.inverse @ equations.A
         known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
         covariance = share @ known @ share.T
-        covariance += effect * (solution.inverse * prior) @ solution.inverse
+        covariance += (
+            max(1.0, summary.design_effect) * (solution.inverse * prior) @ solution.inverse
+        )
         mark_undetermined(covariance, solution.determined)
         words = own.method.partition(", ")[2]
         return replace(
@@ -170,7 +163,7 @@ class Estimator:
             IdentificationError: there is no consistent solution.
         """
         assert group.phase is not None
-        fit = fit_of(self.model, self.name, self._shrinkage, centre, self._prior)
+        fit = fit_of(self.model, self.name, self._shrinkage, centre)
         found = fit((), group.phase)
         motions = {ref.motion for ref in group.refs}
         if len(motions) == 1 and "" not in motions:
@@ -179,10 +172,6 @@ class Estimator:
         if group.products is None:
             return found
         return with_uncertain_delay(found, group.phase.total, group.products, self.delay_variance)
-
-    def weights(self, total: Factor) -> Array:
-        """Weight of each joint's rows (n,)."""
-        return np.ones(len(total.samples)) if self.name == "ols" else joint_weights(total)
 
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
@@ -274,7 +263,7 @@ def sum_level(
         settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
         warnings=(*warnings, *warning_lines(group.warned)),
         speed_rms=speed_rms(model, total),
-        information=total.weighted(estimator.weights(total)).A,
+        information=total.weighted(joint_weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
         payload=payload,
         unseen=unseen,

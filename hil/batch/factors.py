@@ -27,7 +27,7 @@ from hil.progress import Silent
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay import rate_products
-from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.estimators.least_squares import fit_least_squares
 from identification.factor.factor import Estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
@@ -40,8 +40,6 @@ from .types import ArchiveRef, Broken, Bundle, ChangedError, Stamp, Summary
 BUNDLE: Final = 16
 """Archives of a campaign that are reduced together. Of each a summary is cached, of all of them one
 sum, which is fifty times the size of a summary."""
-
-WEIGHTINGS: Final[tuple[Weighting, ...]] = ("weighted", "ordinary")
 
 _FIELDS: Final = (
     "cycle",
@@ -239,7 +237,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     samples = (samples_of if fitted else judged_samples)(source, cell, settings)
     model = cell.model
     phase = PhaseFactor.from_samples(model, samples)
-    fits = {kind: _fit(model, samples, phase, kind) for kind in WEIGHTINGS} if fitted else {}
+    fit, effect = _fit(model, samples, phase) if fitted else (None, 1.0)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(source.merged_words)
@@ -248,19 +246,17 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     return Summary(
         ref=ref,
         total=phase.merged(max(1, len(phase))),
-        fits={kind: found for kind, (found, _) in fits.items()},
-        design_effects={kind: effect for kind, (_, effect) in fits.items()},
+        fit=fit,
+        design_effect=effect,
         warnings=tuple(warnings),
         products=rate_products(model, samples) if fitted and settings.delay_variance else None,
     ), phase
 
 
-def _fit(
-    model: RobotModel, samples: Samples, phase: PhaseFactor, weighting: Weighting
-) -> tuple[Estimate, float]:
+def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor) -> tuple[Estimate, float]:
     """With the mean ratio of the estimate's variances to those of white residuals."""
-    found = fit_least_squares(model, [samples], weighting, phase=phase)
-    weights = np.ones(phase.n_joints) if weighting == "ordinary" else joint_weights(phase.total)
+    found = fit_least_squares(model, [samples], phase=phase)
+    weights = joint_weights(phase.total)
     if found.undetermined:
         return found, block_covariance(phase, weights, found.values).design_effect
     information = phase.total.weighted(weights).A

@@ -74,8 +74,7 @@ def reidentify(
         check: given the archives that were found, before their samples are read; may refuse them.
 
     Raises:
-        InputError: a place does not exist, there is not one archive that can be fitted, or the
-            estimator does not suit an arm.
+        InputError: a place does not exist, or there is not one archive that can be fitted.
         CacheError: the cache cannot be written.
     """
     found = discover(roots, where, workers, reporter)
@@ -220,13 +219,14 @@ class _Batch:
         pooled: list[LevelEstimate] = []
         estimated: list[LevelEstimate] = []
         repetitions: list[LevelEstimate] = []
+        name = cast(BatchEstimator, self.options.estimator)
         archives = sum(len(refs) for one in campaigns for refs, _ in one.bundles)
         with self.reporter.task(_TITLE, archives) as progress:
             for digest, own in groupby(campaigns, lambda one: one.key.arm):
                 members = list(own)
                 settings = members[0].ready
                 arms[digest] = Arm(digest, settings.law(self._cell(members[0].refs[0])))
-                estimator = self._estimator(members, arms[digest].cell, settings)
+                estimator = Estimator(name, arms[digest].cell.model, settings)
                 everything, levels = Group(), list[LevelEstimate]()
                 for one in members:
                     group, found = self._campaign(one, estimator, progress.advance)
@@ -264,24 +264,6 @@ class _Batch:
             cached=self.cached,
             code=code_digest(),
         )
-
-    def _estimator(self, members: Sequence[_Campaign], cell: Cell, settings: Settings) -> Estimator:
-        """That of an arm; one prior serves all its campaigns, so their cells must state the same.
-
-        Raises:
-            InputError: they do not.
-        """
-        name = cast(BatchEstimator, self.options.estimator)
-        first, *others = (ref for one in members for ref in one.refs)
-        other = next((ref for ref in others if ref.belief != first.belief), None)
-        if name == "prior" and other is not None:
-            raise InputError(
-                other.location,
-                f"its cell states another [nominal] than that of {first.location}, of the same arm",
-                field="--estimator prior",
-                remedy="name their folders apart, or use --estimator wls",
-            )
-        return Estimator(name, cell, settings)
 
     def _campaign(
         self, one: _Campaign, estimator: Estimator, advance: Callable[[float, str], None]

@@ -18,7 +18,7 @@ from identification.model.payload import Payload
 Array = NDArray[np.float64]
 
 Level = Literal["repetition", "campaign", "pooled"]
-BatchEstimator = Literal["auto", "wls", "ols", "prior", "consistent"]
+BatchEstimator = Literal["auto", "wls", "consistent"]
 """The estimators that need factors only, and no sample."""
 
 Stamp = tuple[int, ...]
@@ -64,7 +64,6 @@ class ArchiveRef:
         cell: digest of the texts of cell file and URDF.
         motion: digest of the planned motion, "" where none is known.
         when: time of recording, ISO 8601; "" in simulation.
-        belief: digest of what the cell's `[nominal]` says of the arm.
         stamp: of the file when it was hashed; None of a remote one.
         kind: as its metadata say.
         attempt: at the interval; 0 where the archive does not number them.
@@ -83,7 +82,6 @@ class ArchiveRef:
     motion: str
     when: str = ""
     setup: str = ""
-    belief: str = ""
     stamp: Stamp | None = None
     kind: str = ""
     attempt: int = 0
@@ -121,9 +119,8 @@ class Summary:
     Attributes:
         ref: the archive.
         total: its factor as one block.
-        fits: the estimate from it alone, with cluster-robust covariance, by weighting: "weighted"
-            and "ordinary"; none of a validation run.
-        design_effects: by how much the mean variance of each is that of white residuals.
+        fit: the estimate from it alone, with cluster-robust covariance; None of a validation run.
+        design_effect: ratio of its mean variance to that of white residuals.
         warnings: what a reader must know of it.
         products: (n, p, p + 1), see
             :func:`identification.estimators.delay.rate_products`; None where the delay
@@ -132,8 +129,8 @@ class Summary:
 
     ref: ArchiveRef
     total: PhaseFactor
-    fits: Mapping[str, Estimate]
-    design_effects: Mapping[str, float]
+    fit: Estimate | None
+    design_effect: float
     warnings: tuple[str, ...] = ()
     products: Array | None = None
 

@@ -304,9 +304,9 @@ class TestCache:
         monkeypatch.setattr(factors, "open_archive", never)
         monkeypatch.setattr("hil.batch.discovery.open_archive", never)
         workers = Here()
-        second = batch(folder, where=Where(), workers=workers, estimator="ols")
+        second = batch(folder, where=Where(), workers=workers, estimator="consistent")
         assert (second.read, second.cached, workers.tasks) == (0, 5, [])
-        assert "ordinary" in second.campaigns[0].method
+        assert "consistent" in second.campaigns[0].method
 
     def test_of_a_longer_campaign_lacks_what_is_new(self, folder: Path) -> None:
         archive = sorted((folder / "archives").glob("excitation_002*"))[0]
@@ -729,19 +729,6 @@ class TestGroups:
         assert [one.repetitions for one in result.campaigns] == [2, 1]
         assert used.pop(victim.name) == pytest.approx(0.0042)
         assert set(used.values()) == {0.0002}
-
-    def test_a_prior_that_archives_state_differently_is_refused(
-        self, loose: Path, tmp_path: Path
-    ) -> None:
-        victim = excitations(loose)[2]
-        other = with_attachment(
-            victim, tmp_path / victim.name, "uncertainty = 0.2", "uncertainty = 0.3"
-        )
-        other.replace(victim)
-        with pytest.raises(InputError, match=rf"{victim.name}.*another \[nominal\]"):
-            batch(loose, estimator="prior")
-        (level,) = batch(loose).campaigns
-        assert level.repetitions == 3  # a belief is nothing to least squares
 
     def test_the_newest_whole_accepted_attempt_counts(self, tmp_path: Path, arm: Cell) -> None:
         def attempt(index: int, number: int) -> Path:

@@ -102,7 +102,7 @@ class TestDamage:
         assert header.checksum({"a": "1"}) != header.checksum({"a": "2"})
 
 
-# Whole chunks of another archive, by the list of checksums in the outcome; without it, by the cycles
+# Whole chunks of another archive: by the checksums in the outcome, or else by the cycles
 
 
 def recorded(path: Path, first: int = FIRST) -> bytes:

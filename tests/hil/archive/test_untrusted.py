@@ -139,7 +139,7 @@ def test_an_entry_that_cannot_be_used_is_named(field, text, written, tmp_path):
 def test_a_missing_period_is_a_fault_of_a_recorded_archive_alone():
     entries = {"kind": "imported", "joint_names": '["a"]', "attachments": "[]"}
     assert ArchiveHeader.of(entries).period is None
-    with pytest.raises(HeaderError, match="period is"):
+    with pytest.raises(HeaderError, match="period cannot be used"):
         ArchiveHeader.of({**entries, "period": "soon"})
 
 
