@@ -6,15 +6,18 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zstandard
+from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
+from mcap.writer import Writer
 
 from hil.archive import container
 from hil.archive.chunk import ChunkParser
 from hil.archive.container import Record, encoded
 from hil.archive.mcap_writer import McapWriter, entries_of
+from hil.archive.schema import CYCLE
 
 
 class Head(NamedTuple):
@@ -85,6 +88,29 @@ def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(data)
     return target
+
+
+def rewritten(source: Path, target: Path, *, cycles: int | None = None, **options: Any) -> None:
+    """Another program's copy; where `cycles` is given, no chunk has more of them."""
+    with source.open("rb") as stream, target.open("wb") as copy:
+        reader, writer = make_reader(stream), Writer(copy, **options)
+        writer.start("ros2")
+        first, last = reader.iter_metadata()
+        writer.add_metadata(first.name, first.metadata)
+        for one in reader.iter_attachments():
+            writer.add_attachment(0, 0, one.name, "x/y", one.data)
+        channels: dict[str, int] = {}
+        for kind, channel, message in reader.iter_messages(log_time_order=False):
+            assert kind is not None
+            if channel.topic not in channels:
+                number = writer.register_schema(kind.name, kind.encoding, kind.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            if cycles and channel.topic == CYCLE and message.sequence % cycles == 0:
+                writer.flush()
+            times = message.log_time, message.data, message.publish_time, message.sequence
+            writer.add_message(channels[channel.topic], *times)
+        writer.add_metadata(last.name, last.metadata)
+        writer.finish()
 
 
 class Indexed:

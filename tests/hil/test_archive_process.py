@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 import random
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -468,37 +466,3 @@ def test_every_flush_waits_for_the_disk_and_the_first_comes_at_once(
         assert on_disk[-1] == path.stat().st_size
     archive.close("completed")
     assert on_disk[-1] == path.stat().st_size
-
-
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
-def test_the_archive_process_asks_the_disk_ten_times_a_second(tmp_path: Path) -> None:
-    cycles = Paced()
-    process = ArchiveProcessHandle.start(cycles, 2)
-    traced = tmp_path / "calls.txt"
-    try:
-        spec = ArchiveSpec(
-            tmp_path / "excitation_000_a1.mcap", joint_names=("a", "b"), period=PERIOD, metadata={}
-        )
-        process.send(Open(1, spec, drive_train(), from_now=True, until_ended=False))
-        assert process.answer(30.0, 1) == Opened(1)
-        calls = ["-f", "-ttt", "-e", "trace=fdatasync", "-o", str(traced)]
-        strace = subprocess.Popen(
-            ["strace", *calls, "-p", str(process.process.pid)],
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert strace.stderr is not None
-        if "attached" not in strace.stderr.readline():
-            strace.communicate()
-            pytest.skip("this system does not allow to trace a process")
-        cycles.begin()
-        time.sleep(2.5)
-        written = cycles.ring.written
-        strace.send_signal(signal.SIGINT)
-        strace.communicate()
-    finally:
-        process.process.kill()
-        process.end()
-        cycles.close()
-    times = [float(t) for t in re.findall(r"^\d+ +([\d.]+) fdatasync", traced.read_text(), re.M)]
-    assert len(times) == pytest.approx(written / FLUSH, abs=3)
-    assert np.median(np.diff(times)) == pytest.approx(FLUSH * PERIOD, abs=0.02)

@@ -163,13 +163,6 @@ class TestRobot:
             assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
             assert cell.joint_names == one.joint_names == ("hip", "ankle")
 
-    def test_gravity_and_rotor_inertia_are_kept(self, tmp_path):
-        (tmp_path / "two.urdf").write_text(URDF)
-        robot = Robot.from_urdf(tmp_path / "two.urdf", gravity=(0, 9.81, 0), rotor_inertia=False)
-        model = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml")).model
-        assert model.gravity.tolist() == [0, 9.81, 0]
-        assert not model.rotor_inertia
-
     def test_a_cell_file_serves_as_well(self, tmp_path, robot):
         (tmp_path / "robot.urdf").write_text(robot.urdf)
         (tmp_path / "cell.toml").write_text(robot.cell)
@@ -252,10 +245,6 @@ class TestImport:
         assert set(archive.columns) == {"stamp", "position"}
         assert open_recording(archive.path).torque is None
 
-    def test_velocity_reaches_the_archive(self, imported):
-        archive = imported([state(8_000_000 * i, [1, 2], velocity=[0.5, -i]) for i in range(3)])
-        assert archive.columns["velocity"].tolist() == [[-i, 0.5] for i in range(3)]
-
     def test_recorded_joints_are_those_of_the_fullest_message(self, tmp_path):
         messages = [state(5, [0.01], names=["finger"]), *states(2)]
         file = bag(tmp_path / "b.db3", {"/js": (STATE, messages)})
@@ -276,16 +265,6 @@ class TestImport:
     def test_names_may_differ_from_the_urdfs(self, imported):
         archive = imported(states(names=["j2", "j1"]), joint_names={"j1": "hip", "j2": "ankle"})
         assert archive.columns["position"][3].tolist() == [-3, pytest.approx(0.3)]
-
-    def test_a_folder_of_split_files_is_one_recording(self, tmp_path, robot):
-        folder = tmp_path / "bag"
-        folder.mkdir()
-        messages = states(6)
-        bag(folder / "bag_0.db3", {"/js": (STATE, messages[:4])})
-        bag(folder / "bag_1.db3", {"/js": (STATE, messages[4:])})
-        archive = open_archive(import_rosbag2(folder, tmp_path / "a.mcap", robot=robot))
-        assert archive.n_samples == 6
-        assert archive.header.entries["source"] == '["bag_0.db3", "bag_1.db3"]'
 
     def test_the_archive_says_where_it_comes_from(self, imported):
         recording = open_recording(imported(states(), held_joints=["hip"]).path)
@@ -512,11 +491,6 @@ def test_the_parts_of_a_split_bag_follow_each_other_by_number(tmp_path: Path, ro
     (folder / "bag_3.mcap.zstd").write_bytes(packed)
     (folder / "bag_3.mcap").unlink()
     assert_imported(import_rosbag2(folder, tmp_path / "out.mcap", robot=robot))
-
-
-def test_an_archive_of_ours_can_be_imported_like_any_other(tmp_path: Path, robot: Robot) -> None:
-    first = import_rosbag2(joint_states(tmp_path / "x.mcap"), tmp_path / "a.mcap", robot=robot)
-    assert_imported(import_rosbag2(first, tmp_path / "b.mcap", robot=robot))
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
@@ -750,9 +724,9 @@ class TestTypes:
         assert read_mcap(path)["/good/x"].tolist() == [2.5]
 
 
-def chunked(path: Path, compression: CompressionType) -> Path:
+def chunked(path: Path) -> Path:
     with path.open("wb") as stream:
-        writer = Writer(stream, compression=compression)
+        writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start("ros2")
         kind = writer.register_schema("pkg/A", "ros2msg", b"float64 x")
         channel = writer.register_channel("/a", "cdr", kind)
@@ -774,11 +748,6 @@ def with_chunk(path: Path, body: bytes) -> None:
 
 
 class TestMcap:
-    @pytest.mark.parametrize("compression", list(CompressionType))
-    def test_a_sound_file_passes(self, compression: CompressionType, tmp_path: Path) -> None:
-        path = chunked(tmp_path / "x.mcap", compression)
-        assert read_mcap(path)["/a/x"].tolist() == list(range(100))
-
     @pytest.mark.parametrize(
         ("name", "packed", "claimed"),
         [
@@ -793,7 +762,7 @@ class TestMcap:
     def test_a_chunk_that_is_not_what_it_claims(
         self, name: str, packed: bytes, claimed: int, tmp_path: Path
     ) -> None:
-        path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
+        path = chunked(tmp_path / "x.mcap")
         head = struct.pack("<QQQI", 0, 0, claimed, 0) + mcap_bytes.text(name)
         with_chunk(path, head + struct.pack("<Q", len(packed)) + packed)
         with pytest.raises(SourceError, match=r"claims|cannot be decompressed"):
@@ -803,24 +772,6 @@ class TestMcap:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(mcap_messages, "MOST_BYTES", 600)
-        path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
+        path = chunked(tmp_path / "x.mcap")
         with pytest.raises(SourceError, match="too large to be read at once"):
             read_mcap(path)
-
-    @pytest.mark.parametrize("checked", [True, False])
-    def test_an_index_that_points_elsewhere(self, checked: bool, tmp_path: Path) -> None:
-        """Refused where the summary has a checksum; nothing is found by it in any case."""
-        path = chunked(tmp_path / "x.mcap", CompressionType.ZSTD)
-        data = bytearray(path.read_bytes())
-        with path.open("rb") as stream:
-            records = list(container.records(stream, len(data)))
-        first = next(record for record in records if record.opcode == container.CHUNK)
-        struct.pack_into("<Q", data, data.rindex(struct.pack("<Q", first.offset)), 17)
-        if not checked:
-            struct.pack_into("<I", data, len(data) - len(container.MAGIC) - 4, 0)
-        path.write_bytes(data)
-        if checked:
-            with pytest.raises(SourceError, match="fails its checksum"):
-                read_mcap(path)
-        else:
-            assert read_mcap(path)["/a/x"].tolist() == list(range(100))
