@@ -454,8 +454,8 @@ class Scan:
             if gaps[topic] > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages that were before")
         # Another program may have cut chunks within a cycle: then the cycles are what is read.
-        counted = NUMBERS if self._past_damage or schema.CYCLE not in found else (schema.CYCLE,)
-        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in counted}) > 1:
+        alike = NUMBERS if self._past_damage or schema.CYCLE not in found else (schema.CYCLE,)
+        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in alike}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
         return [topic for topic, gap in gaps.items() if gap]
 

@@ -457,8 +457,8 @@ def test_a_version_is_that_of_the_content_or_none(monkeypatch: pytest.MonkeyPatc
     store, address = fsspec.filesystem("memory"), "memory://store/a.mcap"
     store.pipe(address, b"one")
     assert archives_below(address)[0][1] == ""
-    plain = type(store).info
-    monkeypatch.setattr(type(store), "info", lambda *path: plain(*path) | {"ETag": '"5f3"'})
+    original = type(store).info
+    monkeypatch.setattr(type(store), "info", lambda *path: original(*path) | {"ETag": '"5f3"'})
     assert archives_below(address)[0][1] == '"5f3"'
 
 
