@@ -6,19 +6,28 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
+from identification import Recording
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck, check_consistency
-from identification.validation.plausibility import Implausible, implausibilities
+from identification.validation.finding import Finding
+from identification.validation.nominal_scale import inertia_ratio, nominal_scale
+from identification.validation.plausibility import Implausible, implausibilities, inertia_matrices
+from identification.validation.position_jumps import position_jumps
+from tests.hil.identified_arm import a_motion as sines
+from tests.hil.identified_arm import packaged_urdf
 from tests.identification.test_essential import NOISE, a_motion, samples_of
-from tests.identification.two_link import MODEL, URDF, sine_motion
+from tests.identification.test_verdict import an_error, finding_of, judged
+from tests.identification.two_link import MODEL, URDF, as_samples, sine_motion
 
 Array = NDArray[np.float64]
 
@@ -162,3 +171,201 @@ class TestConsistencyCheck:
         found = checked(runs(I2yy=0.05, I2m=0.0))
         assert found.room[1] < 0.01
         assert any("link of elbow" in bound for bound in found.bounds)
+
+
+def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:
+    rng = np.random.default_rng(seed)
+    time = np.cumsum((1.0 + jitter * rng.uniform(-1.0, 1.0, int(12 * rate))) / rate)
+    q = np.column_stack([0.8 * np.sin(w * time + w) + 0.3 * np.sin(3.1 * w * time) for w in (2, 3)])
+    q += 2e-5 * rng.standard_normal(q.shape)
+    return Recording(time, q, ("hip", "knee"), torque=np.zeros_like(q))
+
+
+def with_jump(one: Recording, size: float, rows: slice) -> Recording:
+    position = one.position.copy()
+    position[rows, 1] += size
+    return Recording(one.time, position, one.joint_names, torque=one.torque)
+
+
+@pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
+@pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
+def test_a_lasting_jump_is_named_with_its_joint_time_and_size(rate: float, size: float) -> None:
+    one, at = recording(rate), int(5 * rate)
+    (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
+    assert (jump.recording, jump.joint) == ("log.mcap", "knee")
+    assert jump.time == pytest.approx(one.time[at] - one.time[0])
+    assert jump.size == pytest.approx(size, abs=2e-3)
+    finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
+    assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
+
+
+@pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_motion_with_an_uneven_clock_has_none(rate: float, jitter: float) -> None:
+    assert position_jumps(recording(rate, jitter=jitter, seed=3)) == []
+
+
+def test_a_sudden_stop_is_none() -> None:
+    """From 1 rad/s to rest within one sample; the position goes on where it was."""
+    time = np.arange(0.0, 8.0, 0.002)
+    q = np.column_stack([np.minimum(time, 4.0), np.sin(time)])
+    q += 1e-5 * np.random.default_rng(1).standard_normal(q.shape)
+    assert position_jumps(Recording(time, q, ("a", "b"), torque=np.zeros_like(q))) == []
+
+
+def test_a_glitch_that_is_taken_back_is_no_slip() -> None:
+    one = recording(500.0)
+    assert position_jumps(with_jump(one, 0.2, slice(2500, 2501))) == []
+
+
+def test_a_gap_is_no_jump() -> None:
+    one = recording(500.0)
+    gap = np.zeros(len(one.time), dtype=np.bool_)
+    gap[2500] = True
+    moved = one.position.copy()
+    moved[2500:] += 0.3
+    torn = Recording(one.time, moved, one.joint_names, torque=np.zeros_like(moved), gap_before=gap)
+    assert position_jumps(torn) == []
+
+
+AXES = range(1, 4)  # of the UR5, whose weight and inertia stand out of their friction
+
+
+def findings(model: RobotModel, **surroundings: object) -> list[Finding]:
+    """What these surroundings make a verdict say."""
+    error = an_error(0.05, joints=model.n_joints)
+    known = judged(model.joint_names, held_out=error, training=error).findings
+    found = judged(model.joint_names, held_out=error, training=error, **surroundings).findings
+    return [one for one in found if one not in known]
+
+
+@pytest.fixture(scope="module")
+def model() -> RobotModel:
+    return RobotModel.from_urdf(packaged_urdf("ur5_robot.urdf"), friction=FrictionLaw(offset=True))
+
+
+def standard(model: RobotModel, wrong: float, seed: int) -> Array:
+    """Nominal parameters with every link off by its own share, and rotors."""
+    values = model.nominal.copy()
+    rng = np.random.default_rng(seed)
+    for link in range(model.n_joints):
+        rows = model.layout.links[link]
+        values[rows] *= 1.0 + wrong * rng.uniform(-1.0, 1.0)
+    values[model.layout.rotors] = 0.2
+    return values
+
+
+def runs_of(model: RobotModel, values: Array, seed: int) -> list[Samples]:
+    friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
+    truth = np.concatenate([model.base.grouping @ values, friction])
+    found = []
+    for number in range(2):
+        motion = sines(model.n_joints, 10 * seed + number)
+        torque = model.torque(truth, *motion[1:])
+        torque += (
+            0.02 * torque.std(axis=0) * np.random.default_rng(seed).standard_normal(torque.shape)
+        )
+        found.append(as_samples(model, motion, torque))
+    return found
+
+
+def nominal(model: RobotModel) -> Array:
+    friction = np.zeros(model.n_parameters - model.base.rank)
+    return np.concatenate([model.base.grouping @ model.nominal, friction])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_links_that_are_off_by_a_tenth_raise_no_doubt(model: RobotModel, seed: int) -> None:
+    found = nominal_scale(model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed))
+    assert np.isfinite(found.scale[2])
+    assert findings(model, nominal_scale=found) == []
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("factor", [0.6, 1.5])
+def test_a_wrong_torque_constant_is_told_by_axis_and_factor(
+    model: RobotModel, axis: int, factor: float
+) -> None:
+    scaled = []
+    for run in runs_of(model, standard(model, 0.05, axis), axis):
+        torque = run.torque.copy()
+        torque[:, axis] *= factor
+        scaled.append(replace(run, torque=torque))
+    found = nominal_scale(model, nominal(model), scaled)
+    assert np.flatnonzero(found.off).tolist() == [axis]
+    assert found.scale[axis] == pytest.approx(factor, rel=0.1)
+    (finding,) = findings(model, nominal_scale=found)
+    name = model.joint_names[axis]
+    assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
+
+
+def test_of_a_urdf_without_masses_nothing_is_said(model: RobotModel) -> None:
+    zero = np.zeros(model.n_parameters)
+    found = nominal_scale(model, zero, runs_of(model, standard(model, 0.0, 1), 1))
+    assert np.isnan(found.scale).all() and findings(model, nominal_scale=found) == []
+
+
+@pytest.mark.parametrize("factor", [0.01, 1000.0])
+def test_torques_of_another_unit_or_of_the_motors_leave_no_model_to_rely_on(
+    model: RobotModel, factor: float
+) -> None:
+    scaled = [
+        replace(run, torque=factor * run.torque)
+        for run in runs_of(model, standard(model, 0.05, 1), 1)
+    ]
+    (finding,) = findings(model, nominal_scale=nominal_scale(model, nominal(model), scaled))
+    assert finding.level == "wrong"
+    assert "unit" in finding.next_step and "side" in finding.next_step
+
+
+def test_all_torques_negated_are_one_finding(model: RobotModel) -> None:
+    negated = [
+        replace(run, torque=-run.torque) for run in runs_of(model, standard(model, 0.05, 1), 1)
+    ]
+    found = nominal_scale(model, nominal(model), negated)
+    (finding,) = findings(model, nominal_scale=found)
+    assert (finding.check, finding.level) == ("direction of axes", "wrong")
+    assert "all torques seem to have the other sign" in finding.words
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[RobotModel, Array, Array, Array]:
+    """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
+    urdf = packaged_urdf("ur5_robot.urdf")
+    model = RobotModel.from_urdf(urdf)
+    standard = model.nominal.copy()
+    standard[model.layout.rotors] = 0.2
+    friction = np.full(model.n_parameters - model.base.rank, 3.0)
+    values = np.concatenate([model.base.grouping @ standard, friction])
+    position = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 6))
+    reference = pin.buildModelFromXML(urdf)
+    data = reference.createData()
+    diagonal = np.array([np.diag(pin.crba(reference, data, q)) for q in position]) + 0.2
+    return model, values, position, diagonal
+
+
+def test_the_diagonal_is_that_of_the_composite_rigid_body_algorithm(
+    arm: tuple[RobotModel, Array, Array, Array],
+) -> None:
+    model, values, position, diagonal = arm
+    matrices = inertia_matrices(model, values, position)
+    np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
+
+
+def test_a_joint_that_is_off_is_named_and_a_silent_one_is_not(
+    arm: tuple[RobotModel, Array, Array, Array],
+) -> None:
+    model, values, position, diagonal = arm
+    theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
+    found = inertia_ratio(model, values, position, theirs)
+    assert found is not None
+    np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
+    np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
+    (finding,) = findings(model, controller_inertia=found)
+    assert finding.level == "doubtful"
+    assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
+
+
+def test_zeros_are_no_inertia(arm: tuple[RobotModel, Array, Array, Array]) -> None:
+    model, values, position, diagonal = arm
+    assert inertia_ratio(model, values, position, 0.0 * diagonal) is None

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from identification import FrictionLaw, RobotModel
 from identification.export.simulators import (
@@ -19,12 +21,17 @@ from identification.export.simulators import (
     random_states,
     sdf,
 )
+from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.export.urdf import WriteBackError
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.payload import Payload
+from identification.signals.noise import noiseless_above, spectrum
+from identification.signals.samples import Samples
+from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
+from tests.identification.two_link import as_samples, sine_motion
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
 WRIST = np.eye(6)
@@ -163,3 +170,173 @@ class TestTexts:
         root = ElementTree.fromstring(sdf(an_arm(urdf), "arm"))
         names = [one.get("name") for tag in ("link", "joint", "frame") for one in root.iter(tag)]
         assert len(names) == len(set(names))
+
+
+Array = NDArray[np.float64]
+
+URDF = (Path(__file__).parent / "two_link.urdf").read_text()
+F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
+PRESLIDING = 1e-3
+
+
+def model_with(**law: float | bool) -> RobotModel:
+    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, offset=True, **law))
+
+
+def values_of(model: RobotModel) -> Array:
+    standard = model.nominal.copy()
+    standard[[10, 21]] = 0.4, 0.1  # rotors
+    return np.concatenate([model.base.grouping @ standard, F0, F1, FO])
+
+
+def samples_of(model: RobotModel, bandwidth: float | None = None) -> Samples:
+    time = np.arange(3000) * 2e-3
+    rate, amplitude = np.array([2.1, 3.7]), np.array([0.9, 1.2])
+    motion = sine_motion(time, amplitude, rate, np.zeros(2))
+    samples = as_samples(
+        model,
+        motion,
+        np.zeros((3000, 2)),
+        usable=np.ones((3000, 2), dtype=np.bool_),
+        position_bandwidth=np.full(2, 10.0),
+        torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
+    ).directed(model)
+    return replace(samples, torque=samples.predicted_torque(model, values_of(model)))
+
+
+class TestParts:
+    """Inertia, Coriolis, gravity and friction of a predicted torque."""
+
+    @pytest.mark.parametrize("bandwidth", [None, 20.0])
+    @pytest.mark.parametrize("presliding", [0.0, PRESLIDING])
+    def test_add_up_to_it(self, bandwidth: float | None, presliding: float) -> None:
+        model = model_with(presliding=presliding)
+        samples = samples_of(model, bandwidth)
+        parts = torque_parts(model, values_of(model), samples)
+        np.testing.assert_allclose(sum(parts), samples.torque, atol=1e-9)
+
+    def test_are_those_of_the_whole_where_samples_are_a_part(self) -> None:
+        model = model_with()
+        whole = samples_of(model, 20.0)
+        some = torque_parts(model, values_of(model), whole.between(500, 900))
+        for part, all_rows in zip(some, torque_parts(model, values_of(model), whole), strict=True):
+            np.testing.assert_array_equal(part, all_rows[500:900])
+
+    def test_follow_what_they_are_named_after(self) -> None:
+        """Doubled speed: Coriolis torque grows fourfold; inertia and gravity stay."""
+        model, values = model_with(), values_of(model_with())
+        samples = samples_of(model)
+        fast = replace(
+            samples, motion=samples.motion._replace(velocity=2.0 * samples.motion.velocity)
+        )
+        slow, quick = torque_parts(model, values, samples), torque_parts(model, values, fast)
+        np.testing.assert_allclose(quick.coriolis, 4.0 * slow.coriolis, atol=1e-9)
+        np.testing.assert_allclose(quick.inertia, slow.inertia, atol=1e-9)
+        np.testing.assert_array_equal(quick.gravity, slow.gravity)
+        velocity = samples.motion.velocity
+        expected = F0 * np.sign(velocity) + F1 * velocity + FO
+        np.testing.assert_allclose(slow.friction, expected, atol=1e-9)
+
+
+class TestFrictionCurve:
+    """The law of a joint over speed and after a reversal."""
+
+    def test_jumps_at_zero_and_has_the_offset(self) -> None:
+        model = model_with()
+        curve = friction_curve(model, values_of(model), 1, -2.0, 3.0)
+        assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
+        ends = [-F0[1] - 2.0 * F1[1] + FO[1], F0[1] + 3.0 * F1[1] + FO[1]]
+        np.testing.assert_allclose(curve.sliding[[0, -1]], ends)
+        middle = len(curve.speed) // 2
+        jump = curve.sliding[middle] - curve.sliding[middle - 1]
+        assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
+        assert np.isnan(curve.travel).all() and np.isnan(curve.turning).all()
+
+    def test_turns_round_over_the_presliding_displacement(self) -> None:
+        model = model_with(presliding=PRESLIDING)
+        curve = friction_curve(model, values_of(model), 0, -1.0, 1.0)
+        assert curve.turning[0] == pytest.approx(FO[0] - F0[0])
+        assert curve.turning[-1] == pytest.approx(FO[0] + F0[0], rel=0.01)
+        zero = np.interp(0.0, curve.turning - FO[0], curve.travel)
+        assert zero == pytest.approx(PRESLIDING * np.log(2.0), rel=0.02)
+
+    def test_of_an_arm_with_an_identified_spring(self) -> None:
+        """Parameters behind those of friction are none of the curve's."""
+        law = FrictionLaw(third=None, offset=True)
+        spring = TorsionSpring("shoulder", 0.2, identified=True)
+        model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
+        curve = friction_curve(model, np.append(values_of(model_with()), 25.0), 0, -1.0, 1.0)
+        assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
+
+    def test_is_what_the_data_lie_on(self) -> None:
+        """Torque without the other parts, of a perfect model, lies on the curve."""
+        model = model_with()
+        values, samples = values_of(model), samples_of(model)
+        speed = samples.motion.velocity[:, 0]
+        curve = friction_curve(model, values, 0, float(speed.min()), float(speed.max()))
+        on_it = np.interp(speed, curve.speed, curve.sliding)
+        sliding = np.abs(speed) > 1e-3
+        data = friction_torque(model, values, samples)[:, 0]
+        np.testing.assert_allclose(data[sliding], on_it[sliding], atol=1e-6)
+
+
+class TestSpectrum:
+    """Amplitude spectral density of torques."""
+
+    def test_of_white_noise_is_flat_at_its_density(self) -> None:
+        rate, std = 500.0, 0.3
+        time = np.arange(20_000) / rate
+        noise = std * np.random.default_rng(1).standard_normal((20_000, 1))
+        frequency, density = spectrum(time, noise, [slice(0, 20_000)])
+        expected = std / np.sqrt(rate / 2.0)
+        level = np.sqrt(np.mean(density[frequency > 5.0] ** 2))
+        assert level == pytest.approx(expected, rel=0.05)
+
+    def test_has_its_peak_at_the_sine(self) -> None:
+        """Uneven stamps are the times of the samples, not their numbers."""
+        rng = np.random.default_rng(2)
+        time = np.sort(np.arange(4000) * 0.01 + rng.uniform(0.0, 0.003, 4000))
+        frequency, density = spectrum(
+            time, np.sin(2.0 * np.pi * 7.0 * time)[:, None], [slice(0, 4000)]
+        )
+        assert frequency[np.argmax(density)] == pytest.approx(7.0, rel=0.03)
+
+    def test_reads_the_longest_segment_and_none_that_is_short(self) -> None:
+        time = np.arange(300) * 0.01
+        signals = np.where(np.arange(300) < 40, 9.0, np.sin(time))[:, None]
+        both = spectrum(time, signals, [slice(0, 40), slice(40, 300)])
+        alone = spectrum(time[40:], signals[40:], [slice(0, 260)])
+        np.testing.assert_array_equal(both.density, alone.density)
+        assert spectrum(time, signals, [slice(0, 10)]).frequency.size == 0
+
+
+class TestNoise:
+    """A measured torque has noise at every frequency, unless it came through a low-pass."""
+
+    TIME = np.arange(4000) * 0.005
+    SHAPE = LowPassShape(order=4)
+
+    def torque(self, noise: float) -> Array:
+        slow = 20.0 * np.sin(2.0 * np.pi * np.array([0.3, 0.9]) * self.TIME[:, None])
+        return np.asarray(slow + noise * np.random.default_rng(3).standard_normal(slow.shape))
+
+    def above(self, torque: Array) -> float | None:
+        return noiseless_above(self.TIME, torque, [slice(0, len(torque))])
+
+    def test_of_half_a_per_cent_is_seen(self) -> None:
+        assert self.above(self.torque(0.1)) is None
+
+    @pytest.mark.parametrize("bandwidth", [2.0, 5.0, 10.0])
+    def test_ends_above_a_low_pass(self, bandwidth: float) -> None:
+        found = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
+        assert found is not None
+        assert bandwidth < found < 2.5 * bandwidth
+
+    def test_of_one_joint_is_enough_for_the_channel(self) -> None:
+        torque = self.torque(0.1)
+        torque[:, 1] = low_passed(self.TIME, torque[:, 1:], 5.0, self.SHAPE)[:, 0]
+        assert self.above(torque) is None
+
+    def test_of_a_constant_or_a_few_samples_is_not_judged(self) -> None:
+        assert self.above(np.ones((4000, 2))) is None
+        assert self.above(self.torque(0.0)[:20]) is None
