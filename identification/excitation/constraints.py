@@ -16,13 +16,9 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from planner import FourierSeries, JointLimits, PiecewiseCubic, Trajectory
 
-# Sampling a planned motion for everything that looks at it sample by sample.
-#
-# Both ways are uniform in time with the longest step that divides the motion and does not exceed
-# the period asked for. Checks want both ends. Criteria want the middles of the steps: a joint
-# that rests at an end has sgn(qd) = 0 there, or, after rounding, ±1 without moving; both say
-# something about friction that no motion does, and it weighs the more the fewer the samples.
-# Judged at 8 instead of 1 ms, log det of random motions of the NS 16 changes by 0.002 with
+# Checks want both ends of a motion, criteria the middles of the steps: a joint that rests at an end
+# has sgn(qd) = 0 there, or, after rounding, ±1 without moving, and weighs the more the fewer the
+# samples. Judged at 8 instead of 1 ms, log det of random motions of the NS 16 changes by 0.002 with
 # middles (and not to one side), by 0.02 with ends.
 SAMPLE_PERIOD: Final = 0.008
 """s; motions are looked at this often. A fast arm's tip moves some 4 cm meanwhile."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,13 +262,8 @@ def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
             yield int(index[start]), slice(start, stop)
 
 
-class EqualRuns(NamedTuple):
-    """Blocks one after the other that have as many rows each."""
-
-    first: int  # the first block
-    blocks: int  # how many of them
-    start: int  # its first row
-    length: int  # rows of each
+# Blocks in a row of as many rows each: the first, how many, its first row, rows of each.
+EqualRuns = tuple[int, int, int, int]
 
 
 def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
@@ -276,11 +271,11 @@ def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
     groups: list[EqualRuns] = []
     for block, at in block_runs(index):
         length = at.stop - at.start
-        last = groups[-1] if groups else None
-        if last is not None and last.length == length and last.first + last.blocks == block:
-            groups[-1] = last._replace(blocks=last.blocks + 1)
+        first, count, start, rows = groups[-1] if groups else (block, 0, at.start, length)
+        if groups and rows == length and first + count == block:
+            groups[-1] = first, count + 1, start, rows
         else:
-            groups.append(EqualRuns(block, 1, at.start, length))
+            groups.append((block, 1, at.start, length))
     return groups
 
 

@@ -108,19 +108,13 @@ class Anchors:
 class TorsionSpring(Element):
     """A spring about the axis; the drive holds ``stiffness (q - rest)``.
 
-    Attributes:
-        joint: name.
-        rest: position without torque [rad].
-        stiffness: [N·m/rad]; of an identified spring the nominal one, if it is known.
-        identified: whether the stiffness is a parameter.
-
     Raises:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
-    rest: float
-    stiffness: float | None = None
-    identified: bool = False
+    rest: float  #: position without torque [rad]
+    stiffness: float | None = None  #: [N·m/rad]; of an identified spring nominal, if known
+    identified: bool = False  #: whether the stiffness is a parameter
 
     def __post_init__(self) -> None:
         _require_finite("rest angle", self.rest)
@@ -140,24 +134,17 @@ class TorsionSpring(Element):
 class ExtensionSpring(Element):
     """A spring between two anchors, of tension ``stiffness (l - free_length) + preload``.
 
-    Attributes:
-        joint: name.
-        anchors: where it is fixed.
-        free_length: [m].
-        stiffness: [N/m]; of an identified spring the nominal one, if it is known.
-        preload: tension at the free length [N]; an identified spring without it gets a parameter
-            for it, a known spring none.
-        identified: whether the stiffness is a parameter.
-
     Raises:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
-    anchors: Anchors
-    free_length: float
-    stiffness: float | None = None
+    anchors: Anchors  #: where it is fixed
+    free_length: float  #: [m]
+    stiffness: float | None = None  #: [N/m]; of an identified spring nominal, if known
+    #: tension at the free length [N]; an identified spring without it gets a parameter for it, a
+    #: known spring none
     preload: float | None = None
-    identified: bool = False
+    identified: bool = False  #: whether the stiffness is a parameter
 
     def __post_init__(self) -> None:
         _require_finite("free length or preload", self.free_length, self.preload or 0.0)
@@ -185,28 +172,19 @@ class GasCylinder(Element):
     With the stroke s, by which the anchors compress the gas from the length at which pressure and
     volume are given, the pressure is ``pressure volume / (volume - s area)``.
 
-    Attributes:
-        joint: name.
-        anchors: where it is fixed.
-        length: distance between the anchors at which pressure and volume are given [m].
-        area: of the piston, or of a gas spring's rod [m²].
-        pressure: over that outside [Pa].
-        volume: of the gas [m³].
-        pulls: whether it pulls the anchors together, its gas being compressed as they part
-            (hydraulic balancer), or pushes them apart (gas spring).
-        identified: whether a factor of its torque is a parameter.
-
     Raises:
         ModelError: a figure is not positive, or the gas has no volume left at some angle.
     """
 
-    anchors: Anchors
-    length: float
-    area: float
-    pressure: float
-    volume: float
+    anchors: Anchors  #: where it is fixed
+    length: float  #: distance between the anchors at which pressure and volume are given [m]
+    area: float  #: of the piston, or of a gas spring's rod [m²]
+    pressure: float  #: over that outside [Pa]
+    volume: float  #: of the gas [m³]
+    #: whether it pulls the anchors together, its gas being compressed as they part (hydraulic
+    #: balancer), or pushes them apart (gas spring)
     pulls: bool = True
-    identified: bool = False
+    identified: bool = False  #: whether a factor of its torque is a parameter
 
     def __post_init__(self) -> None:
         for name, unit in (("length", "m"), ("area", "m²"), ("pressure", "Pa"), ("volume", "m³")):
@@ -245,15 +223,11 @@ class TorqueRipple(Element):
     Each order has a cosine and a sine of the motor's angle, so that amplitude and phase are
     identified. The phase holds as long as nobody takes the gear apart. That a coupled motor passes
     some of it on to other joints is left out.
-
-    Attributes:
-        joint: name.
-        motor: turns of the motor per turn of each joint that turns it, with the joints' names.
-        orders: periods per turn of the motor.
     """
 
+    #: turns of the motor per turn of each joint that turns it, with the joints' names
     motor: tuple[tuple[str, float], ...]
-    orders: tuple[int, ...]
+    orders: tuple[int, ...]  #: periods per turn of the motor
 
     @property
     def turns(self) -> Mapping[str, float]:

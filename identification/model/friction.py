@@ -41,47 +41,29 @@ _EXPONENT: Final = {1: "", 2: "²", 3: "³"}
 
 @dataclass(frozen=True)
 class FrictionTerm:
-    """A coefficient times a column of speed and direction.
+    """A coefficient times a column of speed and direction."""
 
-    Attributes:
-        symbol: of the coefficient; terms with the same one exclude each other.
-        option: of :class:`FrictionLaw`, and of `[robot.friction]`, that asks for it.
-        label: of the term in a list; in lower case its name on the command line.
-        words: what it is.
-        basis: the column as a formula for people.
-        code: the column in Python, as a factor of the coefficient; ``v`` is the speed, ``sign`` its
-            direction, ``E`` Euler's number and ``LABEL_SPEED[joint]`` the `speed`.
-        value: the column (...) of speeds, directions of dry friction (...) and `speed`.
-        rate: its derivative with speed, of speeds, that of the direction (...) and `speed`.
-        asked: setting of a law, where it is not that of `option`.
-        power: of the speed in the denominator of the coefficient's unit.
-        speed_symbol: of `speed`; empty for a column without it.
-        urdf: attribute of `<dynamics>` that holds the coefficient; empty for none.
-        of_motor: whether a coupled motor has one beside those of the joints.
-        is_friction: whether it cannot be the zero error of a sensor instead.
-        not_negative: whether only coefficients from zero on take energy. With a `pair` that holds
-            of g, where ``(coefficient of the other symbol, this one) = matrix @ g``.
-        pair: that symbol and matrix.
-        speed: v_s of a column of v / v_s [rad/s, m/s].
-    """
-
-    symbol: str
-    option: str
-    label: str
-    words: str
-    basis: str
+    symbol: str  # of the coefficient; terms with the same one exclude each other
+    option: str  # of `FrictionLaw`, and of `[robot.friction]`, that asks for it
+    label: str  # of the term in a list; in lower case its name on the command line
+    words: str  # what it is
+    basis: str  # the column as a formula for people
+    # the column in Python, as a factor of the coefficient; `v` is the speed, `sign` its direction,
+    # `E` Euler's number and `LABEL_SPEED[joint]` the `speed`
     code: str
-    value: Callable[[Array, Array, float], Array]
-    rate: Callable[[Array, Array, float], Array]
-    asked: Callable[[FrictionLaw], Any] | None = None
-    power: int = 0
-    speed_symbol: str = ""
-    urdf: str = ""
-    of_motor: bool = False
-    is_friction: bool = True
+    value: Callable[[Array, Array, float], Array]  # the column, of speeds, directions and `speed`
+    rate: Callable[[Array, Array, float], Array]  # its derivative, of speeds, that of directions
+    asked: Callable[[FrictionLaw], Any] | None = None  # setting, where not that of `option`
+    power: int = 0  # of the speed in the denominator of the coefficient's unit
+    speed_symbol: str = ""  # of `speed`; empty for a column without it
+    urdf: str = ""  # attribute of `<dynamics>` that holds the coefficient; empty for none
+    of_motor: bool = False  # whether a coupled motor has one beside those of the joints
+    is_friction: bool = True  # whether it cannot be the zero error of a sensor instead
+    # whether only coefficients from zero on take energy; with a `pair` that holds of g, where
+    # (coefficient of the other symbol, this one) = matrix @ g
     not_negative: bool = False
-    pair: Pair | None = None
-    speed: float = 1.0
+    pair: Pair | None = None  # that symbol and matrix
+    speed: float = 1.0  # v_s of a column of v / v_s [rad/s, m/s]
 
     def __reduce__(self) -> tuple[object, ...]:
         return _term, (self.label, self.speed)

@@ -583,20 +583,11 @@ class LinkMotion:
 
 
 class _Step:
-    """The way over one joint, from the link before it to the link behind it.
+    """The way over one joint, from slots of its parent (c, 2, 3, size) to its own, one more.
 
-    The arrays it reads and writes are fixed when it is made, as are all views of them: taking a
-    view costs as much as the arithmetic on a few hundred samples.
-
-    Args:
-        chain, joint: which joint.
-        before: slots of the parent, shape (c, 2, 3, size).
-        rotation: from the parent's axes into the child's, shape (3, 3, size).
-        after: slots of the child, shape (c + 1, 2, 3, size): the last is the joint's own twist.
-        motion: q, qd and qdd of the joint, shape (3, size).
-
-    Attributes:
-        blend: the rotation's nine entries as sums of 1, cos q and sin q, shape (9, 3).
+    The arrays that it reads and writes, and all views of them, are made once: a view costs as much
+    as the arithmetic on a few hundred samples. `rotation` (3, 3, size) is into the child's axes,
+    `motion` q, qd and qdd of the joint (3, size).
     """
 
     def __init__(
@@ -606,6 +597,7 @@ class _Step:
         revolute = bool(chain.revolute[joint])
         own = 0 if revolute else 1
         after[-1, own] = axis[:, None]
+        # The rotation's nine entries as sums of 1, cos q and sin q (9, 3).
         self.blend = _blend(axis, chain.rotation[joint].T, revolute)
         self._position, self._speed, self._rate_of_speed = motion
         self._revolute = revolute

@@ -85,15 +85,10 @@ _UNEXCITING: Final = 1e6
 _ALL: Final = "all"
 
 
-# A polish improves a motion by CMA-ES, from where a search left it.
-#
-# A genetic search finds the right region and then wanders in it; a covariance matrix adaptation
-# (Hansen 2016, "The CMA Evolution Strategy: A Tutorial") learns how far each gene of a motion can
-# still be moved for the better. It looks at nothing but ranks, so constraints need no penalty:
-# whatever satisfies them all ranks before whatever breaks one. The covariance is diagonal (Ros and
-# Hansen 2008, "A simple modification in CMA-ES"): a full one has thousands of entries to learn for
-# a hundred genes, more than a polish has evaluations, and its eigenvectors differ in their last
-# bits with the threads that linear algebra is given.
+# A polish improves a motion by CMA-ES (Hansen 2016, "The CMA Evolution Strategy: A Tutorial"). It
+# looks at ranks alone: whatever satisfies all constraints ranks before whatever breaks one. Its
+# covariance is diagonal (Ros and Hansen 2008): a full one has more entries than a polish has
+# evaluations, and its eigenvectors differ in their last bits with the threads of linear algebra.
 
 # First steps, as a share of each gene's range: the search has left the motion near something good.
 _STEP: Final = 0.03
