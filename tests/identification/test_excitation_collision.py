@@ -563,7 +563,7 @@ def test_obstacles_that_mean_nothing_are_refused(build):
         build()
 
 
-def test_the_floor_under_a_ur5_is_checked_but_for_what_its_mounting_leaves() -> None:
+def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting() -> None:
     """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
     path = urdf_path("ur5_robot.urdf")
     checker = CollisionChecker(

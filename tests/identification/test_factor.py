@@ -28,7 +28,6 @@ from identification.factor.factor import (
     joint_weights,
     reduced,
     residual_variance,
-    rows_of,
     solve,
     solve_rows,
 )
@@ -44,7 +43,6 @@ from tests.identification.two_link import (
     URDF,
     P,
     coloured,
-    gaussian,
     recording,
     sine_motion,
     truth,
@@ -314,14 +312,6 @@ class TestConditioning:
         np.testing.assert_allclose(found.inverse, inverse, rtol=1e-5, atol=atol)
         assert found.determined.all() == (k >= p)
 
-    def test_normal_equations_become_rows_with_the_same_squares(self) -> None:
-        equations = Factor.of(MODEL, noisy(a_motion(), NOISE)).weighted(1.0 / NOISE**2)
-        rows, target = rows_of(equations)
-        scale = np.sqrt(np.diag(equations.A))
-        outer = np.outer(scale, scale)
-        np.testing.assert_allclose(rows.T @ rows / outer, equations.A / outer, atol=1e-12)
-        np.testing.assert_allclose((rows.T @ target) / scale, equations.b / scale, rtol=1e-9)
-
 
 class TestEstimate:
     def trial(self, seed: int, noise: Array = NOISE) -> Factor:
@@ -374,9 +364,3 @@ class TestEstimate:
         np.testing.assert_allclose(found.std, expected.std, rtol=1e-6)
         assert found.interval_factor == expected.interval_factor
         assert found.method.startswith(f"{weighting} least squares, cluster-robust covariance")
-
-    def test_without_a_usable_row_there_is_no_fit(self) -> None:
-        motion = two_link.a_motion(1.0)
-        samples = recording(gaussian(np.random.default_rng(10), motion), motion)
-        with pytest.raises(IdentificationError, match="not one usable sample"):
-            fit_least_squares(MODEL, [replace(samples, usable=np.zeros_like(samples.usable))])

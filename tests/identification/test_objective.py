@@ -298,25 +298,6 @@ def test_all_agree_with_exact_fractions(columns: list[list[int]]) -> None:
         assert found.fitness == pytest.approx(fitness, rel=1e-5, abs=1e-6)
 
 
-@given(seed=st.integers(0, 99), exponents=st.lists(st.integers(-9, 9), min_size=5, max_size=5))
-def test_units_shift_the_determinant_alone(seed: int, exponents: list[int]) -> None:
-    columns = random_columns(seed)
-    scaled = columns * 10.0 ** np.array(exponents)
-    index = coupling_index(gram_of(columns))
-    assert coupling_index(gram_of(scaled)) == pytest.approx(index, rel=1e-6)
-    shift = log10_det(gram_of(scaled), 40) - log10_det(gram_of(columns), 40)
-    assert shift == pytest.approx(2 * sum(exponents), abs=1e-6)
-
-
-@given(seed=st.integers(0, 99), k=st.integers(1, 50))
-def test_resampling_changes_no_scaled_determinant(seed: int, k: int) -> None:
-    columns = random_columns(seed)
-    dense = np.repeat(columns, k, axis=0)  # section 3.2: every point becomes k points
-    assert log10_det(gram_of(dense), 40 * k) == pytest.approx(
-        log10_det(gram_of(columns), 40), abs=1e-9
-    )
-
-
 def test_a_determinant_beyond_floats_has_a_logarithm() -> None:
     gram = np.diag(np.full(58, 1e9))
     with np.errstate(over="ignore"):

@@ -148,25 +148,6 @@ def test_it_is_never_worse_than_its_start(seed, genes):
         assert rugged(after)[0] >= rugged(before)[0]
 
 
-def test_a_seed_is_one_motion_whatever_else_draws(tmp_path, monkeypatch, capfd):
-    class Disturbing(Bowl):
-        def score(self, genes):
-            np.random.standard_normal(7)  # noqa: NPY002
-            return super().score(genes)
-
-    monkeypatch.chdir(tmp_path)
-    one = polished(Bowl(), START)[0].tobytes()
-    assert polished(Disturbing(), START)[0].tobytes() == one
-    assert polished(Bowl(), START, seed=2)[0].tobytes() != one
-    states = []
-    for run in (lambda: None, lambda: polished(Bowl(), START)):
-        np.random.seed(3)  # noqa: NPY002
-        run()
-        states.append(np.random.standard_normal(3).tobytes())  # noqa: NPY002
-    assert states[0] == states[1]
-    assert capfd.readouterr() == ("", "") and list(tmp_path.iterdir()) == []
-
-
 def test_it_ends_when_asked_to_and_where_nothing_moves():
     population = Bowl()
 

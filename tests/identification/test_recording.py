@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification.errors import ShapeError
 from identification.signals.clock import time_base
@@ -198,25 +197,18 @@ class TestRepetitions:
         assert offsets is not None
         np.testing.assert_allclose(offsets, [0.0, clock], atol=2e-3)
 
-    @pytest.mark.parametrize("seed", range(5))
-    def test_other_motions_are_none(self, seed: int) -> None:
-        assert offsets_of_repetitions([recorded(seed), recorded(seed + 100)]) is None
-
-    def test_another_speed_is_another_motion(self) -> None:
-        assert offsets_of_repetitions([recorded(1), recorded(1, pace=1.05)]) is None
-
-    def test_half_of_a_motion_is_no_repetition(self) -> None:
-        assert offsets_of_repetitions([recorded(1), recorded(1, start=4.0)]) is None
-
-    def test_one_of_three_that_differs_makes_none(self) -> None:
-        runs = [recorded(1), recorded(1, noise=1), recorded(2)]
+    @pytest.mark.parametrize(
+        "runs",
+        [
+            [recorded(1)],
+            *([recorded(seed), recorded(seed + 100)] for seed in range(5)),
+            [recorded(1), recorded(1, pace=1.05)],
+            [recorded(1), recorded(1, start=4.0)],
+            [recorded(1), recorded(1, noise=1), recorded(2)],
+        ],
+    )
+    def test_one_alone_and_other_motions_repeat_nothing(self, runs: list[Recording]) -> None:
         assert offsets_of_repetitions(runs) is None
-
-    def test_a_single_recording_repeats_nothing(self) -> None:
-        assert offsets_of_repetitions([recorded(1)]) is None
-
-
-Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])

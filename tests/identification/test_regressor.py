@@ -25,9 +25,9 @@ from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase
-from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
+from identification.model.kinematics import FROM_PINOCCHIO
 from identification.model.motion import Motion
-from identification.model.regressor import CHUNK, LinkMotion, _cos_sin
+from identification.model.regressor import CHUNK
 from identification.selection.essential import eliminate
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
@@ -140,24 +140,6 @@ def test_the_working_arrays_go_with_their_model() -> None:
         assert plan() is None
     finally:
         gc.enable()
-
-
-def test_a_shorter_block_leaves_nothing_of_the_block_before_it() -> None:
-    state = np.random.default_rng(2).uniform(-3.0, 3.0, (3, 25, 6))
-    links = LinkMotion(chain_from_urdf(urdf_text()), np.zeros(3), 25)
-    with np.errstate(invalid="ignore"):
-        links.update(*np.full((3, 25, 6), np.inf))
-    links.update(*state[:, :10])
-    assert np.all(np.isfinite(links.motion))
-
-
-def test_cosine_and_sine_are_exact_to_rounding() -> None:
-    special = np.array([0.0, np.pi / 2, np.pi, -np.pi, 2.0 * np.pi, 1e-300, 1e6])
-    angle = np.concatenate([special, np.random.default_rng(0).uniform(-20.0, 20.0, 100_000)])
-    cosine, sine = np.empty_like(angle), np.empty_like(angle)
-    _cos_sin(angle, cosine, sine)
-    assert np.abs(cosine - np.cos(angle)).max() < 1e-15
-    assert np.abs(sine - np.sin(angle)).max() < 1e-15
 
 
 Array = NDArray[np.float64]

@@ -231,7 +231,7 @@ class Finer(Watched):
     ("method", "measure"),
     [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index"), ("front", None)],
 )
-def test_a_polish_that_is_no_better_at_a_millisecond_is_left_alone(population, method, measure):
+def test_a_polish_no_better_at_a_millisecond_is_left_alone(population, method, measure):
     unpolished = search(population, settings(method))
     assert search(population.begin(), settings(method, polish=60)).chosen is None
     with Finer(unpolished.genes, measure) as finer:
