@@ -169,8 +169,7 @@ class _Reading:
             self._inertial = set()
         elif self._path[1:] == ["link", "inertial", tag] and tag in _NUMBERS:
             self._inertial.add(tag)
-            fault = self._of_numbers(tag, attributes) or self._of_blanks(tag)
-            self._fault = self._fault or fault
+            self._fault = self._fault or self._of_inertia(tag, attributes)
 
     def _end(self, _: str) -> None:
         if self._path[1:] == ["link", "inertial"]:
@@ -195,7 +194,7 @@ class _Reading:
             if self._links > MOST_LINKS:
                 raise _RefusedError(f"it has more than {MOST_LINKS} links")
 
-    def _of_numbers(self, tag: str, attributes: Mapping[str, str]) -> str:
+    def _of_inertia(self, tag: str, attributes: Mapping[str, str]) -> str:
         place = f"in the <{tag}> of its <inertial>"
         needed = [] if tag == "origin" else [key for key in _NUMBERS[tag] if key not in attributes]
         if needed:
@@ -212,9 +211,6 @@ class _Reading:
                 )
         if tag == "mass" and (mass := float(attributes["value"])) < 0.0:
             return f"link {self._link!r} has a mass of {mass:g} kg; write 0 or more"
-        return ""
-
-    def _of_blanks(self, tag: str) -> str:
         if self._has_blanks():
             return (
                 f"link {self._link!r} has a tab or line end within an attribute of the <{tag}> of "

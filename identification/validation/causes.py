@@ -95,7 +95,6 @@ class Causes(NamedTuple):
 
     found: tuple[Cause, ...]  # the one that explains most first
     best: Cause | None  # of all faults the one with the least error where nothing was found
-    undecided: tuple[int, ...]  # joints that might count either way for all that the recordings say
 
 
 def find_causes(
@@ -115,15 +114,8 @@ def find_causes(
             break  # with all parameters apart, nothing is left to compare
         search.mend(trial.cause.fault)
         trials = search.trials()
-    return Causes(
-        tuple(found),
-        min((one.cause for one in first), key=lambda one: one.ratio) if not found else None,
-        tuple(
-            one.cause.fault.joints[0]
-            for one in first
-            if one.cause.fault.kind == "axis sign" and one.cause.ratio < 1.0 + LEAST_GAIN
-        ),
-    )
+    best = min((one.cause for one in first), key=lambda one: one.ratio)
+    return Causes(tuple(found), None if found else best)
 
 
 class _Trial(NamedTuple):

@@ -202,8 +202,6 @@ def _cause_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         half = f" ± {load.half_interval:.2g}" if np.isfinite(load.half_interval) else ""
         more = f"{abs(load.mass):.3g}{half} kg {'more' if load.mass > 0.0 else 'less'}"
         facts |= {"carried": load.explained >= limit.load and most, "more": more, "load": load}
-    if (causes := evidence.causes) is not None and not causes.found and not evidence.in_sample:
-        facts["undecided"] = np.isin(np.arange(len(evidence.held_out.rows)), causes.undecided)
     if (checks := evidence.residuals) is not None:
         # Few samples make most of the error, and are what takes it beyond its limit.
         found, error_of = checks.outliers, evidence.held_out
@@ -490,9 +488,6 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "check how the arm is mounted, and set gravity of [robot] in the cell file to that; if it"
          " is right, check the zero positions of the joints", "cause"),
     _causes,
-    _Row("direction of axes", {"information": "undecided"},
-         "the data do not determine the direction of {joints}: the opposite direction fits about as"
-         " well"),
     _Row("direction of axes", {"wrong": "negated"},
          "all torques seem to have the other sign: over that of the nominal inertias they are"
          " <{scale:.2g}>",

@@ -276,7 +276,7 @@ def finding_of(check: str, names: Sequence[str] = AXES, **changes: Any) -> Findi
 
 
 def caused(kind: Kind, *joints: int, ratio: float = 0.4) -> Causes:
-    return Causes((Cause(Fault(kind, joints), ratio, 0.01, 0.001),), None, ())
+    return Causes((Cause(Fault(kind, joints), ratio, 0.01, 0.001),), None)
 
 
 LATE = DelayEstimate(
@@ -383,11 +383,6 @@ class TestJudgement:
     def test_repetitions_of_a_poor_motion_are_not_compared(self) -> None:
         changes = {"estimate": an_estimate(undetermined=MANY), "disagreement": np.array([0.8, 0.1])}
         assert len(judged(**changes).reasons) == 1
-
-    def test_an_undetermined_direction_is_information(self) -> None:
-        found = finding_of("direction of axes", causes=Causes((), None, undecided=(0,)))
-        assert found.level == "information"
-        assert found.words.startswith("the data do not determine the direction of one:")
 
     def test_names_with_braces_are_names(self) -> None:
         verdict = judged(("{one}", "<two>"), held_out=an_error(0.4), training=an_error(0.4))
