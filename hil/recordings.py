@@ -89,32 +89,21 @@ def recording_of(archive: Archive) -> Recording:
             f"holds no sample{f' ({archive.damage})' if archive.damage else ''}",
             remedy="record it again",
         )
-    current = columns.get("target_current", columns.get("motor_current"))
+    imported, own = archive.kind == "imported", archive.header.controllers_own
     return Recording(
         time=_time(archive),
         position=columns["position"],
         joint_names=archive.joint_names,
         torque=_known(columns.get("torque")),
-        velocity=_measured_velocity(archive),
-        motor_current=current,
-        commanded_position=_commanded(archive),
+        # A controller's own velocity is the slope of its positions.
+        velocity=_known(columns.get("velocity")) if imported else None,
+        motor_current=columns.get("target_current", columns.get("motor_current")),
+        # By the PC, or by the controller's own program.
+        commanded_position=columns.get("target_position" if own else "commanded_position"),
         gap_before=_gaps(archive),
         held_joints=archive.header.held_joints,
         provenance=_provenance(archive),
     )
-
-
-def _commanded(archive: Archive) -> Array | None:
-    """What the arm was commanded: by the PC, or by the controller's own program."""
-    own = archive.header.controllers_own
-    return archive.columns.get("target_position" if own else "commanded_position")
-
-
-def _measured_velocity(archive: Archive) -> Array | None:
-    """Of an imported recording; a controller's own is the slope of its positions."""
-    if archive.kind != "imported":
-        return None
-    return _known(archive.columns.get("velocity"))
 
 
 def _time(archive: Archive) -> Array:

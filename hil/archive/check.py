@@ -35,7 +35,6 @@ from hil.archive.header import (
 from hil.archive.reader import open_archive
 from hil.archive.repair import is_indexed, survey
 from hil.archive.scan import Scan
-from hil.errors import NotAnArchiveError
 
 ASPECTS = {
     "container": "MCAP records in order, header of profile ros2 by hil",
@@ -107,7 +106,7 @@ def check_archive(path: str | PathLike[str]) -> Check:
         faults["index"].append(text)
     if found.metadata is None:
         if not any(fault.aspect == "metadata" for fault in found.faults):
-            raise _another_kind(path, found)
+            open_archive(path, fields=())  # says why it is none
         described = ["without the record hil the rest cannot be checked"]
     else:
         described = _description_faults(path, found.metadata)
@@ -129,19 +128,6 @@ def check_archive(path: str | PathLike[str]) -> Check:
         faults={aspect: _shortened(found) for aspect, found in texts.items() if found},
         samples=found.samples,
         repaired=outcome is not None and outcome.repaired,
-    )
-
-
-def _another_kind(path: Path, found: Scan) -> NotAnArchiveError:
-    if found.size == 0:
-        return NotAnArchiveError(path, "is empty")
-    if found.expected.written_by is None:
-        return NotAnArchiveError(path, "is not an MCAP file")
-    profile, library = found.expected.written_by
-    return NotAnArchiveError(
-        path,
-        f"is an MCAP file of profile {profile!r} written by {library!r}, but not an archive of hil",
-        remedy="import it first",
     )
 
 

@@ -232,7 +232,7 @@ class TestAnotherFile:
             writer = Writer(stream)
             writer.start("ros1", "some recorder")
             writer.finish()
-        with pytest.raises(NotAnArchiveError, match=r"an MCAP file .*'ros1'.*'some recorder'"):
+        with pytest.raises(NotAnArchiveError, match="is an MCAP file, but not an archive"):
             check_archive(path)
 
     @pytest.mark.parametrize(
