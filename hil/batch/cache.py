@@ -2,7 +2,7 @@
 
 ```
 .hil-cache/           beside the archives, if their folder can be written to
-    5f/5fd0...        by its key: what an archive is, a summary, a sum, settings, texts of a cell
+    5f/5fd0...        by its key: what an archive is, a reduced bundle, settings, texts of a cell
 ```
 
 A key is a digest of everything the content depends on, so nothing is ever out of date. An entry
@@ -46,7 +46,7 @@ from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from planner.checked_data import DAMAGED
 
-from .types import ArchiveRef, CacheError, Summary
+from .types import ArchiveRef, Bundle, CacheError, Summary
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
     kind.__name__: kind
     for kind in (
-        *(ArchiveRef, Summary, Estimate, PhaseFactor),
+        *(ArchiveRef, Bundle, Summary, Estimate, PhaseFactor),
         *(Settings, Preprocessing, LowPassShape, Shrinkage, Choice),
     )
 }

@@ -22,7 +22,7 @@ from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
 from hil.identify.options import Options
 from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
 from hil.identify.sources import Source, all_fitted, known_warnings, source_of
-from hil.io import file_digest, json_digest
+from hil.io import file_digest
 from hil.progress import Silent
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
@@ -38,8 +38,8 @@ from .remote import local_file
 from .types import ArchiveRef, Broken, Bundle, ChangedError, Stamp, Summary
 
 BUNDLE: Final = 16
-"""Archives of a campaign that are reduced together. Of each a summary is cached, of all of them one
-sum, which is fifty times the size of a summary."""
+"""Archives of a campaign that are reduced together: a summary of each and one sum of all, which is
+fifty times the size of a summary, are one entry of the cache."""
 
 _FIELDS: Final = (
     "cycle",
@@ -303,41 +303,30 @@ def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bun
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
+    reasons = tuple(Broken(*one) for one in broken.items())
+    bundle = Bundle(tuple(refs), tuple(summaries), phase, reasons, len(refs) - known)
     if lasting:
-        for one in summaries:
-            store.put(_summary_key(one.ref, used), one)
-        for ref in refs:
-            if ref.location in broken:
-                store.put(_summary_key(ref, used), broken[ref.location])
-        store.put(sum_key(refs, used), [phase])
+        store.put(sum_key(refs, used), bundle)
         if known:
             store.remove(sum_key(refs[:known], used))  # part of a longer one now
-    reasons = tuple(Broken(*one) for one in broken.items())
-    return Bundle(tuple(refs), tuple(summaries), phase, reasons, len(refs) - known)
+    return bundle
 
 
 def cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle | None:
     """Archives reduced earlier; None unless all of them are in the cache."""
-    store, used = where.store(refs[0].location), settings_digest(settings)
-    found = store.get(sum_key(refs, used), list)
-    if found is None or len(found) != 1 or not isinstance(found[0], PhaseFactor | None):
+    store = where.store(refs[0].location)
+    found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
+    if found is None:
         return None
-    summaries, broken = [], []
-    for ref in refs:
-        match store.get(_summary_key(ref, used), object):
-            case Summary() as one:  # of an archive that may lie elsewhere by now
-                summaries.append(replace(one, ref=ref))
-            case str() as reason:
-                broken.append(Broken(ref.location, reason))
-            case _:
-                return None
-    return Bundle(tuple(refs), tuple(summaries), found[0], tuple(broken))
+    now = {old.location: ref for old, ref in zip(found.refs, refs, strict=True)}  # moved, perhaps
+    return Bundle(
+        tuple(refs),
+        tuple(replace(one, ref=now[one.ref.location]) for one in found.summaries),
+        found.phase,
+        tuple(Broken(now[path].location, reason) for path, reason in found.broken),
+    )
 
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> bool:
     """Whether there is an entry of the sum of these archives; it may turn out to be damaged."""
     return where.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))
-
-
-def _summary_key(ref: ArchiveRef, settings: str) -> str:
-    return json_digest(["summary", ref.sha256, settings])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 from typing import Final
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hil.archive import Findings, Samples
+from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
 from hil.importers.column_map import ANGLES, RATES
 from identification.model.urdf_text import urdf_tree
@@ -38,17 +38,6 @@ _FOLLOWS: Final = 0.7  # correlation
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
 _NO_LIMIT: Final = 1e4  # what some URDFs write for "none"
 _LENGTHS: Final = frozenset(("m", "mm", "m/s", "mm/s"))
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a joint as its URDF gives them, infinite where it gives none."""
-
-    lower: float = -np.inf
-    upper: float = np.inf
-    velocity: float = np.inf
-    effort: float = np.inf
-    revolute: bool = True
 
 
 def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
@@ -103,79 +92,66 @@ def examine(
         locked: positions [rad or m] of joints that are none of the model, by name.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), samples.position
-    known = urdf_limits(urdf)
-    limits = [known.get(name, Limits()) for name in joint_names]
+    limits = limits_of(urdf, joint_names)
+    kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
+    turning = np.array([kinds[name] != "prismatic" for name in joint_names])
     held = [f"{name} at {place:.4g}" for name, place in (locked or {}).items()]
     lines = [f"locked, rad or m: {', '.join(held)}"] if held else []
     if len(time) < 2:
         return Findings(lines=(f"{len(time)} samples", *lines), warnings=())
     base = time_base(time)
     lines = [f"time: {'; '.join(base.describe())}", *lines]
-    lines += map(_range, joint_names, position.T, limits)
+    lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
         text = f"{base.rate:.3g} samples a second is unusual: is the unit of the time right?"
         warnings.append(text)
-    warnings += _positions(time, position, joint_names, limits)
+    warnings += _positions(time, position, joint_names, limits, turning)
     if samples.velocity is not None:
         warnings += _velocities(time, base.rate, position, samples.velocity, joint_names, limits)
-    warnings += _torques(samples, joint_names, limits)
+    warnings += _torques(samples, joint_names, limits.effort)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
 
 
-def urdf_limits(urdf: str) -> dict[str, Limits]:
-    """Limits by joint name; what a macro left behind is no number, and no limit."""
-    found = {}
-    for joint in urdf_tree(urdf).iter("joint"):
-        kind, limit = joint.get("type"), joint.find("limit")
-        if kind not in ("revolute", "continuous", "prismatic"):
-            continue
-        given = {}
-        for key, text in ({} if limit is None else limit.attrib).items():
-            try:
-                given[key] = float(text)
-            except ValueError:
-                continue
-        bounded = kind != "continuous" and given.get("lower", 0.0) < given.get("upper", 0.0)
-        velocity, effort = (given.get(key, 0.0) for key in ("velocity", "effort"))
-        found[joint.get("name", "")] = Limits(
-            lower=given.get("lower", -np.inf) if bounded else -np.inf,
-            upper=given.get("upper", np.inf) if bounded else np.inf,
-            velocity=velocity if 0.0 < velocity < _NO_LIMIT else np.inf,
-            effort=effort if 0.0 < effort < _NO_LIMIT else np.inf,
-            revolute=kind != "prismatic",
-        )
-    return found
-
-
-def _range(name: str, position: Array, limits: Limits) -> str:
-    low, high = float(position.min()), float(position.max())
-    text = f"{name}: {low:.3f} .. {high:.3f} {'rad' if limits.revolute else 'm'}"
-    if limits.revolute:
-        text += f" ({math.degrees(low):.0f} .. {math.degrees(high):.0f} deg)"
-    if np.isfinite(limits.lower):
-        text += f", limits of the URDF {limits.lower:.3f} .. {limits.upper:.3f}"
-    return text
-
-
-def _outside(position: Array, limits: Sequence[Limits]) -> str:
-    """Share of the rows (m, n) in which a joint is outside its limits [%]."""
-    lower = np.array([one.lower for one in limits]) - _TOLERANCE
-    upper = np.array([one.upper for one in limits]) + _TOLERANCE
-    share = np.mean(((position < lower) | (position > upper)).any(axis=1))
-    return f"{100.0 * float(share):.3g} %"
-
-
-def _fits(position: Array, limits: Sequence[Limits]) -> NDArray[np.bool_]:
-    """Whether each column of the positions lies in the limits of each joint (joints, columns)."""
-    low, high = position.min(axis=0), position.max(axis=0)
-    return np.array(
-        [(one.lower - _TOLERANCE <= low) & (high <= one.upper + _TOLERANCE) for one in limits]
+def limits_of(urdf: str, names: Sequence[str]) -> UrdfLimits:
+    """Limits of joints; infinite as well where a range is empty, or a figure stands for none."""
+    lower, upper, velocity, effort = urdf_limits(urdf, names)
+    bounded = lower < upper
+    return UrdfLimits(
+        np.where(bounded, lower, -np.inf),
+        np.where(bounded, upper, np.inf),
+        *(np.where((one > 0.0) & (one < _NO_LIMIT), one, np.inf) for one in (velocity, effort)),
     )
 
 
+def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> str:
+    low, high = float(position.min()), float(position.max())
+    text = f"{name}: {low:.3f} .. {high:.3f} {'rad' if turns else 'm'}"
+    if turns:
+        text += f" ({math.degrees(low):.0f} .. {math.degrees(high):.0f} deg)"
+    if np.isfinite(lower):
+        text += f", limits of the URDF {lower:.3f} .. {upper:.3f}"
+    return text
+
+
+def _outside(position: Array, limits: UrdfLimits) -> str:
+    """Share of the rows (m, n) in which a joint is outside its limits [%]."""
+    outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
+    return f"{100.0 * float(np.mean(outside.any(axis=1))):.3g} %"
+
+
+def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
+    """Whether each column of the positions lies in the limits of each joint (joints, columns)."""
+    above = limits.lower[:, None] - _TOLERANCE <= position.min(axis=0)
+    return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
+
+
 def _positions(
-    time: Array, position: Array, names: Sequence[str], limits: Sequence[Limits]
+    time: Array,
+    position: Array,
+    names: Sequence[str],
+    limits: UrdfLimits,
+    turning: NDArray[np.bool_],
 ) -> Iterator[str]:
     """Whether a robot could be there, and move so."""
     fits, joints = _fits(position, limits), range(len(names))
@@ -187,9 +163,8 @@ def _positions(
             f"as mapped, {_outside(position, limits)} of the rows leave the limits of the URDF "
             f"({ranges})"
         )
-        turning = np.array([one.revolute for one in limits])
         radians = np.where(turning, np.radians(position), position)
-        farthest = np.array([3.0 * max(-one.lower, one.upper) for one in limits])
+        farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
         far = (np.maximum(-low, high) > farthest)[beyond].any()
         columns = linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
         check = "check unit, sign and zero in the column map"
@@ -215,11 +190,11 @@ def _positions(
     if not len(moved):
         return
     usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
-    for name, speed, one in zip(names, usual, limits, strict=True):
-        if speed > _TOO_FAST * one.velocity:
+    for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
+        if speed > _TOO_FAST * limit:
             yield (
                 f"{name} would move at {speed:.3g} rad/s (or m/s), its limit in the URDF is "
-                f"{one.velocity:.3g}: are degrees read as radians, or seconds as milliseconds?"
+                f"{limit:.3g}: are degrees read as radians, or seconds as milliseconds?"
             )
 
 
@@ -229,7 +204,7 @@ def _velocities(
     position: Array,
     velocity: Array,
     names: Sequence[str],
-    limits: Sequence[Limits],
+    limits: UrdfLimits,
 ) -> Iterator[str]:
     """Whether the velocities are the slopes of the positions: in this order, in these units."""
     moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _HARDLY]
@@ -318,7 +293,7 @@ def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Ar
     return factor, correlation
 
 
-def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -> Iterator[str]:
+def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[str]:
     if samples.torque is None and samples.motor_current is None:
         yield (
             "there is neither torque nor motor current in the log: it can be looked at, not "
@@ -326,11 +301,11 @@ def _torques(samples: Samples, names: Sequence[str], limits: Sequence[Limits]) -
         )
     if samples.torque is None:
         return
-    for name, largest, one in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
+    for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
         if largest == 0.0:
             yield f"the torque of {name} is zero throughout"
-        elif largest > _TOO_FAST * one.effort:
+        elif largest > _TOO_FAST * limit:
             yield (
                 f"the torque of {name} reaches {largest:.3g}, its limit in the URDF is "
-                f"{one.effort:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
+                f"{limit:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
             )

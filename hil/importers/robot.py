@@ -20,7 +20,7 @@ from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
 from hil.importers.dh import Convention, urdf_of_dh
-from hil.importers.findings import Limits, check_clock, examine, urdf_limits
+from hil.importers.findings import check_clock, examine, limits_of
 from hil.io import file_digest
 from hil.reading import named_text
 from identification import FrictionLaw
@@ -196,14 +196,12 @@ def _held(
             remedy=f"recorded are {', '.join(recorded)}; use the names of the URDF (joints in the "
             "map of a log, --rename RECORDED=URDF of a bag)",
         )
-    limits = urdf_limits(urdf)
-    others = {}
-    for name in names:
-        one = limits.get(name, Limits())
-        if name not in recorded:
-            zero = one.lower <= 0.0 <= one.upper
-            others[name] = 0.0 if zero else 0.5 * (one.lower + one.upper)
-    return {**others, **locked}
+    limits = limits_of(urdf, names)
+    rest = {
+        name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
+        for name, low, high in zip(names, limits.lower.tolist(), limits.upper.tolist(), strict=True)
+    }
+    return {name: at for name, at in rest.items() if name not in recorded} | {**locked}
 
 
 def _vector(values: Sequence[float]) -> str:
