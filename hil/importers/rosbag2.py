@@ -102,19 +102,19 @@ def unpacked(files: list[Path]) -> Iterator[list[Path]]:
         SourceError: one cannot be decompressed.
     """
     with TemporaryDirectory() as folder:
-        yield [_unpacked(file, Path(folder)) for file in files]
+        yield [
+            _unpacked(file, Path(folder) / file.stem) if file.suffix in _PACKED else file
+            for file in files
+        ]
 
 
-def _unpacked(file: Path, folder: Path) -> Path:
-    if file.suffix not in _PACKED:
-        return file
-    target = folder / file.stem
+def _unpacked(file: Path, target: Path) -> Path:
     try:
         most = _SLACK + MOST_INFLATION * file.stat().st_size
-        with file.open("rb") as packed, target.open("wb") as unpacked_file:
+        with file.open("rb") as packed, target.open("wb") as output:
             for block in zstandard.ZstdDecompressor().read_to_iter(packed):
-                unpacked_file.write(block)
-                if unpacked_file.tell() > most:
+                output.write(block)
+                if output.tell() > most:
                     raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error
@@ -307,27 +307,21 @@ def _decoded(data: bytes, file: Path, number: int) -> Any:
 
 def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
     """The topic asked for, or the only one that carries joint states."""
-    listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
     fitting = [
         name for name, found in topics.items() if found.is_ros2 and found.kind in JOINT_STATES
     ]
-    problem, remedy = "", f"its topics are: {listing}"
-    if topic is None and len(fitting) != 1:
+    if topic is None and len(fitting) == 1:
+        (topic,) = fitting
+    if topic in fitting:
+        return topic
+    problem = f"there is no topic {topic}"
+    if topic is None:
         problem = f"{len(fitting) or 'no'} topics carry {JOINT_STATE}"
-        remedy = (
-            f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
-            "column map"
-        )
-    elif topic is not None and topic not in topics:
-        problem = f"there is no topic {topic}"
-    elif topic is not None and topic not in fitting:
-        found = topics[topic]
-        problem = (
-            f"topic {topic} carries {found.kind} in {found.encoding}, not measured joint states"
-        )
-    if problem:
-        raise SourceError(file, problem, field="topic", remedy=remedy)
-    return topic or fitting[0]
+    elif topic in topics:
+        problem = f"topic {topic} carries {topics[topic]}, not measured joint states"
+    listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
+    remedy = f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
+    raise SourceError(file, problem, field="topic", remedy=f"{remedy}column map")
 
 
 def _samples(

@@ -424,7 +424,8 @@ def assert_little_is_lost(case: Killed, folder: Path) -> int:
     return case.written - count
 
 
-def require(rounds: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rounds", [20, pytest.param(300, marks=pytest.mark.slow)])
+def test_killed_at_any_moment_it_costs_a_flush_period_at_most(rounds: int, tmp_path: Path) -> None:
     folder = tmp_path / "repaired"
     folder.mkdir()
     with ThreadPoolExecutor(AT_ONCE) as pool:
@@ -432,15 +433,6 @@ def require(rounds: int, tmp_path: Path) -> None:
     lost = [assert_little_is_lost(case, folder) for case in cases]
     assert any(case.written > FLUSH for case in cases)
     assert np.mean([count <= FLUSH + 1 for count in lost]) >= MOSTLY, sorted(lost)
-
-
-def test_killed_at_any_moment_it_costs_a_flush_period_at_most(tmp_path: Path) -> None:
-    require(20, tmp_path)
-
-
-@pytest.mark.slow
-def test_killed_at_any_of_many_moments_it_costs_a_flush_period_at_most(tmp_path: Path) -> None:
-    require(300, tmp_path)
 
 
 def test_every_flush_waits_for_the_disk_and_the_first_comes_at_once(

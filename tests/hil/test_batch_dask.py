@@ -6,13 +6,12 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil.archive import container
 from hil.batch import cluster as dask_cluster
 from hil.batch import run
 from hil.batch.cache import Where
@@ -24,7 +23,7 @@ from hil.batch.cluster import (
     release_children,
     software,
 )
-from hil.batch.types import BatchResult, Broken
+from hil.batch.types import Broken
 from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import Campaign
 from hil.errors import InputError
@@ -33,7 +32,6 @@ from hil.progress import Silent
 from hil.version import install_command
 from tests.hil import batch_work as work
 from tests.hil.dask_cluster import Cluster, running
-from tests.hil.mcap_bytes import metadata
 
 PATIENCE = 60.0  # s; the machine may be busy
 
@@ -184,77 +182,16 @@ def test_a_scheduler_without_workers_is_an_error(
 
 
 @pytest.mark.slow
-def test_a_batch_has_the_bits_of_one_machine_though_a_worker_dies(
-    tmp_path: Path, campaign: Campaign, pair: Cluster
-) -> None:
-    """Two campaigns, distinguished by a record that no estimate reads."""
-    for number in range(2):
-        _copy_with_mark(campaign.folder.root, tmp_path / "data" / f"{number}", f"copy {number}")
-    roots, where = [str(tmp_path / "data")], Where(keep=False)
-    hands = DaskWorkers(pair.address, patience=PATIENCE)
-    with _KillsOne(hands, pair.workers[0]) as workers:
-        found = run.reidentify(roots, FIXED, workers, Silent(), where=where)
-    assert pair.workers[0].wait(1.0) == -9
-    assert pair.workers[1].poll() is None
-    with LocalWorkers(1) as workers:
-        expected = run.reidentify(roots, FIXED, workers, Silent(), where=where)
-    assert not found.broken
-    assert len(found.campaigns) == 2
-    assert _figures(found) == _figures(expected)
+def test_a_batch_has_the_bits_of_one_machine(campaign: Campaign, cluster: Cluster) -> None:
+    def figures(hands: Workers) -> list[bytes]:
+        where = Where(keep=False)
+        found = run.reidentify([str(campaign.folder.root)], FIXED, hands, Silent(), where=where)
+        assert not found.broken
+        levels = [*found.repetitions, *found.campaigns, *found.pooled]
+        return [one.values.tobytes() + one.std.tobytes() for one in levels]
 
-
-class _KillsOne(Workers):
-    """Workers of which one is killed as soon as the first archives were reduced."""
-
-    near = False
-    count = 2
-
-    def __init__(self, hands: DaskWorkers, victim: subprocess.Popen[bytes]) -> None:
-        self._hands, self._victim = hands, victim
-
-    def __enter__(self) -> _KillsOne:
-        both(self._hands)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._hands.close()
-
-    def results(self, tasks: Sequence[Any], done: Any = None) -> Iterator[Any]:
-        """The work on archives."""
-        begun = any(task.function is run.reduced for task in tasks)
-
-        def killing(count: int) -> None:
-            if begun:
-                self._victim.kill()
-            if done is not None:
-                done(count)
-
-        return self._hands.results(tasks, killing)
-
-
-def _copy_with_mark(source: Path, target: Path, mark: str) -> None:
-    """Copy archives, each with one more metadata record: the same samples, another file."""
-    for path in sorted(source.rglob("*.mcap")):
-        copy = target / path.relative_to(source)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        data, head = path.read_bytes(), len(container.MAGIC)
-        copy.write_bytes(data[:head] + metadata("mark", {mark: ""}) + data[head:])
-
-
-def _figures(result: BatchResult) -> list[tuple[str, tuple[bytes, ...]]]:
-    """All numbers, to the bit."""
-    levels = [*result.repetitions, *result.campaigns, *result.pooled]
-    return [
-        (
-            f"{one.level} {one.campaign} {one.archive}",
-            tuple(
-                part.tobytes()
-                for part in (one.values, one.std, one.covariance, one.noise_std, one.unseen_rms)
-                if part is not None
-            ),
-        )
-        for one in levels
-    ]
+    with LocalWorkers(1) as local, connected(cluster) as workers:
+        assert figures(workers) == figures(local)
 
 
 # The package

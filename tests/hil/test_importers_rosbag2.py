@@ -299,7 +299,7 @@ class TestBadInput:
             (
                 {"/a": (STATE, [])},
                 "/joints",
-                r"topic: there is no topic /joints; its topics are: /a",
+                r"topic: there is no topic /joints; name one of its topics: /a",
             ),
             ({"/plan": ("x/msg/Plan", []), "/a": (STATE, [])}, "/plan", "/plan carries x/msg/Plan"),
             ({"/a": (STATE, [])}, None, "none of the joints hip, ankle was recorded; it is empty"),
