@@ -61,7 +61,6 @@ _STATES = {
 }
 """Which columns of the cycles each channel repeats; targets stand for commands that are NaN."""
 _CYCLE_FIELDS = {"cycle", "gap"}.union(*(columns.values() for columns in _STATES.values()))
-_ADDED_LATER = 1  # fields at the end of the cycle that the first archives do not have
 _MOST = 5  # faults of one aspect that are shown
 
 
@@ -98,30 +97,26 @@ def check_archive(path: str | PathLike[str]) -> Check:
     """
     path = Path(path)
     checker = _Checker()
-    faults = checker.faults
-    found = survey(path, checker.visit)
+    found, say = survey(path, checker.visit), checker.say
     outcome = found.outcome
     if not found.faults and found.header is not None and not is_indexed(path, found):
-        text = "the message indexes or the index at the end do not fit what is there"
-        faults["index"].append(text)
+        say("index", "the message indexes or the index at the end do not fit what is there")
     if found.metadata is None:
         if not any(fault.aspect == "metadata" for fault in found.faults):
             open_archive(path, fields=())  # says why it is none
-        described = ["without the record hil the rest cannot be checked"]
+        say("metadata", "without the record hil the rest cannot be checked")
     else:
-        described = _description_faults(path, found.metadata)
+        for text in _description_faults(path, found.metadata):
+            say("metadata", text)
     if outcome is not None and outcome.outcome not in OUTCOMES:
-        text = f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
-        faults["outcome"].append(text)
+        say("outcome", f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}")
     if outcome is not None and CHUNKS in outcome.record and outcome.chunks is None:
-        faults["outcome"].append(f"{CHUNKS} is no list of checksums")
+        say("outcome", f"{CHUNKS} is no list of checksums")
     if found.header is not None and found.pieces:
         checker.finish(found)
-    texts = {
-        aspect: [fault.text for fault in found.faults if fault.aspect == aspect] + own
-        for aspect, own in faults.items()
-    }
-    texts["metadata"] += described
+    texts: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
+    for aspect, text in [*((one.aspect, one.text) for one in found.faults), *checker.faults]:
+        texts[aspect].append(text)
     return Check(
         path=path,
         version=(found.metadata or {}).get("format_version", "unknown"),
@@ -162,13 +157,17 @@ class _Checker:
     """Checks sound chunks, one after the other; then the rest.
 
     Attributes:
-        faults: what is wrong, by aspect of the profile.
+        faults: what is wrong: aspect of the profile, and sentence.
     """
 
     def __init__(self) -> None:
-        self.faults: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
+        self.faults: list[tuple[str, str]] = []
         self._layouts: dict[str, MessageLayout | None] = {}
         self._gaps = 0
+
+    def say(self, aspect: str, text: str) -> None:
+        """Note a fault."""
+        self.faults.append((aspect, text))
 
     def visit(self, found: Scan, messages: Mapping[str, Messages], offset: int) -> None:
         """Check the next chunk."""
@@ -177,16 +176,14 @@ class _Checker:
         place = f"the chunk at byte {offset}"
         compression = container.chunk(found.record).compression
         if compression != "zstd":
-            text = f"{place} is compressed with {compression or 'nothing'}, not zstd"
-            self.faults["chunks"].append(text)
+            self.say("chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd")
         rows: dict[str, Rows] = {}
         for topic, of_topic in messages.items():
             if topic in schema.ONCE:
                 continue
             times = of_topic.of_heads("log_time"), of_topic.of_heads("publish_time")
             if not all(np.array_equal(time, of_topic.stamps) for time in times):
-                text = f"{place} has messages logged at another time than their stamp"
-                self.faults["times"].append(text)
+                self.say("times", f"{place} has messages logged at another time than their stamp")
             try:
                 if topic == schema.EVENTS:
                     for message in of_topic.all():
@@ -194,7 +191,7 @@ class _Checker:
                 else:
                     rows[topic] = self._rows(found, topic, of_topic)
             except LayoutError as error:
-                self.faults["sizes"].append(f"{place} has messages of {topic}: {error}")
+                self.say("sizes", f"{place} has messages of {topic}: {error}")
         if schema.CYCLE in rows and set(rows[schema.CYCLE].dtype.names or ()) >= _CYCLE_FIELDS:
             self._check_cycles(found.header.period, messages, rows, place)
 
@@ -206,15 +203,14 @@ class _Checker:
         if parser.channels:
             cycles = () if imported else (schema.CYCLE, schema.COMMANDED)
             for topic in sorted({schema.MEASURED, schema.EVENTS, *cycles} - parser.topics):
-                self.faults["channels"].append(f"there is no {topic}")
+                self.say("channels", f"there is no {topic}")
             for channel in parser.channels.values():
                 self._check_channel(channel, parser, len(header.joint_names))
         if imported or outcome is None or outcome.repaired or found.losses:
             return
         if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
             stated = outcome.record["lost_packets"]
-            text = f"lost_packets is {stated}, the cycles lack {self._gaps}"
-            self.faults["outcome"].append(text)
+            self.say("outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}")
 
     def _check_channel(self, channel: Channel, parser: ChunkParser, n_joints: int) -> None:
         topic = channel.topic
@@ -228,10 +224,14 @@ class _Checker:
             ("schemas", "encoding of the schema", found.encoding, "ros2msg"),
         ):
             if is_now != must_be:
-                self.faults[aspect].append(f"{topic}: {what} is {is_now!r}, not {must_be!r}")
+                self.say(aspect, f"{topic}: {what} is {is_now!r}, not {must_be!r}")
         text = found.data.decode(errors="replace")
-        if not _extends(text, profile.definition, fixed=topic != schema.CYCLE):
-            self.faults["schemas"].append(f"that of {topic} is not the text of the profile")
+        same = text == profile.definition
+        if topic == schema.CYCLE and not same:  # fields may be added at its end, and age was
+            ours, theirs = _fields(profile.definition), _fields(text)
+            same = theirs[: len(ours)] in (ours, ours[:-1])
+        if not same:
+            self.say("schemas", f"that of {topic} is not the text of the profile")
 
     def _rows(self, found: Scan, topic: str, messages: Messages) -> Rows:
         """The messages as a structured array; a `LayoutError` where one has another layout."""
@@ -259,25 +259,14 @@ class _Checker:
         if period is not None:
             period_ns = period * 1e9
             if not np.array_equal(stamp, np.rint(number * period_ns)):
-                text = f"{place} has cycles whose stamp is not cycle times period"
-                self.faults["times"].append(text)
+                self.say("times", f"{place} has cycles whose stamp is not cycle times period")
             if (int(number[-1]) - int(number[0])) * period_ns >= max(_CHUNK_NS, period_ns):
-                self.faults["chunks"].append(f"{place} spans more than 100 ms")
+                self.say("chunks", f"{place} spans more than 100 ms")
         self._gaps += int(cycles["gap"].sum())
         for topic in _STATES.keys() & rows.keys():
             same = np.array_equal(found[topic].stamps, stamp)
             if not (same and _repeats(rows[topic], cycles, _STATES[topic])):
-                text = f"{place} has messages of {topic} unlike its cycles"
-                self.faults["joint_states"].append(text)
-
-
-def _extends(text: str, profile: str, *, fixed: bool) -> bool:
-    """Whether a text is that of the profile, or has its fields up to those added at the end."""
-    if text == profile or fixed:
-        return text == profile
-    ours, theirs = _fields(profile), _fields(text)
-    shorter = min(len(ours), len(theirs))
-    return shorter >= len(ours) - _ADDED_LATER and ours[:shorter] == theirs[:shorter]
+                self.say("joint_states", f"{place} has messages of {topic} unlike its cycles")
 
 
 def _fields(text: str) -> list[str]:

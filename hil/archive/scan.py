@@ -220,10 +220,9 @@ class Scan:
 
     def _read(self, stream: BinaryIO, outside: Collection[int]) -> None:
         """Take records up to their end or the first damage."""
-        walk = container.records(stream, self.size, skip=outside)
         try:
             try:
-                for record in walk:
+                for record in container.records(stream, self.size, skip=outside):
                     if record.offset in outside:
                         self._flush()
                         self._place, self._gap = self._place + 1, True
@@ -231,13 +230,12 @@ class Scan:
                     self._take(record)
                     if record.opcode == container.METADATA:
                         self._require_ours(record.offset)
-            except Damage as damage:
-                self.damage = damage
-            self._flush()
-            if self.damage is None and not outside and self.header is not None:
+            finally:
+                self._flush()  # what waits is in front of any damage so far
+            if not outside and self.header is not None:
                 for _, text in self._shortfalls():
                     raise Damage(self.size, f"is not there: {text}")
-        except Damage as damage:  # in an earlier record
+        except Damage as damage:
             self.damage = damage
 
     def _require_ours(self, offset: int) -> None:

@@ -39,11 +39,11 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
         SourceError: the file cannot be read, or holds no topic that can be read so; the text says
             why for each.
     """
-    known = mcap_messages.topics(path)
+    known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
     layouts: dict[str, MessageLayout] = {}
     found: dict[str, list[tuple[int, bytes]]] = {}
-    for name, stamp, data in mcap_messages.messages(path, known.keys() - refused.keys()):
+    for name, stamp, data in messages:
         if name in refused:
             continue
         try:
@@ -60,9 +60,9 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
             continue
         found.setdefault(name, []).append((stamp, data[:size]))
     arrays: dict[str, NDArray[Any]] = {}
-    for name, messages in found.items():
+    for name, own in found.items():
         try:
-            columns = _columns(layouts[name], messages)
+            columns = _columns(layouts[name], own)
         except LayoutError as error:
             refused[name] = str(error)
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,14 +54,27 @@ class Topic:
         return self.kind if self.is_ros2 else f"{self.kind} in {self.encoding or 'no encoding'}"
 
 
-def topics(path: Path) -> dict[str, Topic]:
-    """The topics of a file by name.
+def read(
+    path: Path, wanted: Callable[[str, Topic], bool]
+) -> tuple[dict[str, Topic], list[tuple[str, int, bytes]]]:
+    """The topics of a file by name, and the messages of those that are wanted, by their time.
+
+    Args:
+        path: the file.
+        wanted: given name and topic.
+
+    Returns:
+        Topics; name of the topic, log time [ns] and data of each message.
 
     Raises:
-        SourceError: it cannot be read, is no MCAP file or is cut off.
+        SourceError: it cannot be read, is no MCAP file or is cut off, or has too many bytes of
+            these messages.
     """
     schemas: dict[int, Schema] = {}
-    found: dict[str, Topic] = {}
+    topics: dict[str, Topic] = {}
+    names: dict[int, str] = {}
+    found: list[tuple[str, int, bytes]] = []
+    size = 0
     with _opened(path) as stream:
         for record in _records(stream):
             if record.opcode == container.SCHEMA:
@@ -71,36 +84,21 @@ def topics(path: Path) -> dict[str, Topic]:
                 channel: Channel = container.item(record)
                 kind = schemas.get(channel.schema_id, Schema(0, b"", "", "without schema"))
                 topic = Topic(kind.name, channel.message_encoding, kind.encoding, kind.data)
-                found.setdefault(channel.topic, topic)
-    return found
-
-
-def messages(path: Path, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, log time [ns] and data of messages of some topics, by their time.
-
-    Raises:
-        SourceError: the file cannot be read, is cut off, or holds too many bytes of them.
-    """
-    names: dict[int, str] = {}
-    found: list[tuple[str, int, bytes]] = []
-    held_bytes = 0
-    with _opened(path) as stream:
-        for record in _records(stream):
-            if record.opcode == container.CHANNEL:
-                channel: Channel = container.item(record)
+                topics.setdefault(channel.topic, topic)
                 names.setdefault(channel.id, channel.topic)
             elif record.opcode == container.MESSAGE:
                 number, _, log_time, _ = _HEAD.unpack_from(record.body)
-                if names[number] in wanted:
-                    found.append((names[number], log_time, record.body[_HEAD.size :]))
-                    held_bytes += len(record.body)
-            if held_bytes > MOST_BYTES:
+                name = names[number]
+                if wanted(name, topics[name]):
+                    found.append((name, log_time, record.body[_HEAD.size :]))
+                    size += len(record.body)
+            if size > MOST_BYTES:
                 raise SourceError(
                     path,
                     f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
                     remedy="cut it, or leave out topics (`mcap filter`)",
                 )
-    yield from sorted(found, key=lambda message: message[1])
+    return topics, sorted(found, key=lambda message: message[1])
 
 
 def _records(stream: BinaryIO) -> Iterator[Record]:

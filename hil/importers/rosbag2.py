@@ -75,7 +75,7 @@ def topics(file: Path) -> dict[str, Topic]:
         SourceError: it is no bag.
     """
     if file.suffix == ".mcap":
-        return mcap_messages.topics(file)
+        return mcap_messages.read(file, lambda *_: False)[0]
     with _connected(file) as bag:
         query = "SELECT name, type, serialization_format FROM topics ORDER BY name"
         return {str(name): Topic(str(kind), str(code)) for name, kind, code in bag.execute(query)}
@@ -89,7 +89,8 @@ def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
     """
     found: Iterator[tuple[int, bytes]] = _of_sqlite(file, topic)
     if file.suffix == ".mcap":
-        found = ((stamp, data) for _, stamp, data in mcap_messages.messages(file, [topic]))
+        _, read = mcap_messages.read(file, lambda name, _: name == topic)
+        found = ((stamp, data) for _, stamp, data in read)
     for stamp, data in found:
         yield stamp, _decompressed(data, file) if data.startswith(_ZSTD) else data
 
