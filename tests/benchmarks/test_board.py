@@ -65,9 +65,7 @@ class TestSplit:
 
 class TestRow:
     @pytest.mark.parametrize(
-        "split",
-        [Split(fitted="one", predicted="other"), Split(fitted="one", part="all")],
-        ids=str,
+        "split", [Split(fitted="one", predicted="other"), Split(fitted="one", part="all")], ids=str
     )
     def test_both_are_near_the_noise(
         self, split: Split, logs: dict[str, JointLog], archives: dict[str, Path]
@@ -98,10 +96,7 @@ class TestRow:
 
 class TestDegradedRow:
     def test_its_fields(
-        self,
-        logs: dict[str, JointLog],
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+        self, logs: dict[str, JointLog], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         some = {name: board.DEGRADATIONS[name] for name in ("lost rows", "payload in half")}
         monkeypatch.setattr(board, "DEGRADATIONS", some)

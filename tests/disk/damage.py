@@ -32,8 +32,7 @@ from tests.hil.fast_cell import fast_campaign, fast_cell
 from tests.journal import Journal, JournalError
 from tests.journal import rounds as known
 
-EVERY = 10
-"""Rounds of which one is pooled and compared as well."""
+EVERY = 10  # Rounds of which one is pooled and compared as well
 SEED = 20261120
 
 

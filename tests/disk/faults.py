@@ -14,32 +14,21 @@ from pathlib import Path
 from typing import Final
 
 CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
-CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)
-"""Operations on which a disk may fail or hang."""
+CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # Operations on which a disk may fail or hang
 REFUSALS: Final = {"EIO": errno.EIO, "EDQUOT": errno.EDQUOT, "ENOSPC": errno.ENOSPC}
 
 
 @dataclass(frozen=True)
 class Rule:
-    """One thing that goes wrong.
+    """One thing that goes wrong."""
 
-    Attributes:
-        operations: on which of `CHANGES`.
-        names: pattern of the names of files it is about.
-        after: how many matching operations pass before it begins.
-        times: on how many it then acts; 0: on all.
-        error: name of the error, "" for none.
-        delay: s that each of them takes longer.
-        hang: s, counted from the first of them, until which none of them ends.
-    """
-
-    operations: Sequence[str] = CHANGES
-    names: str = "*"
-    after: int = 0
-    times: int = 0
-    error: str = ""
-    delay: float = 0.0
-    hang: float = 0.0
+    operations: Sequence[str] = CHANGES  # on which of `CHANGES`
+    names: str = "*"  # pattern of the names of files it is about
+    after: int = 0  # how many matching operations pass before it begins
+    times: int = 0  # on how many it then acts; 0: on all
+    error: str = ""  # name of the error, "" for none
+    delay: float = 0.0  # s that each of them takes longer
+    hang: float = 0.0  # s, counted from the first of them, until which none of them ends
 
 
 class Faults:

@@ -33,20 +33,15 @@ class Undamaged:
     """A finished campaign as it was before.
 
     Attributes:
-        root: its folder.
-        files: bytes of its archives.
-        archives: what they hold, by path.
-        loose: the estimate from the archives by themselves.
         batch: estimates of the batch by archive, "" for all; values and standard deviations.
-        rows: every sample of all archives, see `_rows`.
     """
 
-    root: Path
-    files: Mapping[Path, bytes]
-    archives: Mapping[Path, Archive]
-    loose: Identification
+    root: Path  # its folder
+    files: Mapping[Path, bytes]  # bytes of its archives
+    archives: Mapping[Path, Archive]  # what they hold, by path
+    loose: Identification  # the estimate from the archives by themselves
     batch: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
-    rows: frozenset[bytes]
+    rows: frozenset[bytes]  # every sample of all archives, see `_rows`
 
     @property
     def paths(self) -> list[Path]:
@@ -190,8 +185,7 @@ def _within(
 
 
 ALONE = "is the only campaign"
-SAME = 1e-9
-"""Relative difference of two sums of the same terms in another order."""
+SAME = 1e-9  # Relative difference of two sums of the same terms in another order
 APART = 5.0
 """Standard deviations of the difference of two estimates that share most of their samples; these
 are correlated, so that 5 is generous, and a wrong sample moves an estimate by far more."""

@@ -31,19 +31,14 @@ from hil.progress import Silent
 from hil.simulation import controller_settings, simulated_controller
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
-SIZE = 64
-"""MiB of the disk."""
+SIZE = 64  # MiB of the disk
 
 
 @dataclass(frozen=True)
 class Disk:
-    """A small disk.
+    """A small disk."""
 
-    Attributes:
-        root: where it is mounted.
-    """
-
-    root: Path
+    root: Path  # where it is mounted
 
     @property
     def ballast(self) -> Path:
@@ -164,8 +159,7 @@ STAGES = {
     "plot": "plot campaign/archives/excitation_000_a1.mcap --output plot.png",
     "repair": "archive repair excitation_000_a1.mcap",
     "new": "new --urdf campaign/robot.urdf --output new.toml --force",
-}
-"""What else leaves something on the disk: command and arguments, paths of which lie there."""
+}  # What else leaves something on the disk: command and arguments, paths of which lie there
 WRITTEN: dict[str, tuple[str, ...]] = {
     "design": ("designed",),
     "compare": ("pages", "campaign", "second"),
@@ -177,8 +171,7 @@ WRITTEN: dict[str, tuple[str, ...]] = {
     "plot": ("plot.png",),
     "repair": ("excitation_000_a1_repaired.mcap",),
     "new": ("new.toml",),
-}
-"""Where each of them writes; sums of archives are kept beside these."""
+}  # Where each of them writes; sums of archives are kept beside these
 
 
 @pytest.fixture(scope="module")

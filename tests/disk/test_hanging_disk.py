@@ -25,8 +25,7 @@ from tests.disk.faults import CREATE, SYNC, WRITE, Rule
 from tests.disk.mounted import Disk, NoFuseError, fuse_disk, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
-PATIENCE = 120.0
-"""s for a process to get on, on a machine that does other things as well."""
+PATIENCE = 120.0  # s for a process to get on, on a machine that does other things as well
 RUN = (sys.executable, "-m", "hil", "run")
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 

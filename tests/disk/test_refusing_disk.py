@@ -31,8 +31,7 @@ DONE = {
     "*": {CREATE: 15, WRITE: 130, SYNC: 130, RENAME: 8},
     "*.mcap": {CREATE: 7, WRITE: 130, SYNC: 130},
     "manifest.json*": {CREATE: 6, WRITE: 6, SYNC: 6, RENAME: 6},
-}
-"""Operations by the names of files, of which a run does at least so many."""
+}  # Operations by the names of files, of which a run does at least so many
 Mount = Callable[[Path], AbstractContextManager[Disk]]
 MOUNTS: dict[str, Mount] = {"planted": planted_disk, "fuse": fuse_disk}
 WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")

@@ -28,8 +28,7 @@ TYPED_ELSEWHERE = {
         ("bring-your-own-robot.md", "first-hour.md", "other-robots.md", "simulators.md"),
         "tests/docs/test_typed_pages.py",
     ),
-}
-"""Pages whose commands another test types, one after the other."""
+}  # Pages whose commands another test types, one after the other
 
 OTHER_PROGRAMS = {
     "sudo": "changes the computer",
@@ -45,8 +44,7 @@ OTHER_PROGRAMS = {
     "cd": "is the shell's own",
     "cp": "is the system's own",
     "python": "stands for programs that are looked up; tests/docs/test_examples.py runs examples",
-}
-"""Programs that are not run, and why."""
+}  # Programs that are not run, and why
 
 NOT_TYPED = {
     "hil demo --effects": "minutes",
@@ -71,15 +69,13 @@ NOT_TYPED = {
     "hil reidentify https:": "network",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
-}
-"""Beginnings of commands that are read and not run, and why."""
+}  # Beginnings of commands that are read and not run, and why
 
 SHORTER = {
     "design": ("--settings", "quick.toml"),
     "doctor": ("--duration", "1"),
     "move": ("--yes",),
-}
-"""What is added so that a command takes seconds, and asks nobody."""
+}  # What is added so that a command takes seconds, and asks nobody
 
 NOT_GOOD_EITHER = ("doctor", "identify", "run")
 """May end with 5: this computer need not be fit, a campaign of seconds no good one."""
@@ -215,8 +211,7 @@ AFTER_TWO = {
     "compare.md": ("march", "june"),
     "design.md": ("demo",),
     "study.md": ("a", "b"),
-}
-"""Pages that name campaigns of one arm, and how."""
+}  # Pages that name campaigns of one arm, and how
 SLOW = ("commands.md", "compare.md", "design.md", "study.md", "tutorial.md")
 
 

@@ -22,8 +22,7 @@ LAST_LINE = {
     "05": "largest distance from the planned path",
     "06": "N·m",
     "07": "packets",
-}
-"""Something that stands in what it prints."""
+}  # Something that stands in what it prints
 
 
 def code_lines(source: str) -> int:

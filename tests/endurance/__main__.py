@@ -40,8 +40,7 @@ from tests.endurance.piece import run_piece
 from tests.endurance.verdict import Piece, Verdict, judge, read_journal
 from tests.journal import COMPRESSED, JournalError
 
-LONGEST = 90.0
-"""min of a piece."""
+LONGEST = 90.0  # min of a piece
 
 
 def main(arguments: list[str] | None = None) -> int:

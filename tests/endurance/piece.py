@@ -33,17 +33,13 @@ from tests.endurance.verdict import SYNC_EVERY, Ran, Use
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 
-REPETITIONS: Final = 20
-"""Of the excitation in a campaign, which so takes about half a minute."""
-MISSED: Final = 3
-"""Answers in a row that the controller misses until it ends open mode."""
+REPETITIONS: Final = 20  # Of the excitation in a campaign, which so takes about half a minute
+MISSED: Final = 3  # Answers in a row that the controller misses until it ends open mode
 TRIES: Final = 5
 """Resumptions of one campaign until it is given up and the next begins: where the machine pauses
 again and again, repetitions differ and are rejected."""
-NEWEST: Final = 3
-"""Campaign folders that stay on the disk."""
-SAMPLED_EVERY: Final = 5.0
-"""s between two looks at everything."""
+NEWEST: Final = 3  # Campaign folders that stay on the disk
+SAMPLED_EVERY: Final = 5.0  # s between two looks at everything
 PRIORITY: Final = 60
 """Real-time priority of the controller: its clock has to be better than what is measured by it."""
 COUNTERS: Final = (

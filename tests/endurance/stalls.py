@@ -17,10 +17,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-PERIOD: Final = 0.001
-"""s between two looks at the clock; what lasts longer than that is a stall."""
-PRIORITY: Final = 90
-"""Real-time priority, above all that is measured."""
+PERIOD: Final = 0.001  # s between two looks at the clock; what lasts longer than that is a stall
+PRIORITY: Final = 90  # Real-time priority, above all that is measured
 _COUNTS: Final = struct.Struct("<qd")  # how many, s in all
 _NAME: Final = "stalls_"  # of a file, and the number of the core
 

@@ -16,8 +16,7 @@ from scipy.stats import mannwhitneyu, theilslopes
 from drivers.exchange.control import quantile
 from tests.journal import entries
 
-SYNC_EVERY: Final = 60.0
-"""s between two waits for the disk."""
+SYNC_EVERY: Final = 60.0  # s between two waits for the disk
 
 
 @dataclass(frozen=True)
@@ -33,24 +32,18 @@ class Sample:
     """One look at everything.
 
     Attributes:
-        t: s since the piece began.
-        load: average of the machine over a minute.
-        processes: by name.
-        shared: files in /dev/shm, of whoever.
-        counters: of the exchange, since it began.
-        stalls, stood: of the machine since the piece began, see `tests.endurance.stalls`, and the
-            s that they lasted; 0 where nobody could look.
-        latencies: answers by duration, in the bins of `drivers.exchange.control`.
+        stalls, stood: of the machine since the piece began, see `tests.endurance.stalls`, and the s
+            that they lasted; 0 where nobody could look.
     """
 
-    t: float
-    load: float
-    processes: Mapping[str, Use]
-    shared: int
-    counters: Mapping[str, float]
+    t: float  # s since the piece began
+    load: float  # average of the machine over a minute
+    processes: Mapping[str, Use]  # by name
+    shared: int  # files in /dev/shm, of whoever
+    counters: Mapping[str, float]  # of the exchange, since it began
     stalls: int = 0
     stood: float = 0.0
-    latencies: Sequence[int] = ()
+    latencies: Sequence[int] = ()  # answers by duration, in the bins of `drivers.exchange.control`
 
 
 @dataclass(frozen=True)
@@ -58,32 +51,23 @@ class Ran:
     """One campaign.
 
     Attributes:
-        number: in its piece, from 0.
-        t: s since the piece began, at its end.
-        complete: whether everything of its plan was done.
         stopped: whether it was stopped because the piece was over; otherwise one that is not
             complete was given up after some restarts.
-        restarts: how often it was resumed, with the errors.
-        motions: that ended on the link meanwhile, as the exchange counted them.
-        archives, records, records_lost: files, what is in them, and what they say is not.
-        faulty: those that do not keep the archive profile, with what is wrong.
-        outcomes: archives by outcome.
-        descriptors: open ones by process, with no archive open.
         held: by the supervisor of its memory: bytes of malloc, blocks of Python's own allocator.
     """
 
-    number: int
-    t: float
-    complete: bool
+    number: int  # in its piece, from 0
+    t: float  # s since the piece began, at its end
+    complete: bool  # whether everything of its plan was done
     stopped: bool
-    restarts: Sequence[str]
-    motions: int
+    restarts: Sequence[str]  # how often it was resumed, with the errors
+    motions: int  # that ended on the link meanwhile, as the exchange counted them
     archives: int
-    faulty: Sequence[str]
-    outcomes: Mapping[str, int]
+    faulty: Sequence[str]  # those that do not keep the archive profile, with what is wrong
+    outcomes: Mapping[str, int]  # archives by outcome
     records: int
-    records_lost: int
-    descriptors: Mapping[str, int]
+    records_lost: int  # files, what is in them, and what they say is not
+    descriptors: Mapping[str, int]  # open ones by process, with no archive open
     held: Mapping[str, int] = field(default_factory=dict)
 
     @property
@@ -143,20 +127,14 @@ PROCESSES: Final = ("exchange", "archive", "supervisor", "controller")
 WARM_UP: Final = 300.0
 """s of a piece after which nothing is to be added to a process any more. The exchange holds 32 MiB
 of heap in reserve from its beginning: a leak shows in its memory only when that is used up."""
-LONG: Final = 4.0
-"""h that a leak is projected to."""
+LONG: Final = 4.0  # h that a leak is projected to
 CONFIDENCE: Final = 0.99
-SHARE: Final = 0.05
-"""Of a process's memory that it may grow by in `LONG`."""
+SHARE: Final = 0.05  # Of a process's memory that it may grow by in `LONG`
 SHARES: Final = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99.9": 0.999}
-BLOCK: Final = 10
-"""Minutes at each end of a piece whose latencies are compared."""
-RARE: Final = 0.01
-"""Chance of one false alarm among all comparisons of blocks."""
-BUSIER: Final = 0.5
-"""By which a load has to be larger to explain that answers are slower."""
-BIN: Final = 2.0**0.25
-"""Ratio of two latencies that the exchange's own histogram just tells apart."""
+BLOCK: Final = 10  # Minutes at each end of a piece whose latencies are compared
+RARE: Final = 0.01  # Chance of one false alarm among all comparisons of blocks
+BUSIER: Final = 0.5  # By which a load has to be larger to explain that answers are slower
+BIN: Final = 2.0**0.25  # Ratio of two latencies that the exchange's own histogram just tells apart
 GIVEN_UP: Final = 0.5
 """Of the campaigns of a piece that may be given up, whatever stood still: with more of them it has
 hardly shown anything."""

@@ -35,8 +35,7 @@ from sim_fixtures.faults import parse_fault, split_faults
 from tests.fault_matrix import small_cell
 
 Array = NDArray[np.float64]
-Exchanged = Sequence[Sequence[Any]]
-"""Packets received, each with its answer or None."""
+Exchanged = Sequence[Sequence[Any]]  # Packets received, each with its answer or None
 
 N: Final = small_cell.N
 PERIOD: Final = 0.001
@@ -49,8 +48,7 @@ LIMITS: Final = JointLimits(
 )
 TOLERATED: Final = 4
 """Answers missing in a row that the controller puts up with; the next one ends open mode."""
-MAX_GAP: Final = 2
-"""Of the session, by default."""
+MAX_GAP: Final = 2  # Of the session, by default
 SESSION_THRESHOLD: Final = 0.6 * small_cell.FOLLOWING_ERROR
 """Narrower than the controller's own, so that the session is the first to notice."""
 _ALLOWANCE: Final = 0.1 * SESSION_THRESHOLD
@@ -193,8 +191,7 @@ FAULTS: Final[Mapping[str, str]] = {
     "current near its limit": "saturate@{c}x100:axis=1",
     "pause 502": "pause@{c}x20:502",
     "pause 500": "pause@{c}x20:500",
-}
-"""Each fault as the command line takes it, {c} for the cycle."""
+}  # Each fault as the command line takes it, {c} for the cycle
 
 SITUATIONS: Final = (
     "sync",
@@ -278,21 +275,17 @@ class Run:
 
     Attributes:
         outcome: what came of the motion requested before the fault, or of open mode without one.
-        recovery: what came of a motion requested after it, once the drive was on again.
-        broken: laws that were broken, in words.
-        cycles: first cycle of each situation.
-        speed: share of full speed that the first motion is planned with.
     """
 
     controller: SimulatedController
     requested_first: bool
     current_share: float = 1.0
-    speed: float = 1.0
+    speed: float = 1.0  # share of full speed that the first motion is planned with
     moving: float = 0.75
     outcome: str = ""
-    recovery: str = ""
-    broken: list[str] = field(default_factory=list)
-    cycles: dict[str, int] = field(default_factory=dict)
+    recovery: str = ""  # what came of a motion requested after it, once the drive was on again
+    broken: list[str] = field(default_factory=list)  # laws that were broken, in words
+    cycles: dict[str, int] = field(default_factory=dict)  # first cycle of each situation
 
     def __post_init__(self) -> None:
         self.session = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
@@ -495,8 +488,7 @@ def cases() -> Iterator[tuple[str, str, str]]:
 SPEEDS: Final = (0.25, 0.5, 0.8, 1.0)
 """Shares of full speed at which packets and answers are lost in a row."""
 FAULTS_AT_SPEED: Final = ("3 packets lost", "5 packets lost", "3 answers lost", "5 answers lost")
-PATIENT: Final = 12
-"""Answers missing in a row that the controller puts up with in these runs."""
+PATIENT: Final = 12  # Answers missing in a row that the controller puts up with in these runs
 
 
 def play_at(fault: str, speed: float, while_silent: str) -> Run:

@@ -10,8 +10,7 @@ from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, Si
 
 N = 2
 HOME = (0.3, -0.4)
-SPEED = (2.0, 2.5)
-"""rad/s, the velocity limits in the URDF."""
+SPEED = (2.0, 2.5)  # rad/s, the velocity limits in the URDF
 
 _LINK = """
   <link name="link_{i}">
@@ -76,9 +75,5 @@ def controller(**changes: Any) -> SimulatedController:
     }
     physical = changes.pop("drive", None) or drive()
     return SimulatedController(
-        URDF,
-        physical,
-        truth(),
-        ControllerSettings(**(QUICK | changes)),
-        **options,
+        URDF, physical, truth(), ControllerSettings(**(QUICK | changes)), **options
     )

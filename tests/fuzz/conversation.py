@@ -13,12 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from drivers import (
-    CycleRing,
-    Guard,
-    RequestError,
-    Session,
-)
+from drivers import CycleRing, Guard, RequestError, Session
 from tests.drivers import oracle
 from tests.drivers.judge import POSITION_MODES, Conduct, Judged
 from tests.drivers.oracle import number_of
@@ -34,14 +29,12 @@ from tests.drivers.sources import (
 from tests.fuzz.draw import Draw
 from tests.fuzz.drawn_arm import arm_of, controller_of
 
-SILENCE = 1.0
-"""s that a session bears while no axis is open."""
+SILENCE = 1.0  # s that a session bears while no axis is open
 STRANGE = (0, 10, 501, 3, 6, 11, 12, 14, 17, 500, 502, 504, 505, 506, 508, -1, 1 << 30, 99)
 FREE = ((16, 228), (388, 548), (708, 1040))
 """Bytes of an init packet that may change without another layout or other limits."""
 STEPS = 60
-CYCLES = 200
-"""Of one conversation at most."""
+CYCLES = 200  # Of one conversation at most
 
 
 class Conversation(Judged):

@@ -17,27 +17,16 @@ CYCLE_MS = 2
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm and where its axes stand in a packet.
+    """An arm and where its axes stand in a packet."""
 
-    Attributes:
-        n: joints.
-        number: of the arm, from 1.
-        axes: (arm from 1, axis from 0) of each slot.
-        period: of the controller [s].
-        train: drive train.
-        limits: of the guard.
-        init: the init packet that fits.
-        other: one whose gear ratios are another arm's.
-    """
-
-    n: int
-    number: int
-    axes: tuple[tuple[int, int], ...]
-    period: float
-    train: DriveTrain
-    limits: GuardLimits
-    init: bytes
-    other: bytes
+    n: int  # joints
+    number: int  # of the arm, from 1
+    axes: tuple[tuple[int, int], ...]  # (arm from 1, axis from 0) of each slot
+    period: float  # of the controller [s]
+    train: DriveTrain  # drive train
+    limits: GuardLimits  # of the guard
+    init: bytes  # the init packet that fits
+    other: bytes  # one whose gear ratios are another arm's
 
     @property
     def middle(self) -> np.ndarray:
@@ -77,11 +66,7 @@ def arm_of(n: int, number: int, order: int, foreign: int) -> Arm:
 
 
 def init_of(
-    axes: tuple[tuple[int, int], ...],
-    number: int,
-    train: DriveTrain,
-    n: int,
-    ratio: float,
+    axes: tuple[tuple[int, int], ...], number: int, train: DriveTrain, n: int, ratio: float
 ) -> bytes:
     """An init packet with these slots; `ratio` is that of its gears to the arm's."""
     table = np.full((4, 10), 0xFF)
@@ -102,10 +87,4 @@ def init_of(
 
 def controller_of(arm: Arm) -> Controller:
     """One that begins with its arm in the middle of its range."""
-    return Controller(
-        arm.train,
-        arm.middle,
-        arm=arm.number,
-        n_axes=len(arm.axes),
-        slots=arm.slots,
-    )
+    return Controller(arm.train, arm.middle, arm=arm.number, n_axes=len(arm.axes), slots=arm.slots)

@@ -15,27 +15,19 @@ class Piece:
     """One life of a fuzzing process.
 
     Attributes:
-        target: what was fuzzed.
-        seconds: it lasted.
-        inputs: executed.
-        edges: covered at its end, as libFuzzer counts them.
-        features: likewise; an edge run through more often is another feature.
-        corpus: inputs kept, at its end.
-        memory: resident at its end [MB].
         ended: "whole", "stopped" where the user ended it, or how it ended early: "crash",
             "timeout", "memory", "killed".
-        reproduced: whether what ended it early ends the target again in a fresh process.
     """
 
-    target: str
-    seconds: float
-    inputs: int
-    edges: int
-    features: int
-    corpus: int
-    memory: int
+    target: str  # what was fuzzed
+    seconds: float  # it lasted
+    inputs: int  # executed
+    edges: int  # covered at its end, as libFuzzer counts them
+    features: int  # likewise; an edge run through more often is another feature
+    corpus: int  # inputs kept, at its end
+    memory: int  # resident at its end [MB]
     ended: str = "whole"
-    reproduced: bool = False
+    reproduced: bool = False  # whether what ended it early ends the target again in a fresh process
 
 
 def append(path: Path, piece: Piece) -> None:

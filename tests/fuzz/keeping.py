@@ -105,10 +105,7 @@ def features_of(control: str) -> dict[Path, frozenset[int]]:
 
 
 def chosen(
-    reached: dict[Path, frozenset[int]],
-    files: int,
-    size: int,
-    known: frozenset[int] = frozenset(),
+    reached: dict[Path, frozenset[int]], files: int, size: int, known: frozenset[int] = frozenset()
 ) -> list[Path]:
     """Inputs that together reach most beyond `known`, greedily, within a number of files, bytes."""
     left = {

@@ -32,17 +32,11 @@ _GRACE = 240.0  # s beyond the time that a process was given, for its start on a
 
 @dataclass(frozen=True)
 class Places:
-    """Where a target's inputs lie.
+    """Where a target's inputs lie."""
 
-    Attributes:
-        corpus: all that was kept so far, outside of the repository.
-        findings: a folder per cause.
-        scratch: for artefacts of libFuzzer and temporary files; lives in memory where it can.
-    """
-
-    corpus: Path
-    findings: Path
-    scratch: Path
+    corpus: Path  # all that was kept so far, outside of the repository
+    findings: Path  # a folder per cause
+    scratch: Path  # for artefacts of libFuzzer and temporary files; lives in memory where it can
 
     @classmethod
     def beside(cls, journal: Path, target: str) -> Places:

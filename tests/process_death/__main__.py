@@ -42,8 +42,7 @@ from tests.process_death.laws import PROMISED  # noqa: E402
 from tests.process_death.play import Stage, play  # noqa: E402
 from tests.process_death.rounds import VICTIMS, drawn  # noqa: E402
 
-_stage: Stage | None = None
-"""What rounds share; their processes are forked from one that has it."""
+_stage: Stage | None = None  # What rounds share; their processes are forked from one that has it
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

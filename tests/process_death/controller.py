@@ -47,10 +47,8 @@ rad/s]."""
 CAPACITY: Final = 40_000
 _HEADER: Final = 128
 _ROWS, _FINISH, _GIVE_UP, _EXCHANGE = range(4)
-WAIT: Final = 60.0
-"""s that a living PC is waited for."""
-REST: Final = 10
-"""Cycles of standing after which an arm is at rest."""
+WAIT: Final = 60.0  # s that a living PC is waited for
+REST: Final = 10  # Cycles of standing after which an arm is at rest
 _PDEATHSIG: Final = 1
 
 

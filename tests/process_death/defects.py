@@ -15,17 +15,11 @@ from tests.process_death import product
 
 @dataclass(frozen=True)
 class Defect:
-    """What is broken.
+    """What is broken."""
 
-    Attributes:
-        module: that the broken process runs.
-        code: what breaks it.
-        found: words of the law that finds it.
-    """
-
-    module: str
-    code: str
-    found: str
+    module: str  # that the broken process runs
+    code: str  # what breaks it
+    found: str  # words of the law that finds it
 
 
 DEFECTS: Final = {

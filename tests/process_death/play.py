@@ -37,15 +37,12 @@ SHORT: Final = {
     "standstill_s": 0.1,
     "settle_s": 0.15,
     "candidates": 6,
-}
-"""Of the cell's `[campaign]`: a campaign of four seconds."""
+}  # Of the cell's `[campaign]`: a campaign of four seconds
 NOISE: Final = 0.004
 """A, of the simulated currents. With the cell's own the arm trembles at rest about as fast as what
 still counts as standstill, and some runs are refused for it without anybody having died."""
-ESTIMATED: Final = 3
-"""In every so many rounds the campaign is estimated from when it is complete."""
-UNLIKELY: Final = 1e-9
-"""Chance that two estimates of one arm differ by more than is let pass."""
+ESTIMATED: Final = 3  # In every so many rounds the campaign is estimated from when it is complete
+UNLIKELY: Final = 1e-9  # Chance that two estimates of one arm differ by more than is let pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +66,13 @@ class Estimated:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What all rounds share.
+    """What all rounds share."""
 
-    Attributes:
-        folder: of the rounds.
-        cell: of the small arm.
-        plan: of its campaign.
-        undisturbed: what is found where nobody dies.
-        planted: folder of a planted defect, None for none.
-    """
-
-    folder: Path
-    cell: Cell
-    plan: CampaignPlan
-    undisturbed: Estimated
-    planted: Path | None = None
+    folder: Path  # of the rounds
+    cell: Cell  # of the small arm
+    plan: CampaignPlan  # of its campaign
+    undisturbed: Estimated  # what is found where nobody dies
+    planted: Path | None = None  # folder of a planted defect, None for none
 
     @classmethod
     def set_up(cls, folder: Path, planted: Path | None = None) -> Stage:

@@ -44,10 +44,8 @@ MARK: Final = "HIL_PROCESS_DEATH"
 
 PATIENCE: Final = 90.0
 """s for anything that has to happen, on a machine that does other things as well."""
-LOOK: Final = 0.001
-"""s between two looks."""
-NOTICED: Final = 100
-"""Cycles within which an exchange has noticed the death of its supervisor."""
+LOOK: Final = 0.001  # s between two looks
+NOTICED: Final = 100  # Cycles within which an exchange has noticed the death of its supervisor
 MAY_MOVE: Final = (State.OPENING, State.OPEN, State.EXITING)
 
 
@@ -63,14 +61,12 @@ class Death:
     """One kill.
 
     Attributes:
-        victim: who died.
-        written: records that the exchange had written just before.
         behind: of them, how many the archive process had not taken at some moment of the last
             second.
     """
 
-    victim: Victim
-    written: int
+    victim: Victim  # who died
+    written: int  # records that the exchange had written just before
     behind: int = 0
 
 
@@ -189,24 +185,17 @@ class Seen:
     """What was seen of one run of a campaign.
 
     Attributes:
-        deaths: in order.
-        status: exit status of the supervisor, None if it was killed.
-        said: what it said, see `supervise`.
-        rows: the controller's account up to when everything else had ended.
-        records: the exchange's, from its memory.
-        entered: manifest as it was before the first kill.
         left: process ids that were still there when all should have ended.
-        port_taken: whether nobody else could have had the port afterwards.
     """
 
-    deaths: list[Death]
-    status: int | None
-    said: dict[str, Any]
-    rows: Rows
-    records: NDArray[np.void]
-    entered: list[Entry]
+    deaths: list[Death]  # in order
+    status: int | None  # exit status of the supervisor, None if it was killed
+    said: dict[str, Any]  # what it said, see `supervise`
+    rows: Rows  # the controller's account up to when everything else had ended
+    records: NDArray[np.void]  # the exchange's, from its memory
+    entered: list[Entry]  # manifest as it was before the first kill
     left: list[int] = field(default_factory=list)
-    port_taken: bool = False
+    port_taken: bool = False  # whether nobody else could have had the port afterwards
 
     @property
     def killed(self) -> tuple[Victim, ...]:

@@ -21,12 +21,9 @@ EARLY: Final = ("start", "cycle")
 MINUTES: Final = 0.1
 """Share of the early deaths of a controller that are played: a supervisor waits a minute for a
 drive to be switched on."""
-CYCLES: Final = 150
-"""Cycles within which the controller has begun, and switched its drive on."""
-LONGEST: Final = 0.8
-"""s that the longest motion of the small cell takes."""
-REPORTED: Final = 0.07
-"""s between two moments at which the exchange says how far a motion has come."""
+CYCLES: Final = 150  # Cycles within which the controller has begun, and switched its drive on
+LONGEST: Final = 0.8  # s that the longest motion of the small cell takes
+REPORTED: Final = 0.07  # s between two moments at which the exchange says how far a motion has come
 ARCHIVES: Final = 6
 """Archives of a whole campaign of it: two ways, standstill, two repetitions, validation."""
 STATES: Final = (State.CLOSED, State.OPENING, State.OPEN, State.EXITING)
@@ -40,17 +37,13 @@ class Trigger:
         moment: what is waited for: the `start` of the supervisor, a `cycle` of the controller, a
             `motion` that has come some way, an `archive` that is created, one that is `entered` in
             the manifest, a `state` of the exchange.
-        count: which cycle, or which motion, archive, entry or time that the state was entered.
-        delay: s from then to the kill.
-        way: s of its own time that a motion has come, where one is waited for.
-        state: of the session, where one is waited for.
     """
 
     moment: Moment
-    count: int
-    delay: float
-    way: float = 0.0
-    state: State = State.CLOSED
+    count: int  # which cycle, or which motion, archive, entry or time that the state was entered
+    delay: float  # s from then to the kill
+    way: float = 0.0  # s of its own time that a motion has come, where one is waited for
+    state: State = State.CLOSED  # of the session, where one is waited for
 
     def __str__(self) -> str:
         what = {
@@ -66,28 +59,17 @@ class Trigger:
 
 @dataclass(frozen=True)
 class Round:
-    """What happens in one round.
+    """What happens in one round."""
 
-    Attributes:
-        number: of the round, and its seed.
-        victims: who is killed, in this order.
-        apart: s between two kills.
-        trigger: when the first of them comes.
-        over_sockets: whether the campaign is finished over sockets, with a new controller.
-        loops: whether the controller's program goes on opening the axes when nobody wants it to.
-        while_silent, missed_replies, stagger: how the controller behaves; see
-            `sim_fixtures.ControllerSettings`.
-    """
-
-    number: int
-    victims: tuple[Victim, ...]
-    apart: float
-    trigger: Trigger
-    over_sockets: bool
-    loops: bool
+    number: int  # of the round, and its seed
+    victims: tuple[Victim, ...]  # who is killed, in this order
+    apart: float  # s between two kills
+    trigger: Trigger  # when the first of them comes
+    over_sockets: bool  # whether the campaign is finished over sockets, with a new controller
+    loops: bool  # whether the controller's program goes on opening the axes when nobody wants it to
     while_silent: WhileSilent
     missed_replies: int
-    stagger: int
+    stagger: int  # how the controller behaves; see `sim_fixtures.ControllerSettings`
 
     @property
     def seed(self) -> int:

@@ -14,28 +14,19 @@ _AXES: Final = {
     "serial": ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0"),
     "planar": ("0 1 0",) * 7,
 }
-_REACH: Final = (0.25, 0.4, 0.36, 0.14, 0.12, 0.1, 0.08)
-"""m from each joint to the next."""
-_MASS: Final = (14.0, 11.0, 6.0, 2.5, 2.0, 1.2, 0.8)
-"""kg."""
+_REACH: Final = (0.25, 0.4, 0.36, 0.14, 0.12, 0.1, 0.08)  # m from each joint to the next
+_MASS: Final = (14.0, 11.0, 6.0, 2.5, 2.0, 1.2, 0.8)  # kg
 
 
 @dataclass(frozen=True)
 class Arm:
-    """The texts that a cell is loaded from.
-
-    Attributes:
-        urdf, cell: texts; the cell names the URDF `arm.urdf`.
-        n_joints: 1 to 7.
-        foreign_axes: axes of another arm that its controller moves as well.
-        words: what was drawn, for a person.
-    """
+    """The texts that a cell is loaded from."""
 
     urdf: str
-    cell: str
-    n_joints: int
-    foreign_axes: int
-    words: str
+    cell: str  # texts; the cell names the URDF `arm.urdf`
+    n_joints: int  # 1 to 7
+    foreign_axes: int  # axes of another arm that its controller moves as well
+    words: str  # what was drawn, for a person
 
 
 def draw_arm(chance: random.Random) -> Arm:

@@ -8,23 +8,15 @@ from typing import Final, NamedTuple
 
 
 class Story(NamedTuple):
-    """What a line may refer to.
+    """What a line may refer to."""
 
-    Attributes:
-        cycles: that the run without faults takes.
-        moving: cycles of it in which set-points move.
-        n_joints: axes are drawn from these.
-        bytes: length of a cyclic packet.
-        writes, saves, creates: that the run without faults makes.
-    """
-
-    cycles: int
-    moving: tuple[int, ...]
-    n_joints: int
-    bytes: int
+    cycles: int  # that the run without faults takes
+    moving: tuple[int, ...]  # cycles of it in which set-points move
+    n_joints: int  # axes are drawn from these
+    bytes: int  # length of a cyclic packet
     writes: int
     saves: int
-    creates: int
+    creates: int  # that the run without faults makes
 
 
 Draw = Callable[[random.Random, Story], str]
@@ -172,8 +164,7 @@ DRAWS: Final[Mapping[str, tuple[float, Draw]]] = {
     "override": (1.0, _override),
     "hold": (1.0, lambda chance, story: f"hold@{_cycle(chance, story)}x{chance.randint(1, 5)}"),
     "hurry": (0.8, lambda chance, story: "hurry@0"),
-}
-"""How often each kind is drawn, against the others, and how."""  # fmt: skip
+}  # How often each kind is drawn, against the others, and how
 WITH_DRY_RUN: Final = 0.02
 
 

@@ -11,10 +11,8 @@ import numpy as np
 from drivers.events import MotionEnded
 from tests.simulate.observed import Broken, Exchanged, Life, Observed
 
-_NUMBERS: Final = 0x7FFF
-"""Packet numbers are 1 to this."""
-_HEADER, _AXIS, _INIT = 12, 36, 1200
-"""bytes"""
+_NUMBERS: Final = 0x7FFF  # Packet numbers are 1 to this
+_HEADER, _AXIS, _INIT = 12, 36, 1200  # bytes
 _DRIVE_ON: Final = 5
 
 

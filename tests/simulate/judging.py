@@ -29,12 +29,7 @@ def completion(seen: Observed) -> Iterator[Broken]:
         yield Broken("completion", f"after {len(seen.runs)} runs it ended {seen.ended}")
 
 
-LAWS: Final[dict[str, Law]] = {
-    "completion": completion,
-    "gaps": gaps,
-    "piles": piles,
-    **OTHERS,
-}
+LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": piles, **OTHERS}
 
 
 def judged(seen: Observed) -> list[Broken]:

@@ -21,10 +21,8 @@ from tests.journal import Journal, entries
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, Verdict
 
-SEEDS_PER_CHILD: Final = 400
-"""After which it gives its memory back."""
-LONGEST: Final = 1200.0
-"""s that a seed may take, made small included, on a busy machine."""
+SEEDS_PER_CHILD: Final = 400  # After which it gives its memory back
+LONGEST: Final = 1200.0  # s that a seed may take, made small included, on a busy machine
 DIED: Final = "the process lives"
 """Name of the law that a seed breaks which takes its process with it, or never ends."""
 SYNC_EVERY: Final = 60.0

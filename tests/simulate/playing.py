@@ -27,30 +27,20 @@ from tests.simulate.scenes import NEIGHBOURS, Scene, scene_of
 from tests.simulate.script import Script, parse_script
 from tests.simulate.world import World, unrest
 
-_MOVING: Final = 0.05
-"""rad/s."""
+_MOVING: Final = 0.05  # rad/s
 _EMPTY: Final = parse_script(())
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """The run without faults of a group of seeds.
+    """The run without faults of a group of seeds."""
 
-    Attributes:
-        scene: cell, plan and controller.
-        folder: of its campaign.
-        found: its estimate.
-        story: what a script may refer to.
-        seen: all that was seen of it.
-        redrawn: scenes before this one that were of no use.
-    """
-
-    scene: Scene
-    folder: Path
-    found: Estimated
-    story: Story
-    seen: Observed
-    redrawn: int = 0
+    scene: Scene  # cell, plan and controller
+    folder: Path  # of its campaign
+    found: Estimated  # its estimate
+    story: Story  # what a script may refer to
+    seen: Observed  # all that was seen of it
+    redrawn: int = 0  # scenes before this one that were of no use
 
 
 class SceneError(Exception):

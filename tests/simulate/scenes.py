@@ -24,34 +24,25 @@ from tests.simulate.arms import Arm, draw_arm
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS: Final = 8
-"""Seeds in a row that share arm, plan and the run without faults."""
+NEIGHBOURS: Final = 8  # Seeds in a row that share arm, plan and the run without faults
 _ARMS: Final = 20
 _MOTIONS: Final = 12
 _QUICK_SERVO: Final = ServoSettings(position_gain=30.0, model_error=(0.01, 0.03))
 """Comes to rest within the short time that a motion's end is held here."""
 _SHORTEST: Final = 0.35
-_LONGEST: Final = 0.55
-"""s of one motion."""
+_LONGEST: Final = 0.55  # s of one motion
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What neighbouring seeds share.
+    """What neighbouring seeds share."""
 
-    Attributes:
-        group: seed // NEIGHBOURS.
-        cell, plan: drawn, and sound together.
-        controller: how the controller behaves where nothing goes wrong.
-        words: what was drawn.
-    """
-
-    group: int
+    group: int  # seed // NEIGHBOURS
     arm: Arm
     cell: Cell
-    plan: CampaignPlan
-    controller: ControllerSettings
-    words: str
+    plan: CampaignPlan  # drawn, and sound together
+    controller: ControllerSettings  # how the controller behaves where nothing goes wrong
+    words: str  # what was drawn
 
 
 def scene_of(group: int, variant: int = 0) -> Scene:

@@ -58,8 +58,7 @@ KINDS: Final[dict[str, str]] = {
     "with-dry-run": "always",
     "declines": "always",
     "hurry": "always",
-}
-"""What `AT` of each kind counts."""
+}  # What `AT` of each kind counts
 _LINE: Final = re.compile(
     r"(?P<kind>[a-z-]+)@(?P<at>\d{1,9})(?:x(?P<count>\d{1,6}))?(?P<options>(?::[^:\s]+)*)"
 )
@@ -69,38 +68,23 @@ _WORDS: Final = frozenset({"answering", "left", "before", "after", "nan"})
 
 @dataclass(frozen=True)
 class Mishap:
-    """What happens to the PC, its disk, or by the person before it.
+    """What happens to the PC, its disk, or by the person before it."""
 
-    Attributes:
-        line: as it was written.
-        kind: one of `KINDS`.
-        at: when; what it counts is in `KINDS`.
-        count: how often, or how many.
-        value: the number among the options: seconds, a share, percent; 0 for none.
-        word: the word among the options, "" for none.
-    """
-
-    line: str
-    kind: str
-    at: int
-    count: int = 1
-    value: float = 0.0
-    word: str = ""
+    line: str  # as it was written
+    kind: str  # one of `KINDS`
+    at: int  # when; what it counts is in `KINDS`
+    count: int = 1  # how often, or how many
+    value: float = 0.0  # the number among the options: seconds, a share, percent; 0 for none
+    word: str = ""  # the word among the options, "" for none
 
 
 @dataclass(frozen=True)
 class Script:
-    """All that happens.
+    """All that happens."""
 
-    Attributes:
-        lines: as written, in order.
-        faults: of link, controller and arm, each with its line.
-        mishaps: of the PC, its disk and the person.
-    """
-
-    lines: tuple[str, ...]
-    faults: tuple[tuple[str, Fault], ...]
-    mishaps: tuple[Mishap, ...]
+    lines: tuple[str, ...]  # as written, in order
+    faults: tuple[tuple[str, Fault], ...]  # of link, controller and arm, each with its line
+    mishaps: tuple[Mishap, ...]  # of the PC, its disk and the person
 
     def of(self, counts: str) -> tuple[Mishap, ...]:
         """The mishaps whose `AT` counts that, in order."""

@@ -11,8 +11,7 @@ from tests.simulate.verdicts import Stage
 GROUPS: Final = (
     *(0, 1, 2, 3, 4, 6, 8, 11, 13, 14, 15, 16, 18),
     *(19, 20, 22, 23, 28, 29, 30, 32, 33, 37, 83, 85, 148, 200),
-)
-"""Of eight seeds each: arms of one to seven joints, mostly in the longer cycle: it costs less."""
+)  # Of eight seeds each: arms of one to seven joints, mostly in the longer cycle: it costs less
 PIECES: Final = 4
 
 

@@ -7,8 +7,7 @@ from typing import Final
 
 from tests.simulate.script import simpler
 
-MOST_TRIES: Final = 40
-"""Campaigns that are played for it, at most."""
+MOST_TRIES: Final = 40  # Campaigns that are played for it, at most
 
 Fails = Callable[[tuple[str, ...]], bool]
 

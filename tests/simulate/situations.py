@@ -31,8 +31,7 @@ EXPECTED: Final = (
     "a dry run was accepted",
     "several runs completed it",
     "no run completed it",
-)
-"""Each is the ground of a law, or of a part of one."""
+)  # Each is the ground of a law, or of a part of one
 
 
 def situations(seen: Observed) -> tuple[str, ...]:

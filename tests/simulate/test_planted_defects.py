@@ -166,11 +166,7 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
         ("lose@{moving}x2", "kill@9999"),
         "guard",
     ),
-    "the guard lets set-points pass": (
-        lets_everything_pass,
-        ("lurch@{moving}x3:0.0001",),
-        "guard",
-    ),
+    "the guard lets set-points pass": (lets_everything_pass, ("lurch@{moving}x3:0.0001",), "guard"),
     "an arm that does not follow is moved": (
         moves_an_arm_that_does_not_follow,
         ("following-error@{moving}x60:axis=1:slip",),
@@ -183,8 +179,7 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "whole motions are done again": (does_whole_motions_again, ("stop@{late}",), "folder"),
     "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",), "folder"),
     "archives are smoothed": (smooths_what_it_archives, (), "archives"),
-}
-"""What is planted, the script that brings it out, and the law that finds it."""
+}  # What is planted, the script that brings it out, and the law that finds it
 
 
 def script(stage: Stage, lines: tuple[str, ...]) -> list[str]:

@@ -26,30 +26,20 @@ class Verdict:
     """One seed.
 
     Attributes:
-        seed: its number.
-        scene: arm and plan, in words.
-        script: what was drawn.
-        struck: kinds of the lines that came to pass, each as often as it did.
-        met: situations that came about, see `situations`.
-        runs: how each run ended: "complete", "incomplete" or the name of an error.
-        cycles: that the controller took, in all.
-        broken: laws and what is wrong, as (law, text).
         shrunk: the smallest script that breaks the first of these laws; () if none was broken.
-        redrawn: scenes that were of no use before that of this seed's group.
-        seconds: processor time.
     """
 
-    seed: int
-    scene: str
-    script: tuple[str, ...]
-    struck: tuple[str, ...]
-    met: tuple[str, ...]
-    runs: tuple[str, ...]
-    cycles: int
-    broken: tuple[tuple[str, str], ...] = ()
+    seed: int  # its number
+    scene: str  # arm and plan, in words
+    script: tuple[str, ...]  # what was drawn
+    struck: tuple[str, ...]  # kinds of the lines that came to pass, each as often as it did
+    met: tuple[str, ...]  # situations that came about, see `situations`
+    runs: tuple[str, ...]  # how each run ended: "complete", "incomplete" or the name of an error
+    cycles: int  # that the controller took, in all
+    broken: tuple[tuple[str, str], ...] = ()  # laws and what is wrong, as (law, text)
     shrunk: tuple[str, ...] = ()
-    redrawn: int = 0
-    seconds: float = 0.0
+    redrawn: int = 0  # scenes that were of no use before that of this seed's group
+    seconds: float = 0.0  # processor time
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it."""
@@ -154,28 +144,20 @@ class Tally:
     """Verdicts, summed up.
 
     Attributes:
-        ran: seeds.
-        failed: the numbers of those that broke a law.
         struck: how often each kind of line came to pass.
         met: in how many seeds each situation came about.
-        ends: how often a run ended in each way.
-        campaigns: how often the last one did.
-        broken: how often each law was broken.
-        redrawn: scenes of no use, by group of seeds.
-        cycles: of all controllers.
-        seconds: of processor time.
     """
 
-    ran: int = 0
-    failed: list[int] = field(default_factory=list)
+    ran: int = 0  # seeds
+    failed: list[int] = field(default_factory=list)  # the numbers of those that broke a law
     struck: Counter[str] = field(default_factory=Counter)
     met: Counter[str] = field(default_factory=Counter)
-    ends: Counter[str] = field(default_factory=Counter)
-    campaigns: Counter[str] = field(default_factory=Counter)
-    broken: Counter[str] = field(default_factory=Counter)
-    redrawn: dict[int, int] = field(default_factory=dict)
-    cycles: int = 0
-    seconds: float = 0.0
+    ends: Counter[str] = field(default_factory=Counter)  # how often a run ended in each way
+    campaigns: Counter[str] = field(default_factory=Counter)  # how often the last one did
+    broken: Counter[str] = field(default_factory=Counter)  # how often each law was broken
+    redrawn: dict[int, int] = field(default_factory=dict)  # scenes of no use, by group of seeds
+    cycles: int = 0  # of all controllers
+    seconds: float = 0.0  # of processor time
 
     def add(self, verdict: Verdict) -> None:
         """Count one more."""

@@ -21,8 +21,7 @@ from tests.simulate.observed import Act, ArmHistory, Exchanged
 from tests.simulate.script import Mishap, Script
 
 Array = NDArray[np.float64]
-LONGEST_STALL = 1.0
-"""s; a longer one is a loss."""
+LONGEST_STALL = 1.0  # s; a longer one is a loss
 
 
 class WatchedController:
@@ -140,11 +139,7 @@ class WatchedTransport(SimulatedTransport):
     """
 
     def __init__(
-        self,
-        peer: WatchedController,
-        script: Script,
-        clock: Clock,
-        look: Callable[[int], None],
+        self, peer: WatchedController, script: Script, clock: Clock, look: Callable[[int], None]
     ) -> None:
         faults = [fault for _, fault in script.faults if isinstance(fault, LinkFault)]
         self._inner = SimulatedTransport(peer, faults)

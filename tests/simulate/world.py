@@ -43,16 +43,12 @@ MOST_CYCLES: Final = 500_000
 """Of one life; all lives together take 66 415 in the longest of some 7000 seeds."""
 _SECOND_CHANCES: Final = 5
 """Runs that may still fail once the script speaks of no later cycle, beside the disk's failures."""
-_JUST_BEFORE: Final = 10
-"""Cycles before a motion was refused in which the arm is looked at."""
-_AFTERWARDS: Final = 400
-"""Cycles that the controller goes on alone after a run, at most."""
+_JUST_BEFORE: Final = 10  # Cycles before a motion was refused in which the arm is looked at
+_AFTERWARDS: Final = 400  # Cycles that the controller goes on alone after a run, at most
 _HURRIES: Final = 500
 """Cycles after the last one of the script in which runs are still begun again at once."""
-_GIVES_UP: Final = 3000
-"""Cycles without an init packet after which the person ends a run."""
-_JOG: Final = "jog the arm"
-"""What a run says that cannot find a free way from where the arm stands."""
+_GIVES_UP: Final = 3000  # Cycles without an init packet after which the person ends a run
+_JOG: Final = "jog the arm"  # What a run says that cannot find a free way from where the arm stands
 
 
 class EndlessError(Exception):

@@ -21,12 +21,10 @@ from sim_fixtures import Phase
 from sim_fixtures.can_end import CanFarEnd
 from tests.drivers.can_bench import HOME, MOVE, PERIOD, PROFILES, Cycles, Run, UnstampedBus
 
-ANSWERS = {0x100, 0x120, 0x121, 0x122, 0x180}
-"""Identifiers of what the PC says (`docs/can.md`)."""
+ANSWERS = {0x100, 0x120, 0x121, 0x122, 0x180}  # Identifiers of what the PC says (`docs/can.md`)
 _channels = count()
 
-LAST_CYCLE = 600
-"""A session takes 484."""
+LAST_CYCLE = 600  # A session takes 484
 
 Frames = list[can.Message]
 Meddle = Callable[["Overheard", int], None]

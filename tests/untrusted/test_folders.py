@@ -284,8 +284,7 @@ NO_TIME = {
     "numbers that no axis shows": member([0.0, 1e308, -1e308]),
     "a shape too large for any number": claiming((10**30,)),
     "a head without end": b"\x93NUMPY\x01\x00\x04\x00((((",
-}
-"""What is no time of an example."""
+}  # What is no time of an example
 
 
 def test_the_series_of_a_report_are_read_as_they_were_written(folder: Path) -> None:

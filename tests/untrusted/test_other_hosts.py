@@ -34,8 +34,7 @@ PERIOD = 0.002
 CONTROLLER = HOSTS["controller"]
 WHERE = f"{HOSTS['pc']}:{PORT}"
 Process: TypeAlias = "subprocess.Popen[bytes]"
-PATIENCE = 240.0
-"""s for commands to end, on a machine that does other things as well."""
+PATIENCE = 240.0  # s for commands to end, on a machine that does other things as well
 
 
 @pytest.fixture(scope="module")

@@ -30,16 +30,13 @@ class Target:
         run: raises where a law is broken; else whether the input is taken, False where it is
             refused as documented.
         seeds: inputs to begin with, made by the product's own writers; all of them are taken.
-        mutate: changes that get past checksums and grammars.
-        most: bytes of the longest input.
-        replayed: changed inputs that the test of the corpora tries.
     """
 
     run: Callable[[bytes], bool]
     seeds: Callable[[], list[bytes]]
-    mutate: Mutation
-    most: int = 1 << 14
-    replayed: int = 200
+    mutate: Mutation  # changes that get past checksums and grammars
+    most: int = 1 << 14  # bytes of the longest input
+    replayed: int = 200  # changed inputs that the test of the corpora tries
 
 
 def place_of(name: str) -> Path:
