@@ -18,10 +18,10 @@ Four hours in three pieces:
 Merged are as many journals as are named, those compressed by `xz` (`long.jsonl.xz`) among them.
 
 The exit code is 1 if anything is wrong, 0 if not, and 2 if the journal is none. What a run is too
-short for is said as a doubt, and so is what the machine explains: slower answers while more was to
-do, campaigns given up and answers missed while its cores stood still, which a process on each of
-them tells that does nothing else. More than one answer in 10 000 beyond that is wrong. Two bounds
-hold whatever stood still: half of a piece's campaigns, and 1 % of its answers.
+short for is said as a doubt, and so is what the machine explains: slower replies while more was to
+do, campaigns given up and replies missed while its cores stood still, which a process on each of
+them tells that does nothing else. More than one reply in 10 000 beyond that is wrong. Two bounds
+hold whatever stood still: half of a piece's campaigns, and 1 % of its replies.
 """
 
 from __future__ import annotations
@@ -45,12 +45,24 @@ LONGEST = 90.0  # min of a piece
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a piece, or only merge; print the verdict over all pieces."""
-    given = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.endurance",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    option = parser.add_argument
+    option("--journal", type=Path, required=True, nargs="+", help="JSON lines; appended to")
+    option("--minutes", type=time_above_0, help="how long this piece takes, 90 at most")
+    option("--folder", type=Path, help="where campaigns are made")
+    option("--rate", type=int, choices=(500, 1000), default=1000, help="packets per second")
+    option("--merge", action="store_true", help="run nothing, print the verdict")
+    option("--json", action="store_true", help="print one line of JSON")
+    given = parser.parse_args(arguments)
     try:
-        _read(given.journal)  # before anything is appended to what is none
+        pieces = _read(given.journal)  # before anything is appended to what is none
         if not given.merge:
-            _run(given)
-        pieces = _read(given.journal)
+            _run(given, parser)
+            pieces = _read(given.journal)
     except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
@@ -60,10 +72,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     verdict = judge(pieces)
     if given.json:
-        facts = {"good": not verdict.faults, **asdict(verdict)}
-        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.write(json.dumps({"good": not verdict.faults, **asdict(verdict)}) + "\n")
     else:
-        sys.stdout.write("\n".join(_lines(verdict)) + "\n")
+        sys.stdout.writelines(f"{line}\n" for line in _lines(verdict))
     return 1 if verdict.faults else 0
 
 
@@ -71,39 +82,17 @@ def _read(journals: Sequence[Path]) -> list[Piece]:
     return [piece for path in journals for piece in read_journal(path)]
 
 
-def _run(given: argparse.Namespace) -> None:
+def _run(given: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Run a piece, and append to the journal."""
     if given.folder is None or given.minutes is None:
-        _parser().error("--minutes and --folder are needed to run a piece")
+        parser.error("--minutes and --folder are needed to run a piece")
     if given.minutes > LONGEST:
-        _parser().error(f"--minutes must be at most {LONGEST:g}")
+        parser.error(f"--minutes must be at most {LONGEST:g}")
     if len(given.journal) > 1 or given.journal[0].suffix == COMPRESSED:
-        _parser().error("a piece is appended to one --journal, and not to a compressed one")
-    seconds = 60.0 * given.minutes
+        parser.error("a piece is appended to one --journal, and not to a compressed one")
     with stop_on_interrupt() as stop:
-        told = reporter(quiet=given.json)
-        run_piece(given.folder, given.journal[0], seconds, given.rate, stop, told)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.endurance",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--journal", type=Path, required=True, nargs="+", help="JSON lines; appended to"
-    )
-    parser.add_argument(
-        "--minutes", type=time_above_0, help="how long this piece takes, 90 at most"
-    )
-    parser.add_argument("--folder", type=Path, help="where campaigns are made")
-    parser.add_argument(
-        "--rate", type=int, choices=(500, 1000), default=1000, help="packets per second"
-    )
-    parser.add_argument("--merge", action="store_true", help="run nothing, print the verdict")
-    parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    return parser
+        tell = reporter(quiet=given.json)
+        run_piece(given.folder, given.journal[0], 60.0 * given.minutes, given.rate, stop, tell)
 
 
 def _lines(verdict: Verdict) -> Iterator[str]:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -29,7 +29,6 @@ from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.errors import HilError
 from hil.progress import Reporter, Silent, Task
 from tests.endurance.stalls import so_far, watched
-from tests.endurance.verdict import SYNC_EVERY, Ran, Use
 from tests.hil.fast_cell import fast_cell
 from tests.journal import Journal
 
@@ -51,16 +50,7 @@ COUNTERS: Final = (
 def run_piece(
     folder: Path, journal_path: Path, seconds: float, rate: int, stop: Stop, reporter: Reporter
 ) -> None:
-    """Run for that long, and append to the journal.
-
-    Args:
-        folder: where campaigns are made; the newest stay there.
-        journal_path: a file of JSON lines.
-        seconds: of the piece.
-        rate: of the exchange, Hz: 500 or 1000.
-        stop: ends the piece before its time.
-        reporter: told of the progress.
-    """
+    """Run for that long at a rate [Hz], and append to the journal; `folder` has the campaigns."""
     work = folder / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{os.getpid()}"
     work.mkdir(parents=True)
     cell = fast_cell(work, repetitions=REPETITIONS).with_values(
@@ -72,7 +62,7 @@ def run_piece(
     if os.geteuid() == 0:
         options += ["--priority", str(PRIORITY)]
     with (
-        Journal(journal_path, SYNC_EVERY) as journal,
+        Journal(journal_path, sync_every=60.0) as journal,
         reporter.task("enduring (s)", seconds) as task,
     ):
         machine = f"{os.cpu_count()} cores, {platform.system()} {platform.release()}"
@@ -112,7 +102,7 @@ class _Piece:
     link: LiveLink
     simulator: SimulatorProcess
     began: float = field(default_factory=time.monotonic)
-    _kept: list[Path] = field(default_factory=list)
+    _newest: list[Path] = field(default_factory=list)
 
     @property
     def at(self) -> float:
@@ -153,14 +143,14 @@ class _Piece:
         used = {}
         for name, pid in self.pids.items():
             with suppress(OSError):
-                threads = sum(1 for _ in Path(f"/proc/{pid}/task").iterdir())
-                used[name] = asdict(Use(own_memory(pid), threads))
+                threads = count(f"/proc/{pid}/task")
+                used[name] = {"own": own_memory(pid), "threads": threads}
         self.journal.add(
             kind="sample",
             t=self.at,
             load=os.getloadavg()[0],
             processes=used,
-            shared=sum(1 for _ in Path("/dev/shm").iterdir()),
+            shared=count("/dev/shm"),
             counters={name: getattr(status, name) for name in COUNTERS},
             latencies=list(status.latencies),
             stalls=stalls,
@@ -176,26 +166,23 @@ class _Piece:
             campaign = Campaign.create(self.folder / f"campaign_{number:05d}", cell, plan)
             errors: list[str] = []
             complete = self._completed(campaign, errors)
-            descriptors = {
-                name: sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
-                for name, pid in self.pids.items()
-            }
-            ran = Ran(
+            whole = checked(campaign.folder.archives)
+            self.journal.add(
+                kind="campaign",
                 number=number,
                 t=self.at,
                 complete=complete,
                 stopped=not complete and self.stop.requested,
                 restarts=errors,
                 motions=self.link.exchange.status().ended_count - before,
-                descriptors=descriptors,
+                descriptors={name: count(f"/proc/{pid}/fd") for name, pid in self.pids.items()},
                 held=held(),
-                **checked(campaign.folder.archives),
+                **whole,
             )
-            self.journal.add(kind="campaign", **asdict(ran))
-            if not ran.faulty:  # what is faulty is to be looked at
-                self._kept.append(campaign.folder.root)
-            while len(self._kept) > NEWEST:
-                shutil.rmtree(self._kept.pop(0))
+            if not whole["faulty"]:  # what is faulty is to be looked at
+                self._newest.append(campaign.folder.root)
+            while len(self._newest) > NEWEST:
+                shutil.rmtree(self._newest.pop(0))
             number += 1
 
     def _completed(self, campaign: Campaign, errors: list[str]) -> bool:
@@ -253,6 +240,11 @@ def checked(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def count(folder: str) -> int:
+    """Entries of a folder."""
+    return sum(1 for _ in Path(folder).iterdir())
+
+
 def own_memory(pid: int) -> int:
     """Bytes in pages of a process that no file is behind, swapped ones too.
 
@@ -264,8 +256,7 @@ def own_memory(pid: int) -> int:
     return 1024 * sum(int(kilobytes[name].split()[0]) for name in ("Anonymous", "Swap"))
 
 
-_INTERNED: Final = 2**17
-"""More strings than the table takes before it is rebuilt; it has 32 000 that stay."""
+_INTERNED: Final = 2**17  # more strings than the table takes before it is rebuilt; 32 000 stay
 
 
 class _MallInfo(ctypes.Structure):

@@ -8,8 +8,9 @@ import mmap
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import pytest
 from drivers.exchange.control import BINS, upper_edge
 from tests.endurance.__main__ import main
 from tests.endurance.piece import held, own_memory
-from tests.endurance.verdict import PROCESSES, Piece, Ran, Sample, Use, judge, read_journal
+from tests.endurance.verdict import PROCESSES, Line, Piece, judge, read_journal
 from tests.journal import Journal
 
 MIB = 2**20
@@ -32,9 +33,9 @@ Change = Callable[[Piece], Piece]
 def piece(seed: int, leak: float = 0.0, slow: float = 1.0, load: float = 1.0) -> Piece:
     """80 minutes and 160 campaigns as they look on two cores.
 
-    With a leak in the archive process [MiB/h], or answers that are slower by a factor, at another
+    With a leak in the archive process [MiB/h], or replies that are slower by a factor, at another
     load, in the last quarter of an hour. Memory is a level that wanders up and down by pages;
-    answers take about 150 µs, the median of each minute scatters by 5 %.
+    replies take about 150 µs, the median of each minute scatters by 5 %.
     """
     rng = np.random.default_rng(seed)
     samples, counts, level = [], np.zeros(BINS, np.int64), 0.0
@@ -44,32 +45,26 @@ def piece(seed: int, leak: float = 0.0, slow: float = 1.0, load: float = 1.0) ->
             level = 150e-6 * np.exp(0.05 * rng.standard_normal())
         took = level * (slow if late else 1.0) * np.exp(0.3 * rng.standard_normal(500))
         counts += np.histogram(took, EDGES)[0]
-        used = {}
-        for name in PROCESSES:
-            grown = leak * MIB * second / 3600.0 if name == "archive" else 0.0
-            own = int(40 * MIB + grown + 4096 * rng.integers(0, 64))
-            used[name] = Use(own=own, threads=1)
-        counters = {"missed": 0.0, "late": 0.0, "answered": float(counts.sum())}
-        samples.append(
-            Sample(
-                float(second), load if late else 1.0, used, 3, counters, latencies=counts.tolist()
-            )
-        )
-    campaigns = [ran(number) for number in range(160)]
+        grown = {"archive": leak * MIB * second / 3600.0}
+        own = {n: int(40 * MIB + grown.get(n, 0) + 4096 * rng.integers(0, 64)) for n in PROCESSES}
+        samples.append({
+            "t": float(second), "load": load if late else 1.0,
+            "shared": 3, "stalls": 0, "stood": 0.0,
+            "processes": {name: {"own": size, "threads": 1} for name, size in own.items()},
+            "counters": {"missed": 0.0, "late": 0.0, "answered": float(counts.sum())},
+            "latencies": counts.tolist(),
+        })  # fmt: skip
     begun = {"scheduling": "SCHED_FIFO 50", "rate": 100}
-    return Piece(begun, samples, campaigns, {"reason": ""})
+    return Piece(begun, samples, [ran(number) for number in range(160)], {"reason": ""})
 
 
-def ran(number: int, **changes: Any) -> Ran:
+def ran(number: int, **changes: Any) -> Line:
     """A campaign as it should be, but for the changes."""
-    return replace(
-        Ran(
-            number=number, t=30.0 * number, complete=True, stopped=False, restarts=(), motions=26,
-            archives=26, faulty=(), outcomes={"completed": 26}, records=30_000, records_lost=0,
-            descriptors=IDLE,
-        ),
-        **changes,
-    )  # fmt: skip
+    return {
+        "number": number, "t": 30.0 * number, "complete": True, "stopped": False, "restarts": [],
+        "motions": 26, "archives": 26, "faulty": [], "outcomes": {"completed": 26}, "held": {},
+        "records": 30_000, "records_lost": 0, "descriptors": IDLE, **changes,
+    }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -77,91 +72,78 @@ def sound() -> Piece:
     return piece(1)
 
 
-def sampled(change: Callable[[int, Sample], Mapping[str, Any]]) -> Change:
+def sampled(change: Callable[[int, Line], Line]) -> Change:
     """Another piece by a change of each sample."""
     return lambda one: replace(
-        one, samples=[replace(s, **change(place, s)) for place, s in enumerate(one.samples)]
+        one, samples=[s | change(place, s) for place, s in enumerate(one.samples)]
     )
 
 
-def counted(name: str, share: float) -> Change:
-    """A share of the answers missed or late, evenly."""
+def each_campaign(change: Callable[[Line], Line]) -> Change:
+    return lambda one: replace(one, campaigns=[ran | change(ran) for ran in one.campaigns])
+
+
+def not_in_time(name: str, share: float) -> Change:
+    """A share of the replies missed or late, evenly."""
     return sampled(
-        lambda _, s: {"counters": {**s.counters, name: round(share * s.counters["answered"])}}
+        lambda _, s: {"counters": s["counters"] | {name: round(share * s["counters"]["answered"])}}
     )
 
 
 def stalling(share: float) -> Change:
     """On a machine that stands still for this share of the time, 10 ms now and then."""
-    return sampled(lambda _, s: {"stalls": round(100 * share * s.t), "stood": share * s.t})
+    return sampled(lambda _, s: {"stalls": round(100 * share * s["t"]), "stood": share * s["t"]})
 
 
 def given_up(*numbers: int) -> Change:
     """These campaigns given up after some restarts."""
-    return lambda one: replace(
-        one,
-        campaigns=[
-            replace(ran, complete=False, restarts=("closed",) * 5) if ran.number in numbers else ran
-            for ran in one.campaigns
-        ],
-    )
+    lost = {"complete": False, "restarts": ["closed"] * 5}
+    return each_campaign(lambda ran: lost if ran["number"] in numbers else {})
 
 
 def with_one(**changes: Any) -> Change:
     """One of the campaigns with changes."""
-    return lambda one: replace(one, campaigns=[*one.campaigns[:-1], ran(159, **changes)])
+    return each_campaign(lambda ran: changes if ran["number"] == 159 else {})
 
 
 def all_of(*changes: Change) -> Change:
-    def changed(one: Piece) -> Piece:
-        for change in changes:
-            one = change(one)
-        return one
-
-    return changed
+    return lambda one: reduce(lambda piece, change: change(piece), changes, one)
 
 
 def holding(name: str, grown: float) -> Change:
     """A supervisor that holds so much more an hour."""
-    return lambda one: replace(
-        one,
-        campaigns=[
-            replace(ran, held={name: 400_000 + round(grown * ran.t / 3600.0)})
-            for ran in one.campaigns
-        ],
-    )
+    return each_campaign(lambda ran: {"held": {name: 400_000 + round(grown * ran["t"] / 3600.0)}})
 
 
 LOADED = sampled(lambda _, s: {"load": 6.0})
-THREADS = sampled(
+MORE_THREADS = sampled(
     lambda _, s: {
-        "processes": {
-            **s.processes, "exchange": Use(s.processes["exchange"].own, 1 + int(s.t // 600.0))
-        }
+        "processes": s["processes"]
+        | {"exchange": {"own": 40 * MIB, "threads": 1 + int(s["t"] // 600)}}
     }
-)  # fmt: skip
-SHARED = sampled(lambda place, s: {"shared": 3 + int(s.t // 600.0) + place % 2})
+)
+SHARED = sampled(lambda place, s: {"shared": 3 + int(s["t"] // 600.0) + place % 2})
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (
-            all_of(given_up(*range(81)), counted("missed", 0.004), stalling(0.005)),
+            all_of(given_up(*range(81)), not_in_time("missed", 0.004), stalling(0.005)),
             "81 of 160 campaigns were given up",
         ),
         (given_up(70), "campaign 70 was given up, and no core stood"),
         (all_of(LOADED, given_up(70)), "campaign 70 was given up, and no core"),
         (all_of(given_up(70), stalling(0.005)), "campaign 70 was given up"),
-        (counted("missed", 0.2), "20.0% of the answers were missed"),
-        (all_of(LOADED, counted("late", 2e-4)), "96 of 480500 answers were late while"),
-        (all_of(stalling(0.003), counted("missed", 0.009)), "were missed while no core stood"),
-        (all_of(stalling(0.05), counted("late", 0.02)), "2.0% of the answers were late"),
+        (not_in_time("missed", 0.2), "20.0% of the replies were missed"),
+        (all_of(LOADED, not_in_time("late", 2e-4)), "96 of 480500 replies were late while"),
+        (all_of(stalling(0.003), not_in_time("missed", 0.009)), "were missed while no core stood"),
+        (all_of(stalling(0.05), not_in_time("late", 0.02)), "2.0% of the replies were late"),
         (lambda one: replace(one, ended={"reason": "no link"}), "ended early: no link"),
-        (THREADS, "the exchange has 9 threads in the second half, 5 in"),
+        (MORE_THREADS, "the exchange has 9 threads in the second half, 5 in"),
         (SHARED, "files in shared memory grow in number: 3, 5, 7, 9 at least"),
         (with_one(archives=25), "26 motions ended and there are 25 archives"),
-        (with_one(faulty=("x.mcap is damaged",)), "x.mcap is damaged"),
+        (with_one(faulty=["x.mcap is damaged"]), "x.mcap is damaged"),
         (with_one(records_lost=3), "3 records lost"),
         (with_one(descriptors={**IDLE, "exchange": 13}), "the exchange has 13 descriptors"),
         (holding("bytes", 10_000), "what the supervisor holds (bytes) grows by 10.0% in 4 h"),
@@ -177,7 +159,7 @@ def test_what_is_wrong_is_a_fault(sound: Piece, change: Change, words: str) -> N
     assert words in fault
 
 
-def test_slower_answers_are_a_fault_where_no_load_explains_them() -> None:
+def test_slower_replies_are_a_fault_where_no_load_explains_them() -> None:
     faults = judge([piece(7, slow=1.5)]).faults
     assert len(faults) == 4 and "p50 of the latency" in faults[0]
     verdict = judge([piece(8, slow=1.5, load=6.0)])
@@ -196,10 +178,10 @@ def test_hours_without_a_fault_are_good(seed: int) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (with_one(restarts=("lost",) * 2), "2 restarts of campaigns, and no core stood still"),
-        (counted("missed", 5e-5), "24 of 480500 answers were missed while no core stood still"),
+        (with_one(restarts=["lost"] * 2), "2 restarts of campaigns, and no core stood still"),
+        (not_in_time("missed", 5e-5), "24 of 480500 replies were missed while no core stood still"),
         (
-            all_of(given_up(70), counted("missed", 0.004), stalling(0.005)),
+            all_of(given_up(70), not_in_time("missed", 0.004), stalling(0.005)),
             "1 of 160 campaigns were given up, as cores stood still",
         ),
         (lambda one: replace(one, ended=None), "no end: it was killed, or it still runs"),
@@ -212,11 +194,11 @@ def test_what_the_machine_explains_is_a_doubt(sound: Piece, change: Change, word
     assert words in doubt
 
 
-def test_a_stall_excuses_no_more_answers_than_it_lasts(sound: Piece) -> None:
-    change = all_of(given_up(70), counted("missed", 0.004), stalling(0.001))
-    campaign, answers = judge([change(sound)]).faults
+def test_a_stall_excuses_no_more_replies_than_it_lasts(sound: Piece) -> None:
+    change = all_of(given_up(70), not_in_time("missed", 0.004), stalling(0.001))
+    campaign, replies = judge([change(sound)]).faults
     assert "campaign 70 was given up, and no core stood still" in campaign
-    assert "of 480500 answers were missed while no core stood still" in answers
+    assert "of 480500 replies were missed while no core stood still" in replies
 
 
 def test_files_of_others_that_come_and_go_are_none_of_ours(sound: Piece) -> None:
@@ -239,9 +221,9 @@ def test_pieces_of_several_journals_are_merged(
     with Journal(first) as journal:
         journal.add(kind="begin", **sound.begun)
         for sample in sound.samples:
-            journal.add(kind="sample", **asdict(sample))
+            journal.add(kind="sample", **sample)
         for campaign in sound.campaigns:
-            journal.add(kind="campaign", **asdict(campaign))
+            journal.add(kind="campaign", **campaign)
         journal.add(kind="end", **(sound.ended or {}))
     small = tmp_path / "tuesday.jsonl.xz"
     small.write_bytes(lzma.compress(first.read_bytes() + b'{"kind":"begin"}\n{"kind":"samp'))
@@ -265,11 +247,11 @@ def test_a_piece_is_not_appended_to_what_is_no_journal(tmp_path: Path) -> None:
 
 def test_what_a_process_holds_is_known_to_the_byte() -> None:
     before = held()
-    kept = np.ones(MIB), [object() for _ in range(1000)]
+    made = np.ones(MIB), [object() for _ in range(1000)]
     after = held()
     assert after["bytes"] - before["bytes"] == pytest.approx(8 * MIB, rel=0.01)
     assert after["blocks"] - before["blocks"] == pytest.approx(1000, abs=50)
-    del kept
+    del made
     assert held()["bytes"] - before["bytes"] < MIB
 
 
@@ -307,6 +289,6 @@ def test_some_seconds_of_it_leave_archives_and_a_journal(tmp_path: Path) -> None
     assert found.ended is not None
     assert found.ended["reason"] == ""
     last = found.samples[-1]
-    assert set(last.processes) == set(PROCESSES)
+    assert set(last["processes"]) == set(PROCESSES)
     # Every packet answered is in the histogram, but for the one under way.
-    assert abs(sum(last.latencies) - last.counters["answered"]) <= 50
+    assert abs(sum(last["latencies"]) - last["counters"]["answered"]) <= 50
