@@ -75,7 +75,7 @@ COMMANDS = {
         {"round": 3, "broken": [], "seconds": 9.0, "processor": 2.0},
     ),
     "simulate": LongCommand(
-        simulate.main, ["--seeds", "1"], Verdict(3, "an arm", (), (), (), (), 9).to_dict()
+        simulate.main, ["--seeds", "1"], asdict(Verdict(3, "an arm", (), (), (), (), 9))
     ),
 }
 OTHERS = {

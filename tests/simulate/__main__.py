@@ -14,10 +14,9 @@ from hil.progress import reporter
 from tests.arguments import at_least_one, whole_number
 from tests.simulate.judging import judged
 from tests.simulate.many import Known, played, stage_folder
-from tests.simulate.observed import Observed
 from tests.simulate.playing import UndisturbedError
 from tests.simulate.script import GRAMMAR
-from tests.simulate.verdicts import Stage, Tally, Verdict, runs_of
+from tests.simulate.verdicts import Stage, Verdict, runs_of, summary
 
 EPILOG = f"""\
 One seed is one arm, plan, person and script of faults, and always the same run:
@@ -34,7 +33,24 @@ The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s f
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    parser = _parser()
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.simulate",
+        description=__doc__,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--seed", type=whole_number, metavar="S", help="play this one and tell all of it"
+    )
+    what.add_argument("--seeds", type=whole_number, metavar="N", help="play N of them")
+    option = parser.add_argument
+    option("--start", type=whole_number, default=0, help="the first of N (0)")
+    option("--script", type=Path, metavar="FILE", help="of --seed: instead of its own")
+    option("--jobs", type=at_least_one, default=1, help="child processes (1)")
+    option("--journal", type=Path, metavar="FILE", help="JSON lines, one a seed")
+    option("--no-shrink", action="store_true", help="leave scripts of failures as is")
+    option("--json", action="store_true", help="end with one JSON object")
     options = parser.parse_args(arguments)
     if options.seed is None and options.script is not None:
         parser.error("--script is played with one --seed, not with --seeds")
@@ -49,95 +65,69 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.simulate",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "--seed", type=whole_number, metavar="S", help="play this one and tell all of it"
-    )
-    what.add_argument("--seeds", type=whole_number, metavar="N", help="play N of them")
-    parser.add_argument("--start", type=whole_number, default=0, help="the first of N (0)")
-    parser.add_argument("--script", type=Path, metavar="FILE", help="of --seed: instead of its own")
-    parser.add_argument("--jobs", type=at_least_one, default=1, help="child processes (1)")
-    parser.add_argument("--journal", type=Path, metavar="FILE", help="JSON lines, one a seed")
-    parser.add_argument("--no-shrink", action="store_true", help="leave scripts of failures as is")
-    parser.add_argument("--json", action="store_true", help="end with one JSON object")
-    return parser
-
-
 def _one(options: argparse.Namespace) -> int:
-    lines = None
+    script = None
     if options.script is not None:
         try:
-            lines = options.script.read_text("utf-8").splitlines()
+            script = options.script.read_text("utf-8").splitlines()
         except OSError as error:
             raise ValueError(f"{options.script}: {error.strerror}; name a script") from error
     with stage_folder() as root:
         stage = Stage(root)
         try:
-            seen = stage.observed(options.seed, lines)
+            seen = stage.observed(options.seed, script)
         except UndisturbedError as error:
             sys.stdout.write(f"BROKEN undisturbed: {error}\n")
             return 1
-        broken = judged(seen)
-        told = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}", *_story(seen)]
-    told += [f"BROKEN {law}: {text}" for law, text in broken]
-    told += [] if broken else ["all laws hold"]
-    if not options.json:
-        sys.stdout.write("\n".join(told) + "\n")
-    else:
+        broken, runs = judged(seen), runs_of(seen)
+        lines = [f"seed {options.seed}: {stage.twin(options.seed).scene.words}"]
+    if options.json:
         found = {
             "ran": 1,
             "failed": int(bool(broken)),
             "seeds_failed": [options.seed] if broken else [],
             "script": list(seen.schedule),
             "struck": list(seen.struck),
-            "runs": list(runs_of(seen)),
+            "runs": list(runs),
             "broken": [list(one) for one in broken],
         }
         sys.stdout.write(json.dumps(found) + "\n")
-    return int(bool(broken))
-
-
-def _story(seen: Observed) -> list[str]:
-    """What was drawn and what happened, for a person."""
-    told = [
+        return int(bool(broken))
+    lines += [
         f"  {line}{'' if line in seen.struck else '   (never struck)'}" for line in seen.schedule
     ]
-    for number, (life, how) in enumerate(zip(seen.runs, runs_of(seen), strict=True), start=1):
+    for number, (life, how) in enumerate(zip(seen.runs, runs, strict=True), start=1):
         why = "" if life.error is None else f": {life.error}"
-        told.append(
-            f"run {number}, cycles {life.first_cycle}..{life.last_cycle}: {how}{why}"
-            f" [{', '.join(life.archives) or 'no archive'}]"
-        )
+        archives = ", ".join(life.archives) or "no archive"
+        cycles = f"{life.first_cycle}..{life.last_cycle}"
+        lines.append(f"run {number}, cycles {cycles}: {how}{why} [{archives}]")
     if seen.unidentified:
-        told.append(f"not identified: {seen.unidentified}")
-    return told
+        lines.append(f"not identified: {seen.unidentified}")
+    lines += [f"BROKEN {law}: {text}" for law, text in broken] or ["all laws hold"]
+    sys.stdout.writelines(f"{line}\n" for line in lines)
+    return int(bool(broken))
 
 
 def _many(options: argparse.Namespace) -> int:
     known = Known(options.journal)
     seeds = range(options.start, options.start + options.seeds)
-    tally, out = Tally(), sys.stderr if options.json else sys.stdout
-    with redirect_stdout(out):
-        told = reporter()
-        with told.task("playing seeds", len(seeds)) as task:
+    verdicts: list[Verdict] = []
+    failed = 0
+    with redirect_stdout(sys.stderr if options.json else sys.stdout):
+        progress = reporter()
+        with progress.task("playing seeds", len(seeds)) as task:
             for verdict in played(seeds, known, options.jobs, shrink=not options.no_shrink):
-                tally.add(verdict)
-                task.advance(1, f"{len(tally.failed)} failed")
+                verdicts.append(verdict)
+                failed += bool(verdict.broken)
+                task.advance(1, f"{failed} failed")
                 if verdict.broken:
-                    told.say(_failure(verdict))
-    summary = tally.to_dict()
+                    progress.say(_failure(verdict))
+    found = summary(verdicts)
     if options.json:
-        sys.stdout.write(json.dumps(summary) + "\n")
+        sys.stdout.write(json.dumps(found) + "\n")
     else:
-        sys.stdout.writelines(f"{name}: {value}\n" for name, value in summary.items())
-    return int(bool(tally.failed))
+        sys.stdout.writelines(f"{name}: {value}\n" for name, value in found.items())
+    return int(bool(failed))
 
 
 def _failure(verdict: Verdict) -> str:

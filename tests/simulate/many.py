@@ -8,12 +8,13 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from functools import cache
 from itertools import groupby
 from multiprocessing.connection import wait
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Final
 
 from planner.errors import PlannerCrashed, PlannerNotStarted, PlanningTimedOut
 from planner.worker import WorkerProcess
@@ -25,21 +26,11 @@ SEEDS_PER_CHILD: Final = 400  # After which it gives its memory back
 LONGEST: Final = 1200.0  # s that a seed may take, made small included, on a busy machine
 DIED: Final = "the process lives"
 """Name of the law that a seed breaks which takes its process with it, or never ends."""
-SYNC_EVERY: Final = 60.0
-"""s of which a loss of power costs the verdicts; the death of a process costs one."""
-
-
 _PREFIX: Final = "hil_simulate_"
 
 
 class Known:
-    """Verdicts that a journal has, and those that are added to it.
-
-    Args:
-        path: of the journal; None keeps nothing.
-
-    Attributes:
-        verdicts: by seed.
+    """Verdicts by seed that a journal has, and those that are added to it; without a path none.
 
     Raises:
         JournalError: it is another file, or cannot be read or written.
@@ -48,12 +39,12 @@ class Known:
     def __init__(self, path: Path | None) -> None:
         found = () if path is None else entries(path, Verdict.from_dict, "verdict on a seed")
         self.verdicts = {verdict.seed: verdict for verdict in found}
-        self._journal = Journal(path, SYNC_EVERY)
+        self._journal = Journal(path, sync_every=60.0)  # s of which a loss of power costs
 
     def add(self, verdict: Verdict) -> None:
         """Keep one more."""
         self.verdicts[verdict.seed] = verdict
-        self._journal.add(**verdict.to_dict())
+        self._journal.add(**asdict(verdict))
 
 
 @contextmanager
@@ -88,13 +79,13 @@ def played(
     with stage_folder() as root, ExitStack() as children:
         desks = [_Desk(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
         for desk in desks:
-            children.callback(desk.close)
+            children.callback(desk.child.close)
         busy = [desk for desk in desks if desk.begin()]
         while busy:
-            left = min(desk.deadline for desk in busy) - monotonic()
-            ready = wait([desk.connection for desk in busy], max(0.0, left))
+            left = min(desk.child.deadline for desk in busy) - monotonic()
+            ready = wait([desk.child.connection for desk in busy], max(0.0, left))
             for desk in list(busy):
-                if desk.connection in ready or desk.deadline <= monotonic():
+                if desk.child.connection in ready or desk.child.deadline <= monotonic():
                     if (verdict := desk.fetch()) is not None:
                         known.add(verdict)
                         yield verdict
@@ -107,21 +98,11 @@ class _Desk:
 
     def __init__(self, groups: deque[deque[int]], root: str, shrink: bool) -> None:
         self._groups, self._root, self._shrink = groups, root, shrink
-        self._child = WorkerProcess(timeout=LONGEST)
+        self.child = WorkerProcess(timeout=LONGEST)
         self._seeds: deque[int] = deque()
         self._again: set[int] = set()
         self._seed = -1
         self._played = 0
-
-    @property
-    def connection(self) -> Any:
-        """Becomes readable when there is something to fetch."""
-        return self._child.connection
-
-    @property
-    def deadline(self) -> float:
-        """When the child must have answered, on the monotonic clock [s]."""
-        return self._child.deadline
 
     def begin(self) -> bool:
         """Give the child the next seed; whether there was one."""
@@ -132,14 +113,14 @@ class _Desk:
         self._seed = self._seeds.popleft()
         self._played += 1
         if self._played % SEEDS_PER_CHILD == 0:
-            self._child.close()
-        self._child.send(play_one, self._seed, self._root, self._shrink)
+            self.child.close()
+        self.child.send(play_one, self._seed, self._root, self._shrink)
         return True
 
     def fetch(self) -> Verdict | None:
         """The verdict; None where the child died, and the seed is tried once more."""
         try:
-            found: Verdict = self._child.receive()
+            found: Verdict = self.child.receive()
         except (PlannerCrashed, PlannerNotStarted, PlanningTimedOut) as error:
             if self._seed in self._again:
                 return Verdict(self._seed, "", (), (), (), (), 0, ((DIED, str(error)),))
@@ -147,10 +128,6 @@ class _Desk:
             self._seeds.appendleft(self._seed)
             return None
         return found
-
-    def close(self) -> None:
-        """End the child."""
-        self._child.close()
 
 
 @cache

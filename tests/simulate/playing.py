@@ -21,10 +21,9 @@ from hil.progress import Silent
 from identification import IdentificationError
 from identification.estimators.least_squares import estimate_repetitions
 from sim_fixtures.settings import WHILE_SILENT
-from tests.simulate.drawing import Story, draw_script
 from tests.simulate.observed import Estimated, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS, Scene, scene_of
-from tests.simulate.script import Script, parse_script
+from tests.simulate.script import Script, Story, draw_script, parse_script
 from tests.simulate.world import World, unrest
 
 _MOVING: Final = 0.05  # rad/s

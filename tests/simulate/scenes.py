@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -20,7 +21,131 @@ from identification.excitation import RESCORE_PERIOD, Excitation, Objective
 from planner import FourierSeries, PiecewiseCubic, PlanningError, plan_in_child
 from sim_fixtures import ControllerSettings
 from sim_fixtures.settings import ServoSettings
-from tests.simulate.arms import Arm, draw_arm
+
+SHAPES: Final = ("upright", "serial", "planar")
+"""UR-like (a turning base, three parallel axes, a wrist), NS 16-like (wrist in line), parallel."""
+_AXES: Final = {
+    "upright": ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1"),
+    "serial": ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0"),
+    "planar": ("0 1 0",) * 7,
+}
+_REACH: Final = (0.25, 0.4, 0.36, 0.14, 0.12, 0.1, 0.08)  # m from each joint to the next
+_MASS: Final = (14.0, 11.0, 6.0, 2.5, 2.0, 1.2, 0.8)  # kg
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The texts that a cell is loaded from."""
+
+    urdf: str
+    cell: str  # texts; the cell names the URDF `arm.urdf`
+    n_joints: int  # 1 to 7
+    foreign_axes: int  # axes of another arm that its controller moves as well
+    words: str  # what was drawn, for a person
+
+
+def draw_arm(chance: random.Random) -> Arm:
+    """An arm with its drives, limits, controller and truth; what it can do is not checked yet."""
+    n = chance.choices(range(1, 8), (4, 9, 5, 2, 1, 2, 1))[0]
+    shape = chance.choice(SHAPES)
+    mass = [m * chance.uniform(0.6, 1.4) for m in _MASS[:n]]
+    reach = [r * chance.uniform(0.8, 1.2) for r in _REACH[:n]]
+    cycle = chance.choice((1, 2, 2, 2))
+    coupled = n >= 6 and chance.random() < 0.7
+    foreign = chance.choice((0, 0, 0, 1, 3))
+    arm = chance.choice((1, 1, 1, 1, 2, 4))
+    where = _controller_text(chance, cycle, arm, foreign)
+    text = "\n".join((*_cell_text(chance, n, mass, reach, cycle=cycle, coupled=coupled), *where))
+    words = f"{n} joints, {shape}, {cycle} ms" + (", coupled wrist" if coupled else "")
+    return Arm(_urdf(chance, shape, mass, reach), text, n, foreign, words)
+
+
+def _urdf(chance: random.Random, shape: str, mass: Sequence[float], reach: Sequence[float]) -> str:
+    parts = ['<robot name="drawn"><link name="base"/>']
+    for i, (m, length) in enumerate(zip(mass, reach, strict=True)):
+        x, y, z = (chance.uniform(-0.04, 0.04), chance.uniform(-0.04, 0.04), 0.45 * length)
+        wide = chance.uniform(0.05, 0.09)
+        along, across = m * (length**2 + wide**2) / 12.0, m * wide**2 / 6.0
+        lift = 0.3 if i == 0 else reach[i - 1]
+        parts.append(
+            f'<link name="link_{i + 1}"><inertial><mass value="{m:.6g}"/>'
+            f'<origin xyz="{x:.6g} {y:.6g} {z:.6g}"/><inertia ixx="{along:.6g}" ixy="0" ixz="0" '
+            f'iyy="{1.1 * along:.6g}" iyz="0" izz="{across:.6g}"/></inertial>'
+            '<collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+            f'<joint name="joint_{i + 1}" type="revolute"><parent link="'
+            f'{"base" if i == 0 else f"link_{i}"}"/><child link="link_{i + 1}"/>'
+            f'<origin xyz="0 0 {lift:.6g}"/><axis xyz="{_AXES[shape][i]}"/>'
+            '<limit lower="-3" upper="3" effort="2000" velocity="12"/></joint>'
+        )
+    return "".join([*parts, "</robot>\n"])
+
+
+def _list(values: Iterable[float]) -> str:
+    return "[" + ", ".join(f"{value:.9g}" for value in values) + "]"
+
+
+def _cell_text(
+    chance: random.Random,
+    n: int,
+    mass: Sequence[float],
+    reach: Sequence[float],
+    *,
+    cycle: int,
+    coupled: bool,
+) -> Iterable[str]:
+    gear = [chance.choice((-1, 1)) * round(chance.uniform(60.0, 140.0), 2) for _ in range(n)]
+    constant = [round(chance.uniform(0.2, 0.6), 3) for _ in range(n)]
+    # Inertia of the stretched arm, about: a gear's rotor shows as much, or the loop were weak.
+    arm = [sum(mass[i:]) * sum(reach[i:]) ** 2 / 3.0 for i in range(n)]
+    rotor = [chance.uniform(0.5, 1.0) * inertia + 0.1 for inertia in arm]
+    coulomb = [1.0 + chance.uniform(0.3, 0.8) * mass[i] for i in range(n)]
+    viscous = [chance.uniform(0.1, 0.4) * mass[i] for i in range(n)]
+    # Static torque of the stretched arm, three times, and what acceleration takes of it.
+    weight = [9.81 * sum(mass[i:]) * sum(reach[i:]) for i in range(n)]
+    torque = [3.0 * w + 120.0 * (r + i) for w, r, i in zip(weight, rotor, arm, strict=True)]
+    current = [
+        round(max(2.0, t / abs(g) / k), 3) for t, g, k in zip(torque, gear, constant, strict=True)
+    ]
+    home = [round(chance.uniform(-25.0, 25.0), 1) for _ in range(n)]
+    away = chance.choice((0.0, 0.0, 3.0))
+    initial = [round(h + chance.uniform(-away, away), 1) for h in home]
+    speed = [round(chance.uniform(150.0, 400.0), 1) for _ in range(n)]
+    ease = [round(s * chance.uniform(10.0, 18.0)) for s in speed]
+    jerk = [round(a * chance.uniform(25.0, 45.0)) for a in ease]
+    k54, k64, k65 = (round(chance.uniform(-0.06, 0.06), 4) if coupled else 0.0 for _ in range(3))
+    yield '[cell]\nname = "drawn"\nurdf = "arm.urdf"\n'
+    yield '[robot.friction]\nthird = "none"\nstandstill = 0.05\n'
+    yield f"[nominal]\nrotor_inertia = {_list(rotor)}\ncoulomb = {_list(coulomb)}"
+    yield f"viscous = {_list(viscous)}\n"
+    yield f'[limits]\nframe = "urdf"\nlower_deg = {_list(h - 45.0 for h in home)}'
+    yield f"upper_deg = {_list(h + 45.0 for h in home)}\nvelocity_deg = {_list(speed)}"
+    yield f"acceleration_deg = {_list(ease)}\njerk_deg = {_list(jerk)}\n"
+    yield f"[drive_train]\ngear_ratio = {_list(gear)}"
+    yield f"calibration = {_list(round(chance.uniform(-40.0, 40.0), 3) for _ in range(n))}"
+    yield f"k54 = {k54}\nk64 = {k64}\nk65 = {k65}"
+    yield f"joint_sign = {[chance.choice((-1, 1)) for _ in range(n)]}"
+    yield f"joint_offset_deg = {_list(chance.choice((0.0, 90.0, -11.5)) for _ in range(n))}"
+    yield f"torque_constant = {_list(constant)}\ncurrent_limit = {_list(current)}"
+    yield f"following_error = {_list(round(0.03 * abs(g), 3) for g in gear)}"
+    yield "encoder_counts_per_revolution = 65536\n"
+    yield '[workspace]\nfloor = "none"\nmargin = 0.0\n'
+    repetitions = chance.choice((1, 1, 1, 2, 3) if cycle == 2 else (1, 1, 2))
+    yield f"[campaign]\nrepetitions = {repetitions}\nvalidation_runs = 1"
+    yield f"home_deg = {_list(home)}\napproach_speed = 1.0\nsettle_s = 0.16\nstandstill_s = 0.1"
+    yield f"warmup_drift = 0\nbad_repetitions = {chance.choice((1, 3))}\n"
+    yield f"[simulation]\nseed = {chance.randrange(1 << 30)}\ninitial_deg = {_list(initial)}"
+    yield f"rotor_inertia = {_list(rotor)}\ncoulomb = {_list(coulomb)}"
+    yield f"viscous = {_list(viscous)}\nthird = {_list([0.0] * n)}"
+    yield "current_noise = 0.01\ncurrent_resolution = 0.001\n"
+
+
+def _controller_text(chance: random.Random, cycle: int, arm: int, foreign: int) -> Iterable[str]:
+    other = 1 if arm > 1 else 2
+    yield f'[controller]\ntransport = "simulated"\ncycle_ms = {cycle}\narm = {arm}'
+    yield f"current_delay_cycles = {0.5 - 0.3 / cycle:.9g}\nmax_gap = {chance.choice((1, 2, 2, 4))}"
+    yield f"other_axes = {[[other, axis] for axis in range(1, foreign + 1)]}"
+    yield f"packets = {'true' if chance.random() < 0.2 else 'false'}\n"
+
 
 Array = NDArray[np.float64]
 

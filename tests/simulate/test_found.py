@@ -22,9 +22,19 @@ from hil.cell import Cell
 from hil.errors import ControllerFault
 from hil.simulation import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
-from sim_fixtures import Phase
+from sim_fixtures import Phase, SimulatedController
 from tests.hil.fast_cell import fast_cell
 from tests.simulate.verdicts import Stage
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Cell:
+    return fast_cell(tmp_path)
+
+
+@pytest.fixture
+def controller(cell: Cell) -> SimulatedController:
+    return simulated_controller(cell)
 
 
 class TestAControllerThatDoesNotBeginASession:
@@ -34,9 +44,9 @@ class TestAControllerThatDoesNotBeginASession:
     of the 60 s; then the person was told to switch the drive on, which does not help.
     """
 
-    def test_the_person_is_told_to_start_its_program_anew(self, tmp_path: Path) -> None:
-        cell = fast_cell(tmp_path)
-        controller = simulated_controller(cell)
+    def test_the_person_is_asked_to_start_its_program_anew(
+        self, cell: Cell, controller: SimulatedController
+    ) -> None:
         first = Link.over(SimulatedTransport(controller), cell)
         first.connect(Stop())
         controller.emergency_stop()
@@ -46,10 +56,8 @@ class TestAControllerThatDoesNotBeginASession:
         assert "switch the drive on" not in str(told.value)
 
     def test_a_session_that_ended_at_once_is_not_said_to_have_been_waited_for(
-        self, tmp_path: Path
+        self, cell: Cell, controller: SimulatedController
     ) -> None:
-        cell = fast_cell(tmp_path)
-        controller = simulated_controller(cell)
         controller.finish()
         link = Link.over(SimulatedTransport(controller), cell)
         with pytest.raises(ControllerFault, match="ended the session within 0") as told:
@@ -62,11 +70,9 @@ class TestAControllerThatDoesNotBeginASession:
 
 
 def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_without_end(
-    tmp_path: Path,
+    cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
     """Seed 455: the drive was lost between two motions, and virtual time went on for ever."""
-    cell = fast_cell(tmp_path)
-    controller = simulated_controller(cell)
     link = Link.over(SimulatedTransport(controller), cell)
     where = link.connect(Stop())
     controller.emergency_stop()
@@ -78,10 +84,10 @@ def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_withou
     assert (open_archive(spec.path).outcome or ArchiveOutcome()).outcome == "void"
 
 
-def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(tmp_path: Path) -> None:
+def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(
+    cell: Cell, controller: SimulatedController, tmp_path: Path
+) -> None:
     """Seed 2088 with `stop@30`: the link was left with some of the axes in open mode."""
-    cell = fast_cell(tmp_path)
-    controller = simulated_controller(cell)
     link = Link.over(SimulatedTransport(controller), cell)
     motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
     stop, phases = Stop(), []
@@ -124,9 +130,9 @@ class TestALinkThatIsClosed:
     def patience(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(link_module, "END_TIMEOUT", 0.5)
 
-    def test_does_not_wait_without_end_for_a_controller_started_anew(self, tmp_path: Path) -> None:
-        cell = fast_cell(tmp_path)
-        controller = simulated_controller(cell)
+    def test_does_not_wait_without_end_for_a_controller_started_anew(
+        self, cell: Cell, controller: SimulatedController
+    ) -> None:
         link = Link.over(
             SimulatedTransport(controller), cell, lambda: controller.restart(warm=True)
         )
@@ -136,9 +142,8 @@ class TestALinkThatIsClosed:
         assert link.transport.now - began == pytest.approx(0.5, abs=0.01)
         assert link.session.state is State.DRIVE_OFF
 
-    def test_says_that_axes_stay_open(self, tmp_path: Path) -> None:
-        cell = fast_cell(tmp_path)
-        link = Link.over(SimulatedTransport(simulated_controller(cell)), cell)
+    def test_says_that_axes_stay_open(self, cell: Cell, controller: SimulatedController) -> None:
+        link = Link.over(SimulatedTransport(controller), cell)
         link.connect(Stop())
         exchange(link.transport, link.session, until=lambda: link.session.state is State.OPEN)
         with pytest.raises(ControllerFault, match=r"an axis is still open 0\.5 s after"):

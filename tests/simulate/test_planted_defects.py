@@ -19,7 +19,7 @@ from drivers.reply_policy import ReplyPolicy
 from drivers.session import Sequence
 from drivers.state_machine import Machine
 from hil.archive.recorder import Recorder
-from hil.campaign.folder import CampaignFolder, Entry
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.run import Runner
 from planner import TrajectoryPlayer
 from tests.simulate.judging import judged
@@ -88,12 +88,6 @@ def answers_what_piled_up(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Intake, "_newest", all_of_them)
 
 
-def loses_a_record(patch: pytest.MonkeyPatch) -> None:
-    """The last record of each batch is left out, and nobody says so."""
-    write = Recorder._write
-    patch.setattr(Recorder, "_write", lambda self, records: write(self, records[:-1]))
-
-
 def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
     """What a manifest says of a stopped motion is that it completed."""
     add = CampaignFolder.add
@@ -127,15 +121,6 @@ def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Runner, "play", played)
 
 
-def believes_the_manifest(patch: pytest.MonkeyPatch) -> None:
-    """Archives are not compared with their checksums."""
-
-    def there(self: CampaignFolder, entry: Entry) -> bool:
-        return (self.archives / entry.name).is_file()
-
-    patch.setattr(CampaignFolder, "_unchanged", there)
-
-
 def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
     """Positions in archives are not those of the wire."""
     write = Recorder._write
@@ -149,28 +134,28 @@ def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Recorder, "_write", written)
 
 
-def lets_everything_pass(patch: pytest.MonkeyPatch) -> None:
-    """The guard does not look at set-points."""
-    patch.setattr(Guard, "check_set_point", lambda *arguments: None)
+def replaced(owner: type, name: str, value: Any) -> Plant:
+    return lambda patch: patch.setattr(owner, name, value)
 
 
-def moves_an_arm_that_does_not_follow(patch: pytest.MonkeyPatch) -> None:
-    """The guard does not look at what the arm does."""
-    patch.setattr(Guard, "check_feedback", lambda *arguments: None)
-
+write = Recorder._write
+loses_a_record = replaced(Recorder, "_write", lambda self, records: write(self, records[:-1]))
+believes_the_manifest = replaced(
+    CampaignFolder, "_unchanged", lambda self, entry: (self.archives / entry.name).is_file()
+)
+lets_set_points_pass = replaced(Guard, "check_set_point", lambda *_: None)
+lets_feedback_pass = replaced(Guard, "check_feedback", lambda *_: None)
 
 DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",), "replies"),
     "a motion catches up, unguarded": (
-        catches_up_unguarded,
-        ("lose@{moving}x2", "kill@9999"),
-        "guard",
+        *(catches_up_unguarded, ("lose@{moving}x2", "kill@9999"), "guard"),
     ),
-    "the guard lets set-points pass": (lets_everything_pass, ("lurch@{moving}x3:0.0001",), "guard"),
+    "the guard lets set-points pass": (
+        *(lets_set_points_pass, ("lurch@{moving}x3:0.0001",), "guard"),
+    ),
     "an arm that does not follow is moved": (
-        moves_an_arm_that_does_not_follow,
-        ("following-error@{moving}x60:axis=1:slip",),
-        "guard",
+        *(lets_feedback_pass, ("following-error@{moving}x60:axis=1:slip",), "guard"),
     ),
     "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",), "gaps"),
     "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",), "piles"),
@@ -179,7 +164,8 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "whole motions are done again": (does_whole_motions_again, ("stop@{late}",), "folder"),
     "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",), "folder"),
     "archives are smoothed": (smooths_what_it_archives, (), "archives"),
-}  # What is planted, the script that brings it out, and the law that finds it
+}
+"""What is planted, the script that brings it out, and the law that finds it."""
 
 
 def script(stage: Stage, lines: tuple[str, ...]) -> list[str]:

@@ -11,14 +11,12 @@ import pytest
 
 from tests.simulate import world
 from tests.simulate.__main__ import main
-from tests.simulate.drawing import DRAWS, Story, draw_script
 from tests.simulate.judging import judged
 from tests.simulate.many import Known, stage_folder
 from tests.simulate.playing import SceneError, _twin, twin_of
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.script import kind_of, parse_script, simpler
-from tests.simulate.shrinking import shrunk
-from tests.simulate.verdicts import Stage, Tally, Verdict
+from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script, simpler
+from tests.simulate.verdicts import Stage, Verdict, shrunk, summary
 
 STORY = Story(900, tuple(range(100, 800)), 3, 120, 40, 6, 6)
 
@@ -102,19 +100,16 @@ class TestJournal:
         again.add(verdict(5))
         assert set(Known(path).verdicts) == {3, 4, 5}
 
-    def test_a_tally_counts_kinds_ends_and_failures(self) -> None:
-        tally = Tally()
-        tally.add(verdict(1))
-        tally.add(verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c")))
-        told = tally.to_dict()
-        assert (told["ran"], told["failed"], told["seeds_failed"]) == (2, 1, [2])
-        assert told["laws_broken"] == {"guard": 1, "rest": 1}
-        assert told["struck"] == {"kill": 2}
-        assert "push" in told["never_struck"]
-        assert "kill" not in told["never_struck"]
-        assert told["met"] == {"the process died": 2}
-        assert "motion lost" in told["never_met"]
-        assert told["campaigns_ended"] == {"complete": 2}
+    def test_a_summary_counts_kinds_ends_and_failures(self) -> None:
+        found = summary([verdict(1), verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c"))])
+        assert (found["ran"], found["failed"], found["seeds_failed"]) == (2, 1, [2])
+        assert found["laws_broken"] == {"guard": 1, "rest": 1}
+        assert found["struck"] == {"kill": 2}
+        assert "push" in found["never_struck"]
+        assert "kill" not in found["never_struck"]
+        assert found["met"] == {"the process died": 2}
+        assert "motion lost" in found["never_met"]
+        assert found["campaigns_ended"] == {"complete": 2}
 
 
 def test_a_seed_is_the_same_campaign_again_to_the_last_byte() -> None:

@@ -5,20 +5,121 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
-from tests.simulate.drawing import DRAWS
+from drivers.events import AnswersLost, GapSeen, InitReceived, LinkLost, MotionEnded
 from tests.simulate.judging import LAWS, judged
-from tests.simulate.observed import Broken, Observed
+from tests.simulate.observed import Life, Observed
 from tests.simulate.playing import Twin, UndisturbedError, play, twin_of
 from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.script import kind_of, parse_script
-from tests.simulate.shrinking import shrunk
-from tests.simulate.situations import EXPECTED, situations
+from tests.simulate.script import DRAWS, kind_of, parse_script, simpler
+
+MOST_TRIES: Final = 40  # Campaigns that are played for it, at most
+
+Fails = Callable[[tuple[str, ...]], bool]
+
+
+def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple[str, ...]:
+    """A script of which no line can be left out or made plainer, as far as was tried.
+
+    Args:
+        lines: a script that fails.
+        fails: whether another one breaks the same law.
+        tries: how often that is asked, at most.
+    """
+    left, current = [tries], tuple(lines)
+
+    def still(candidate: tuple[str, ...]) -> bool:
+        left[0] -= 1
+        return left[0] >= 0 and fails(candidate)
+
+    size = max(1, len(current) // 2)
+    while size:  # halves first, then lines
+        start = 0
+        while start < len(current):
+            candidate = current[:start] + current[start + size :]
+            if still(candidate):
+                current = candidate
+            else:
+                start += size
+        size //= 2
+    for row in range(len(current)):
+        others = simpler(current[row])
+        while others:
+            candidate = (*current[:row], others[0], *current[row + 1 :])
+            if still(candidate):
+                current, others = candidate, simpler(candidate[row])
+            else:
+                others = others[1:]
+    return current
+
+
+EXPECTED: Final = (
+    "a duplicate was answered",
+    "a stale packet was left out",
+    "a malformed packet was left out",
+    "packets piled up",
+    "packets were missed",
+    "more were missed than allowed",
+    "answers were not taken",
+    "a set-point was refused",
+    "the link fell silent",
+    "the controller began anew in mid-run",
+    "motion completed",
+    "motion stopped",
+    "motion refused",
+    "motion lost",
+    "the process died",
+    "the process died with a torn archive",
+    "the disk failed",
+    "a whole archive was adopted",
+    "a motion was rejected",
+    "a dry run was accepted",
+    "several runs completed it",
+    "no run completed it",
+)  # Each is the ground of a law, or of a part of one
+
+
+def situations(seen: Observed) -> tuple[str, ...]:
+    """Those of `EXPECTED` that came about."""
+    found = {name for life in seen.runs for name in _of_life(life, seen.cell.controller.max_gap)}
+    if not seen.complete:
+        found.add("no run completed it")
+    elif len(seen.runs) > 1:
+        found.add("several runs completed it")
+    return tuple(name for name in EXPECTED if name in found)
+
+
+def _of_life(life: Life, max_gap: int) -> Iterator[str]:
+    counters, result = life.counters, life.result
+    events = [event for _, event in life.events]
+    inits = sum(isinstance(event, InitReceived) for event in events)
+    met = {
+        "a duplicate was answered": counters.duplicates,
+        "a stale packet was left out": counters.stale,
+        "a malformed packet was left out": counters.malformed,
+        "packets piled up": counters.discarded.get("late"),
+        "packets were missed": counters.missed,
+        "answers were not taken": any(isinstance(event, AnswersLost) for event in events),
+        "a set-point was refused": counters.refused,
+        "the link fell silent": any(isinstance(event, LinkLost) for event in events),
+        "the controller began anew in mid-run": inits > 1,
+        "the process died": life.died,
+        "the process died with a torn archive": life.died and any(life.torn.values()),
+        "the disk failed": life.disk,
+        "a whole archive was adopted": result is not None and result.adopted,
+        "a motion was rejected": result is not None and result.rejected,
+        "a dry run was accepted": result is not None and result.dry_run == "accepted",
+        "more were missed than allowed": any(
+            isinstance(event, GapSeen) and event.missed > max_gap for event in events
+        ),
+    }
+    yield from (name for name, so in met.items() if so)
+    yield from {f"motion {event.outcome}" for event in events if isinstance(event, MotionEnded)}
 
 
 @dataclass(frozen=True)
@@ -41,13 +142,9 @@ class Verdict:
     redrawn: int = 0  # scenes that were of no use before that of this seed's group
     seconds: float = 0.0  # processor time
 
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """From what `to_dict` returned, through JSON.
+        """From its fields, through JSON.
 
         Raises:
             KeyError, TypeError, ValueError: it is none.
@@ -104,7 +201,11 @@ class Stage:
         except UndisturbedError as error:
             return Verdict(seed, "", (), (), (), (), 0, (("undisturbed", str(error)),))
         broken = judged(seen)
-        plain = shrunk(seen.schedule, self._fails(seed, broken[0])) if broken and shrink else ()
+
+        def fails(lines: tuple[str, ...]) -> bool:
+            return any(one.law == broken[0].law for one in judged(self.observed(seed, lines)))
+
+        smallest = shrunk(seen.schedule, fails) if broken and shrink else ()
         self.clear()
         return Verdict(
             seed=seed,
@@ -115,16 +216,10 @@ class Stage:
             runs=runs_of(seen),
             cycles=len(seen.arm.sent),
             broken=tuple((one.law, one.text) for one in broken),
-            shrunk=plain,
+            shrunk=smallest,
             redrawn=self.twin(seed).redrawn,
             seconds=time.process_time() - begun,
         )
-
-    def _fails(self, seed: int, broken: Broken) -> Any:
-        def fails(lines: tuple[str, ...]) -> bool:
-            return any(one.law == broken.law for one in judged(self.observed(seed, lines)))
-
-        return fails
 
 
 def runs_of(seen: Observed) -> tuple[str, ...]:
@@ -139,56 +234,30 @@ def runs_of(seen: Observed) -> tuple[str, ...]:
     )
 
 
-@dataclass
-class Tally:
-    """Verdicts, summed up.
+def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """Many verdicts as JSON holds them; what never came about is named: nothing was tried of it."""
 
-    Attributes:
-        struck: how often each kind of line came to pass.
-        met: in how many seeds each situation came about.
-    """
+    def counts(values: Iterable[str]) -> dict[str, int]:
+        return dict(sorted(Counter(values).items()))
 
-    ran: int = 0  # seeds
-    failed: list[int] = field(default_factory=list)  # the numbers of those that broke a law
-    struck: Counter[str] = field(default_factory=Counter)
-    met: Counter[str] = field(default_factory=Counter)
-    ends: Counter[str] = field(default_factory=Counter)  # how often a run ended in each way
-    campaigns: Counter[str] = field(default_factory=Counter)  # how often the last one did
-    broken: Counter[str] = field(default_factory=Counter)  # how often each law was broken
-    redrawn: dict[int, int] = field(default_factory=dict)  # scenes of no use, by group of seeds
-    cycles: int = 0  # of all controllers
-    seconds: float = 0.0  # of processor time
-
-    def add(self, verdict: Verdict) -> None:
-        """Count one more."""
-        self.ran += 1
-        self.struck.update(verdict.struck)
-        self.met.update(verdict.met)
-        self.ends.update(verdict.runs)
-        self.campaigns[verdict.runs[-1] if verdict.runs else "nothing"] += 1
-        self.broken.update({law for law, _ in verdict.broken})
-        self.redrawn[verdict.seed // NEIGHBOURS] = verdict.redrawn
-        self.cycles += verdict.cycles
-        self.seconds += verdict.seconds
-        if verdict.broken:
-            self.failed.append(verdict.seed)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it. What never came about is named: nothing was tried of it."""
-        return {
-            "ran": self.ran,
-            "failed": len(self.failed),
-            "seeds_failed": sorted(self.failed),
-            "struck": dict(sorted(self.struck.items())),
-            "never_struck": sorted(set(DRAWS) - {"stalls"} - set(self.struck)),
-            "met": dict(sorted(self.met.items())),
-            "never_met": sorted(set(EXPECTED) - set(self.met)),
-            "laws": sorted(LAWS),
-            "laws_broken": dict(sorted(self.broken.items())),
-            "runs_ended": dict(sorted(self.ends.items())),
-            "campaigns_ended": dict(sorted(self.campaigns.items())),
-            "scenes": len(self.redrawn),
-            "scenes_redrawn": sum(self.redrawn.values()),
-            "cycles": self.cycles,
-            "processor_seconds": round(self.seconds, 1),
-        }
+    failed = sorted(one.seed for one in verdicts if one.broken)
+    struck = counts(kind for one in verdicts for kind in one.struck)
+    met = counts(name for one in verdicts for name in one.met)
+    scenes = {one.seed // NEIGHBOURS: one.redrawn for one in verdicts}
+    return {
+        "ran": len(verdicts),
+        "failed": len(failed),
+        "seeds_failed": failed,
+        "struck": struck,
+        "never_struck": sorted(set(DRAWS) - {"stalls"} - set(struck)),
+        "met": met,
+        "never_met": sorted(set(EXPECTED) - set(met)),
+        "laws": sorted(LAWS),
+        "laws_broken": counts(law for one in verdicts for law in {law for law, _ in one.broken}),
+        "runs_ended": counts(how for one in verdicts for how in one.runs),
+        "campaigns_ended": counts(one.runs[-1] if one.runs else "nothing" for one in verdicts),
+        "scenes": len(scenes),
+        "scenes_redrawn": sum(scenes.values()),
+        "cycles": sum(one.cycles for one in verdicts),
+        "processor_seconds": round(sum(one.seconds for one in verdicts), 1),
+    }

@@ -6,19 +6,21 @@ import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers import CycleRing, Session
 from drivers.transports.faults import Fault as LinkFault
 from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Link
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import ControllerFault
 from tests.simulate.observed import Act, ArmHistory, Exchanged
-from tests.simulate.script import Mishap, Script
+from tests.simulate.script import Script
 
 Array = NDArray[np.float64]
 LONGEST_STALL = 1.0  # s; a longer one is a loss
@@ -53,7 +55,6 @@ class WatchedController:
         return self.controller.phase is Phase.ENDED
 
     def next_packet(self) -> bytes | None:
-        """See `drivers.transports.simulated.Peer`."""
         for line, fault in self._faults.get(self.cycle, ()):
             fault.inflict(self.controller)
             self.struck.append(line)
@@ -70,7 +71,6 @@ class WatchedController:
         return packet
 
     def accept(self, reply: bytes | None) -> None:
-        """See `drivers.transports.simulated.Peer`."""
         self.controller.accept(reply)
 
     def alone(self, cycles: int) -> None:
@@ -87,7 +87,6 @@ class WatchedController:
         self.controller.drive_on()
 
     def history(self) -> ArmHistory:
-        """All of it."""
         n = self.controller.plant.position.size
         return ArmHistory(
             sent=tuple(self._sent),
@@ -102,7 +101,9 @@ class Clock:
     """The PC's clock, which jumps by what the script says; it goes on through all lives."""
 
     def __init__(self, script: Script) -> None:
-        jumps = sorted((one.at, one.value, one.line) for one in script.of("cycle") if _jump(one))
+        jumps = sorted(
+            (one.at, one.value, one.line) for one in script.of("cycle") if one.kind == "clock"
+        )
         self._at = [at for at, _, _ in jumps]
         self._offset: list[float] = [0.0, *accumulate(value for _, value, _ in jumps)]
         self._lines = [line for _, _, line in jumps]
@@ -116,10 +117,6 @@ class Clock:
         if passed > len(self.struck):
             self.struck = self._lines[:passed]
         return self._offset[passed]
-
-
-def _jump(mishap: Mishap) -> bool:
-    return mishap.kind == "clock"
 
 
 class WatchedTransport(SimulatedTransport):
@@ -146,12 +143,8 @@ class WatchedTransport(SimulatedTransport):
         self._inner.cycle = peer.cycle
         self._clock, self._look = clock, look
         self._period = peer.period
-        self._stalls = deque(
-            sorted(
-                (one for one in script.of("cycle") if one.kind == "stall" and one.at >= peer.cycle),
-                key=lambda one: one.at,
-            )
-        )
+        stalls = (one for one in script.of("cycle") if one.kind == "stall" and one.at >= peer.cycle)
+        self._stalls = deque(sorted(stalls, key=lambda one: one.at))
         self._held: deque[tuple[float, bytes]] = deque()
         self._arrival = -math.inf
         self.struck: list[str] = []
@@ -169,7 +162,6 @@ class WatchedTransport(SimulatedTransport):
         return self._inner.cycle
 
     def receive(self, timeout: float) -> bytes | None:
-        """See `Transport.receive`."""
         self._look(self._inner.cycle)
         self._stall("")
         if self._held:
@@ -183,13 +175,11 @@ class WatchedTransport(SimulatedTransport):
         return packet
 
     def send(self, packet: bytes) -> None:
-        """See `Transport.send`."""
         self.seen[self.answering][3].append(packet)
         self._stall("answering")
         self._inner.send(packet)
 
     def close(self) -> None:
-        """Give the link up."""
         self._inner.close()
 
     def _stall(self, where: str) -> None:
@@ -212,7 +202,6 @@ class StampedWatchedTransport(WatchedTransport):
 
     @property
     def arrived(self) -> float:
-        """See `drivers.transports.base.Transport`."""
         return min(self.now, self._arrival + self._clock.offset(self._inner.cycle))
 
 
@@ -232,70 +221,48 @@ class SessionLog:
         self._of: dict[int, int] = {}
         self._given: set[int] = set()
         self._dtype = link.ring.rows.dtype
-        self._link = link
-        self._tap_ring()
-        session = link.session
+        self._tap(link.ring, "commit", self._commit)
         for name in ("request", "stop", "override", "hold", "resume", "discarded"):
-            self._tap(session, name)
-        self._tap_tick()
-        self._tap_reply()
-        taken = session.events
+            self._tap(link.session, name, self._act)
+        for name in ("tick", "reply", "events"):
+            self._tap(link.session, name, getattr(self, f"_{name}"))
 
-        def events() -> list[Any]:
-            fresh = taken()
-            self.events += [(transport.answering, event) for event in fresh]
-            return fresh
+    def _tap(self, owner: Any, name: str, instead: Callable[..., Any]) -> None:
+        setattr(owner, name, partial(instead, owner, getattr(owner, name)))
 
-        session.events = events  # type: ignore[method-assign]
+    def _commit(self, ring: CycleRing, commit: Callable[[], None]) -> None:
+        slot = ring.slot
+        self._of[self._transport.answering] = len(self._rows)
+        self._rows.append(ring.rows[slot : slot + 1].tobytes())
+        commit()
 
-    def _tap_ring(self) -> None:
-        ring, commit = self._link.ring, self._link.ring.commit
+    def _act(self, session: Session, called: Callable[..., None], *arguments: Any) -> None:
+        called(*arguments)
+        act = Act(self._transport.answering + 1, called.__name__, arguments)
+        if not (self.acts and act.name == "stop" and self.acts[-1][1:] == act[1:]):
+            self.acts.append(act)
 
-        def committed() -> None:
-            slot = ring.slot
-            self._of[self._transport.answering] = len(self._rows)
-            self._rows.append(ring.rows[slot : slot + 1].tobytes())
-            commit()
+    def _tick(self, session: Session, tick: Callable[[float], None], now: float) -> None:
+        before = session.deadline
+        tick(now)
+        if math.isfinite(before) and not math.isfinite(session.deadline):
+            self.acts.append(Act(self._transport.answering + 1, "tick", (now,)))
 
-        ring.commit = committed  # type: ignore[method-assign]
-
-    def _tap(self, session: Any, name: str) -> None:
-        called = getattr(session, name)
-
-        def noted(*arguments: Any) -> None:
-            called(*arguments)
-            act = Act(self._transport.answering + 1, name, arguments)
-            if not (self.acts and name == "stop" and self.acts[-1][1:] == act[1:]):
-                self.acts.append(act)
-
-        setattr(session, name, noted)
-
-    def _tap_tick(self) -> None:
-        session, tick = self._link.session, self._link.session.tick
-
-        def ticked(now: float) -> None:
-            before = session.deadline
-            tick(now)
-            if math.isfinite(before) and not math.isfinite(session.deadline):
-                self.acts.append(Act(self._transport.answering + 1, "tick", (now,)))
-
-        session.tick = ticked  # type: ignore[method-assign]
-
-    def _tap_reply(self) -> None:
+    def _reply(self, session: Session, reply: Any, packet: bytes, *arguments: Any) -> bytes | None:
         """Of a pile the session gets some: find out which of those received it has in hand."""
-        session, reply = self._link.session, self._link.session.reply
-        seen, transport = self._seen, self._transport
+        row = self._transport.answering + 1
+        while row < len(self._seen) and self._seen[row][2] is not packet:
+            row += 1
+        assert row < len(self._seen), "the session was given a packet that was not received"
+        self._transport.answering = row
+        self._given.add(row)
+        answer: bytes | None = reply(packet, *arguments)
+        return answer
 
-        def replied(packet: bytes, *arguments: Any) -> bytes | None:
-            row = transport.answering + 1
-            while row < len(seen) and seen[row][2] is not packet:
-                row += 1
-            assert row < len(seen), "the session was given a packet that was not received"
-            transport.answering = row
-            self._given.add(row)
-            return reply(packet, *arguments)
-
-        session.reply = replied  # type: ignore[method-assign, assignment]
+    def _events(self, session: Session, events: Callable[[], list[Any]]) -> list[Any]:
+        fresh = events()
+        self.events += [(self._transport.answering, event) for event in fresh]
+        return fresh
 
     @property
     def exchanged(self) -> tuple[Exchanged, ...]:

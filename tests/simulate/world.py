@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import math
+import os
 import random
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Final
+from typing import Any, Final
 from unittest.mock import patch
 
 import numpy as np
@@ -18,18 +21,21 @@ import numpy as np
 from drivers import State
 from drivers.errors import NotAtStandstill
 from drivers.events import MotionEnded
+from hil.archive import writer
 from hil.campaign import Campaign, Link, link, steering
-from hil.campaign.operator import Stop
+from hil.campaign import folder as campaign_folder
+from hil.campaign.dry_run import DryRun
+from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.run import RunResult
+from hil.files import write_atomically
 from hil.simulation import simulated_controller
+from planner import TrajectoryPlayer
+from planner.arrays import Array
 from sim_fixtures import ControllerSettings
 from tests.hil.fast_cell import pass_rehearsal
-from tests.simulate.disk import Disk, Killed, planted
-from tests.simulate.lurching import lurching
 from tests.simulate.observed import ArmHistory, Digests, Life
-from tests.simulate.person import Person
 from tests.simulate.scenes import Scene
-from tests.simulate.script import Script
+from tests.simulate.script import Mishap, Script
 from tests.simulate.watched import (
     Clock,
     SessionLog,
@@ -37,6 +43,217 @@ from tests.simulate.watched import (
     WatchedController,
     WatchedTransport,
 )
+
+
+class Killed(BaseException):
+    """The process is no more; what unwinds after this does nothing to the disk."""
+
+
+class Disk:
+    """Stands between what writes archives and manifests, and the files.
+
+    Attributes:
+        struck: lines that came to pass.
+        failures: kinds of the failures since the last `begin`.
+        torn: bytes that are missing at the end of an archive since its process died.
+        refused: archives that a write to failed.
+        dead: whether the process was killed.
+    """
+
+    def __init__(self, script: Script) -> None:
+        self._mishaps = {
+            what: {at: one for one in script.of(what) for at in range(one.at, one.at + one.count)}
+            for what in ("write", "save", "create")
+        }
+        self._count = dict.fromkeys(self._mishaps, 0)
+        self._paths: dict[int, Path] = {}
+        self._last: list[Path] = []
+        self.struck: list[str] = []
+        self.failures: list[str] = []
+        self.torn: dict[str, int] = {}
+        self.refused: set[str] = set()
+        self.dead = False
+
+    @property
+    def most(self) -> int:
+        """How often it can strike at all."""
+        return sum(len(mishaps) for mishaps in self._mishaps.values())
+
+    @property
+    def done(self) -> dict[str, int]:
+        """How often there was something to strike, by what it is: writes, saves, creates."""
+        return {f"{what}s": count for what, count in self._count.items()}
+
+    def begin(self) -> None:
+        """A new process begins."""
+        self.dead = False
+        self.failures, self.torn, self.refused = [], {}, set()
+        self._paths.clear()
+        self._last.clear()
+
+    def cut_power(self, keep: float, files: int) -> None:
+        """Kill the process, and have a share left of the newest archives it wrote."""
+        self.dead = True
+        for path in self._last[-files:]:
+            size = path.stat().st_size
+            os.truncate(path, left := round(keep * size))
+            self.torn[path.name] = size - left
+
+    def _due(self, what: str) -> Mishap | None:
+        self._count[what] += 1
+        found = self._mishaps[what].get(self._count[what])
+        if found is not None:
+            self.struck.append(found.line)
+            self.failures.append(found.kind)
+        return found
+
+    # What stands in for `os` below archives.
+
+    def open(self, path: Any, flags: int, mode: int = 0o777) -> int:
+        """Make an archive, or open a folder."""
+        if flags & os.O_CREAT and self._due("create") is not None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        descriptor = os.open(path, flags, mode)
+        if flags & os.O_CREAT:
+            self._paths[descriptor] = Path(path)
+            self._last.append(Path(path))
+        return descriptor
+
+    def write(self, descriptor: int, data: Any) -> int:
+        """Write as much as the disk takes."""
+        if self.dead:
+            return len(data)
+        mishap = self._due("write")
+        if mishap is None:
+            return os.write(descriptor, data)
+        if mishap.kind == "short-write":
+            return os.write(descriptor, data[: max(1, round(mishap.value * len(data)))])
+        part = data[: min(len(data) - 1, round(mishap.value * len(data)))]
+        kept = os.write(descriptor, part) if len(part) else 0
+        if mishap.kind == "kill-at-write":
+            self.dead = True
+            self.torn[self._paths[descriptor].name] = len(data) - kept
+            raise Killed(mishap.line)
+        self.refused.add(self._paths[descriptor].name)
+        number = errno.EIO if mishap.kind == "disk-error" else errno.ENOSPC
+        raise OSError(number, os.strerror(number))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(os, name)
+
+    # What stands in for `write_atomically` below manifests.
+
+    def save(self, path: Path, content: str | bytes) -> None:
+        """Replace a file."""
+        if self.dead:
+            return
+        mishap = self._due("save")
+        if mishap is None:
+            write_atomically(path, content)
+            return
+        if mishap.kind == "save-full":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if mishap.word == "after":
+            write_atomically(path, content)
+        elif mishap.word == "left":
+            half = content[: len(content) // 2]
+            left = path.with_suffix(path.suffix + ".tmp")
+            left.write_bytes(half.encode() if isinstance(half, str) else half)
+        self.dead = True
+        raise Killed(mishap.line)
+
+
+@contextmanager
+def planted(disk: Disk) -> Iterator[None]:
+    """Everything that this thread archives goes through `disk`."""
+    with (
+        patch.object(writer, "os", disk),
+        patch.object(campaign_folder, "write_atomically", disk.save),
+    ):
+        yield
+
+
+class Person:
+    """An `Operator`.
+
+    Args:
+        script: wishes by the controller's cycle.
+        cycle: the present one.
+
+    Attributes:
+        struck: lines that came to pass.
+    """
+
+    can_answer = True
+
+    def __init__(self, script: Script, cycle: Callable[[], int]) -> None:
+        acts = sorted(script.of("cycle"), key=lambda one: one.at)
+        self._overrides = [one for one in acts if one.kind == "override"]
+        self._holds = [one for one in acts if one.kind == "hold"]
+        self._asked = 0
+        declines = [one for one in script.of("always") if one.kind == "declines"]
+        self._declines = [one.line for one in declines for _ in range(one.count)]
+        self._cycle = cycle
+        self._speed = 1.0
+        self.struck: list[str] = []
+
+    def show(self, status: RunStatus) -> None:
+        del status
+
+    def request(self) -> OperatorRequest:
+        """See `Operator`; a hold ends when it was asked after often enough."""
+        cycle = self._cycle()
+        while self._overrides and self._overrides[0].at <= cycle:
+            act = self._overrides.pop(0)
+            self._speed = min(1.0, act.value / 100.0)
+            self.struck.append(act.line)
+        held = False
+        if self._holds and self._holds[0].at <= cycle:
+            if self._asked == 0:
+                self.struck.append(self._holds[0].line)
+            held, self._asked = self._asked < self._holds[0].count, self._asked + 1
+            if not held:
+                self._holds.pop(0)
+                self._asked = 0
+        return OperatorRequest(self._speed, held)
+
+    def accept_dry_run(self, found: DryRun) -> bool:
+        del found
+        if self._declines:
+            self.struck.append(self._declines.pop())
+            return False
+        return True
+
+
+@contextmanager
+def lurching(script: Script, cycle: Callable[[], int], struck: list[str]) -> Iterator[None]:
+    """Motions lurch where the script says so; `struck` takes the lines that came to pass."""
+    due = [one for one in script.of("cycle") if one.kind == "lurch" and one.line not in struck]
+    if not due:
+        yield
+        return
+    due.sort(key=lambda one: one.at)
+    left = due[0].count
+    advance = TrajectoryPlayer.advance
+
+    def advanced(player: TrajectoryPlayer) -> tuple[Array, Array]:
+        nonlocal left
+        position, velocity = advance(player)
+        if not due or cycle() < due[0].at:
+            return position, velocity
+        if due[0].line not in struck:
+            struck.append(due[0].line)
+        position = position.copy()
+        position[0] += math.nan if due[0].word == "nan" else due[0].value
+        left -= 1
+        if not left:
+            due.pop(0)
+            left = due[0].count if due else 0
+        return position, velocity
+
+    with patch.object(TrajectoryPlayer, "advance", advanced):
+        yield
+
 
 MOST_LIVES: Final = 32
 MOST_CYCLES: Final = 500_000
@@ -246,9 +463,7 @@ def _when(script: Script) -> int:
 def _no_waiting() -> Iterator[None]:
     """A person who holds the arm is asked again at once."""
     fake = SimpleNamespace(sleep=lambda seconds: None, monotonic=time.monotonic)
-    with ExitStack() as undo:
-        for module in (link, steering):
-            undo.enter_context(patch.object(module, "time", fake))
+    with patch.object(link, "time", fake), patch.object(steering, "time", fake):
         yield
 
 
