@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,32 +78,22 @@ def broken(
         workers: for a batch of the folder and its comparison with itself; None: without them.
     """
 
-    def named(what: Callable[[], Iterator[str]]) -> Iterator[str]:
-        return _named(what, truth, harmed)
-
-    for path in harmed:
-        yield from named(lambda path=path: _reads(truth, path))  # type: ignore[misc]
-        yield from named(lambda path=path: _checks(truth, path))  # type: ignore[misc]
-        yield from named(lambda path=path: _looks(truth, path))  # type: ignore[misc]
-    identifies = _identifies_campaign if number % 2 else _identifies
+    readers: list[Callable[[], Iterator[str]]] = [
+        partial(law, truth, path) for path in harmed for law in (_reads, _checks, _looks)
+    ]
     if any(path in truth.paths for path in harmed):  # moves are never read for it
-        yield from named(lambda: identifies(truth, harmed))
+        readers.append(partial(_identifies, truth, harmed, campaign=bool(number % 2)))
     if workers is not None:
-        yield from named(lambda: _pools(truth, harmed, workers))
-        yield from named(lambda: _compares(truth, workers))
-
-
-def _named(
-    what: Callable[[], Iterator[str]], truth: Undamaged, harmed: Sequence[Path]
-) -> Iterator[str]:
-    """What a reader breaks; an error of ours that blames what was damaged breaks nothing."""
-    try:
-        yield from what()
-    except HilError as error:
-        if not _blames(str(error), truth, harmed):
-            yield f"an error that names nothing that was damaged: {error}"
-    except Exception as error:
-        yield f"an undocumented {type(error).__name__}: {error}"
+        readers.append(partial(_pools, truth, harmed, workers))
+        readers.append(partial(_compares, truth, workers))
+    for reader in readers:
+        try:
+            yield from reader()
+        except HilError as error:
+            if not _blames(str(error), truth, harmed):
+                yield f"an error that names nothing that was damaged: {error}"
+        except Exception as error:
+            yield f"an undocumented {type(error).__name__}: {error}"
 
 
 def _blames(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
@@ -144,18 +135,11 @@ def _looks(truth: Undamaged, path: Path) -> Iterator[str]:
         yield f"{path.name}: {view.stop} s of {shown} s are drawn without a word"
 
 
-def _identifies(truth: Undamaged, harmed: Sequence[Path]) -> Iterator[str]:
-    yield from _as_before(truth, harmed, identify_archives(truth.paths, Silent()), "identify")
-
-
-def _identifies_campaign(truth: Undamaged, harmed: Sequence[Path]) -> Iterator[str]:
-    found = identify_campaign(truth.root, Silent())
-    yield from _as_before(truth, harmed, found, "identify of the campaign")
-
-
-def _as_before(
-    truth: Undamaged, harmed: Sequence[Path], found: Identification, what: str
-) -> Iterator[str]:
+def _identifies(truth: Undamaged, harmed: Sequence[Path], *, campaign: bool) -> Iterator[str]:
+    if campaign:
+        found, what = identify_campaign(truth.root, Silent()), "identify of the campaign"
+    else:
+        found, what = identify_archives(truth.paths, Silent()), "identify"
     before, now = truth.loose.estimate.pooled, found.estimate.pooled
     if _alike(before.values, now.values):
         return
@@ -228,9 +212,7 @@ def _compares(truth: Undamaged, workers: Workers) -> Iterator[str]:
 def _same(one: Archive, other: Archive) -> bool:
     return (
         one.columns.keys() == other.columns.keys()
-        and all(
-            np.array_equal(one.columns[k], other.columns[k], equal_nan=True) for k in one.columns
-        )
+        and all(np.array_equal(v, other.columns[k], equal_nan=True) for k, v in one.columns.items())
         and one.header == other.header
         and one.outcome == other.outcome
         and one.attachments == other.attachments

@@ -1,14 +1,12 @@
 """A folder seen through FUSE that is slow, hangs or refuses on demand.
 
-`python -m tests.disk.passthrough FOLDER MOUNTPOINT` mounts until its standard input ends. Each line
-there is a list of rules (`tests/disk/faults.py`) to be put in force, and is answered by one line:
-what the rules before it have struck.
+`python -m tests.disk.passthrough FOLDER MOUNTPOINT` mounts until its standard input ends. The rules
+lie beside the mount point (`tests/disk/disks.py`).
 """
 
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import sys
 import threading
@@ -18,7 +16,7 @@ from typing import Any, Final
 
 import mfusepy
 
-from tests.disk.faults import CREATE, RENAME, SYNC, WRITE, Faults, of_text
+from tests.disk.disks import CREATE, RENAME, SYNC, WRITE, Faults
 
 MNT_DETACH: Final = 2
 _STAT: Final = ("st_gid", "st_mode", "st_nlink", "st_size", "st_uid")
@@ -126,23 +124,17 @@ class Passthrough(mfusepy.Operations):  # type: ignore[misc]
         return 0
 
 
-def _obey(faults: Faults, mountpoint: Path) -> None:
-    """Take rules from standard input; unmount when it ends."""
-    for line in sys.stdin:
-        struck = faults.struck
-        faults.set(of_text(line))
-        sys.stdout.write(json.dumps(struck) + "\n")
-        sys.stdout.flush()
-    faults.set([])
-    ctypes.CDLL(None, use_errno=True).umount2(os.fsencode(mountpoint), MNT_DETACH)
-
-
 def main() -> None:
     """Mount, and serve until the end of standard input."""
     root, mountpoint = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
-    faults = Faults()
-    threading.Thread(target=_obey, args=(faults, mountpoint), daemon=True).start()
-    mfusepy.FUSE(Passthrough(root, faults), str(mountpoint), foreground=True, max_threads=10)
+
+    def unmount_at_the_end() -> None:
+        sys.stdin.read()
+        ctypes.CDLL(None, use_errno=True).umount2(os.fsencode(mountpoint), MNT_DETACH)
+
+    threading.Thread(target=unmount_at_the_end, daemon=True).start()
+    operations = Passthrough(root, Faults(mountpoint))
+    mfusepy.FUSE(operations, str(mountpoint), foreground=True, max_threads=10)
 
 
 if __name__ == "__main__":

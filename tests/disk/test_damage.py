@@ -16,8 +16,7 @@ from hil.batch.workers import LocalWorkers
 from hil.errors import ArchiveError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
-from tests.disk.damage import campaign, main, play
-from tests.disk.harm import KINDS
+from tests.disk.damage import KINDS, campaign, main, play
 from tests.disk.laws import Undamaged, broken
 from tests.hil.mcap_bytes import chunks
 

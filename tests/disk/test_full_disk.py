@@ -88,14 +88,8 @@ def hil(*words: object) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
-def require_told(result: Result, disk: Disk, *places: str) -> None:
-    """An error of ours: a path on that disk, what is wrong with it, and a documented status.
-
-    Args:
-        result: of the command.
-        disk: that is full.
-        places: folders and files on it of which one, or something in it, cannot be written.
-    """
+def require_error(result: Result, disk: Disk, *places: str) -> None:
+    """An error of ours: what is wrong, below which of the places on that disk, and its status."""
     error = result.exception
     if isinstance(error, SystemExit):  # of several files, said by the command itself
         said = [line for line in result.output.splitlines() if line.startswith("error: ")]
@@ -129,7 +123,7 @@ def test_a_run_on_a_full_disk_keeps_what_is_whole_and_goes_on(
     disk.fill(left)
     result = hil("run", campaign.folder.root, "--accept-dry-run", "--no-identify", "--quiet")
     disk.empty()
-    require_told(result, disk, "campaign")
+    require_error(result, disk, "campaign")
     after = sums(campaign)
     assert before.items() <= after.items()
     for path in campaign.folder.archives.glob("*.mcap"):
@@ -148,30 +142,27 @@ def test_with_room_again_the_run_completes(disk: Disk, campaign: Campaign) -> No
 
 SHORT = {"population": 8, "generations": 1}
 """Of a search that is only to write what a search writes."""
-STAGES = {
-    "design": "design cell/cell.toml --settings short.toml -o designed --workers 1",
-    "compare": "compare campaign second -o pages/compare.html",
-    "study": "study -o study --campaign campaign --campaign second --workers 1",
-    "rehearse": "rehearse campaign --again",
-    "identify": "identify campaign --quiet",
-    "report": "report campaign",
-    "reidentify": "reidentify campaign --output batch --quiet",
-    "plot": "plot campaign/archives/excitation_000_a1.mcap --output plot.png",
-    "repair": "archive repair excitation_000_a1.mcap",
-    "new": "new --urdf campaign/robot.urdf --output new.toml --force",
-}  # What else leaves something on the disk: command and arguments, paths of which lie there
-WRITTEN: dict[str, tuple[str, ...]] = {
-    "design": ("designed",),
-    "compare": ("pages", "campaign", "second"),
-    "study": ("study", "campaign", "second"),
-    "rehearse": ("campaign",),
-    "identify": ("campaign",),
-    "report": ("campaign",),
-    "reidentify": ("batch", "campaign"),
-    "plot": ("plot.png",),
-    "repair": ("excitation_000_a1_repaired.mcap",),
-    "new": ("new.toml",),
-}  # Where each of them writes; sums of archives are kept beside these
+STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "design": (
+        *("design cell/cell.toml --settings short.toml -o designed --workers 1", ("designed",)),
+    ),
+    "compare": (
+        *("compare campaign second -o pages/compare.html", ("pages", "campaign", "second")),
+    ),
+    "study": (
+        "study -o study --campaign campaign --campaign second --workers 1",
+        ("study", "campaign", "second"),
+    ),
+    "rehearse": ("rehearse campaign --again", ("campaign",)),
+    "identify": ("identify campaign --quiet", ("campaign",)),
+    "report": ("report campaign", ("campaign",)),
+    "reidentify": ("reidentify campaign --output batch --quiet", ("batch", "campaign")),
+    "plot": ("plot campaign/archives/excitation_000_a1.mcap --output plot.png", ("plot.png",)),
+    "repair": ("archive repair excitation_000_a1.mcap", ("excitation_000_a1_repaired.mcap",)),
+    "new": ("new --urdf campaign/robot.urdf --output new.toml --force", ("new.toml",)),
+}
+"""What else leaves something on the disk: the command, and where it writes; sums of archives are
+beside these."""
 
 
 @pytest.fixture(scope="module")
@@ -214,24 +205,20 @@ def test_every_command_says_that_the_disk_is_full_and_works_once_it_is_not(
     as_before(disk, campaign)
     whole = sums(campaign)
     disk.fill(left)
-    full = hil(*STAGES[stage].split())
+    command, written = STAGES[stage]
+    full = hil(*command.split())
     disk.empty()
     assert sums(campaign) == whole
     if full.exit_code or full.exception:
-        require_told(full, disk, *WRITTEN[stage])
+        require_error(full, disk, *written)
     else:
         assert left, "nothing can be written where nothing is left"
-    again = hil(*STAGES[stage].split(), *_on_with_it(stage, disk, full))
+    begun = (disk.root / "designed" / "search.journal").exists()
+    if begun:  # a search that was begun is resumed by an option, which its error names
+        assert "--resume" in f"{full.exception} {full.output}"
+    again = hil(*command.split(), *(["--resume"] if begun else []))
     expected = {"repair": 3}.get(stage, 0)  # what was torn off is lost
     assert again.exit_code == expected, f"{again.exception!r} {again.output}"
-
-
-def _on_with_it(stage: str, disk: Disk, full: Result) -> tuple[str, ...]:
-    """A search that was begun is gone on with by an option, which its error names."""
-    if stage != "design" or not (disk.root / "designed" / "search.journal").exists():
-        return ()
-    assert "--resume" in f"{full.exception} {full.output}"
-    return ("--resume",)
 
 
 @pytest.mark.slow
@@ -243,7 +230,7 @@ def test_every_command_says_that_a_folder_is_read_only_and_changes_nothing(
     as_before(disk, prepared)
     victim = prepared.folder.completed("excitation")[-1]
     victim.rename(victim.with_suffix(".away"))  # so that there is something to run
-    command = "run campaign --no-identify" if stage == "run" else STAGES[stage]
+    command = "run campaign --no-identify" if stage == "run" else STAGES[stage][0]
     subprocess.run(["mount", "-o", "remount,ro", str(disk.root)], check=True)
     try:
         refused = hil(*command.split())
@@ -278,10 +265,10 @@ def test_a_campaign_that_cannot_be_made_leaves_nothing(disk: Disk, campaign: Cam
 def test_an_error_has_to_name_what_on_the_disk_cannot_be_written(
     tmp_path: Path, text: str, passes: bool
 ) -> None:
-    told = HilError(text.format(root=tmp_path, full="No space left on device"))
-    result = cast("Result", SimpleNamespace(exception=told, output=""))
+    error = HilError(text.format(root=tmp_path, full="No space left on device"))
+    result = cast("Result", SimpleNamespace(exception=error, output=""))
     with nullcontext() if passes else pytest.raises(AssertionError):
-        require_told(result, Disk(tmp_path), "campaign")
+        require_error(result, Disk(tmp_path), "campaign")
 
 
 # The folder, or a part of it, is removed while the campaign runs

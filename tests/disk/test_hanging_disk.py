@@ -7,8 +7,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +20,7 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port, loopback_link
 from hil.errors import ControllerFault
 from hil.progress import Silent
-from tests.disk.faults import CREATE, SYNC, WRITE, Rule
-from tests.disk.mounted import Disk, NoFuseError, fuse_disk, processes_disk
+from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, fuse_disk, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 PATIENCE = 120.0  # s for a process to get on, on a machine that does other things as well
@@ -30,21 +28,12 @@ RUN = (sys.executable, "-m", "hil", "run")
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 
 
-MOUNTS: dict[str, Callable[[Path], AbstractContextManager[Disk]]] = {
-    "fuse": fuse_disk,
-    "planted": processes_disk,
-}
-
-
-@pytest.fixture(scope="module", params=sorted(MOUNTS))
+@pytest.fixture(scope="module", params=[fuse_disk, processes_disk])
 def disk(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Disk]:
-    try:
-        with MOUNTS[request.param](tmp_path_factory.mktemp(request.param)) as mounted:
-            yield mounted
-    except NoFuseError as error:
-        pytest.skip(str(error))
+    with request.param(tmp_path_factory.mktemp("disk")) as mounted:
+        yield mounted
 
 
 @dataclass(frozen=True)

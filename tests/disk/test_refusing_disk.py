@@ -7,8 +7,8 @@ the same command completes. Each law is tried on a planted disk and on one mount
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,17 @@ from hil.progress import Silent
 from hil.study import study_settings
 from hil.study.records import Record, read_record, write_record
 from hil.study.settings import StudyFolder
-from tests.disk.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, Rule
-from tests.disk.mounted import Disk, NoFuseError, fuse_disk, planted_disk
+from tests.disk.disks import (
+    CREATE,
+    REFUSALS,
+    RENAME,
+    SYNC,
+    WRITE,
+    Disk,
+    Rule,
+    fuse_disk,
+    planted_disk,
+)
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 DONE = {
@@ -32,22 +41,19 @@ DONE = {
     "*.mcap": {CREATE: 7, WRITE: 130, SYNC: 130},
     "manifest.json*": {CREATE: 6, WRITE: 6, SYNC: 6, RENAME: 6},
 }  # Operations by the names of files, of which a run does at least so many
-Mount = Callable[[Path], AbstractContextManager[Disk]]
-MOUNTS: dict[str, Mount] = {"planted": planted_disk, "fuse": fuse_disk}
+Designed = tuple[Cell, CampaignPlan]
 WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")
 REMEDIES = ("make room", "mend the disk", "another folder", "record again", "writable")
 
 
-@pytest.fixture(scope="module", params=["planted", pytest.param("fuse", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=[planted_disk, pytest.param(fuse_disk, marks=pytest.mark.slow)]
+)
 def disk(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Disk]:
-    mount = MOUNTS[request.param]
-    try:
-        with mount(tmp_path_factory.mktemp(request.param)) as mounted:
-            yield mounted
-    except NoFuseError as error:
-        pytest.skip(str(error))
+    with request.param(tmp_path_factory.mktemp("disk")) as mounted:
+        yield mounted
 
 
 @pytest.fixture(autouse=True)
@@ -57,10 +63,16 @@ def well_again(disk: Disk) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def designed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cell, CampaignPlan]:
+def designed(tmp_path_factory: pytest.TempPathFactory) -> Designed:
     folder = tmp_path_factory.mktemp("designed")
     made = fast_campaign(folder / "campaign", fast_cell(folder, repetitions=2))
     return made.cell, made.plan
+
+
+def rehearsed(disk: Disk, name: str, designed: Designed) -> Campaign:
+    campaign = Campaign.create(disk.root / name, *designed)
+    pass_rehearsal(campaign.folder)
+    return campaign
 
 
 def drawn(rng: random.Random) -> Rule:
@@ -81,7 +93,7 @@ def entered(campaign: Campaign) -> dict[str, bytes]:
     return {entry.name: (folder.archives / entry.name).read_bytes() for entry in folder.manifest()}
 
 
-def require_told(error: HilError, root: Path) -> None:
+def require_error(error: HilError, root: Path) -> None:
     """A documented status, a path on that disk, what is wrong with it, and what to do."""
     text = str(error)
     assert error.exit_code in (1, 2, 4), text
@@ -108,17 +120,17 @@ def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
     """Run on a disk that refuses, then on a well one; what was refused."""
     before = entered(campaign)
     disk.do_wrong(rule)
-    told = None
+    raised = None
     try:
         Campaign.open(campaign.folder.root).run(
             None, None, Silent(), accept_dry_run=True, durable=True
         )
     except HilError as error:
-        told = error
+        raised = error
     struck = disk.do_wrong()
-    assert bool(struck) == (told is not None), f"{struck} struck, and it was raised: {told}"
-    if told is not None:
-        require_told(told, campaign.folder.root)
+    assert bool(struck) == (raised is not None), f"{struck} struck, and it was raised: {raised}"
+    if raised is not None:
+        require_error(raised, campaign.folder.root)
     after = entered(campaign)
     assert before.items() <= after.items(), "what was whole is whole"
     require_readable(campaign)
@@ -128,12 +140,11 @@ def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
     return struck
 
 
-def rounds(disk: Disk, designed: tuple[Cell, CampaignPlan], seeds: range) -> int:
+def rounds(disk: Disk, designed: Designed, seeds: range) -> int:
     """How many refusals struck."""
     count = 0
     for seed in seeds:
-        campaign = Campaign.create(disk.root / f"round_{seed}", *designed)
-        pass_rehearsal(campaign.folder)
+        campaign = rehearsed(disk, f"round_{seed}", designed)
         rule = drawn(random.Random(f"refused/{seed}"))
         try:
             count += bool(refused_run(disk, campaign, rule))
@@ -145,27 +156,23 @@ def rounds(disk: Disk, designed: tuple[Cell, CampaignPlan], seeds: range) -> int
     return count
 
 
-def test_a_disk_that_refuses_costs_the_motion_and_no_more(
-    disk: Disk, designed: tuple[Cell, CampaignPlan]
-) -> None:
+def test_a_disk_that_refuses_costs_the_motion_and_no_more(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(2)) >= 1
 
 
 @pytest.mark.parametrize("operation", [CREATE, WRITE])
-def test_a_manifest_that_is_refused_in_mid_campaign_is_told_of(
-    disk: Disk, designed: tuple[Cell, CampaignPlan], operation: str
+def test_a_manifest_that_is_refused_in_mid_campaign_is_reported(
+    disk: Disk, designed: Designed, operation: str
 ) -> None:
-    campaign = Campaign.create(disk.root / f"manifest_{operation}", *designed)
-    pass_rehearsal(campaign.folder)
+    campaign = rehearsed(disk, f"manifest_{operation}", designed)
     rule = Rule((operation,), "manifest.json*", after=2, times=1, error="EIO")
     assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
 
 
 def test_a_refusal_that_is_swallowed_is_found(
-    disk: Disk, designed: tuple[Cell, CampaignPlan], monkeypatch: pytest.MonkeyPatch
+    disk: Disk, designed: Designed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    campaign = Campaign.create(disk.root / "swallowed", *designed)
-    pass_rehearsal(campaign.folder)
+    campaign = rehearsed(disk, "swallowed", designed)
     true = Campaign.run
 
     def swallowing(*arguments: Any, **named: Any) -> None:
@@ -178,7 +185,7 @@ def test_a_refusal_that_is_swallowed_is_found(
 
 
 def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(
-    disk: Disk, designed: tuple[Cell, CampaignPlan]
+    disk: Disk, designed: Designed
 ) -> None:
     # One that is left without a manifest would look like one whose cell file was edited.
     root = disk.root / "half"
@@ -191,9 +198,7 @@ def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(
 
 
 @pytest.mark.slow
-def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(
-    disk: Disk, designed: tuple[Cell, CampaignPlan]
-) -> None:
+def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(disk: Disk, designed: Designed) -> None:
     # The last as a kill leaves it, in the middle of making the rehearsal's own campaign.
     for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
         campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
@@ -201,15 +206,13 @@ def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(
         with pytest.raises(HilError) as raised:
             campaign.rehearse()
         assert disk.do_wrong()
-        require_told(raised.value, campaign.folder.root)
+        require_error(raised.value, campaign.folder.root)
         (campaign.folder.rehearsed / "plain" / "manifest.json").unlink(missing_ok=number == 2)
         assert Campaign.open(campaign.folder.root).rehearse().passed
 
 
 @pytest.mark.slow
-def test_many_refusals_cost_the_motion_and_no_more(
-    disk: Disk, designed: tuple[Cell, CampaignPlan]
-) -> None:
+def test_many_refusals_cost_the_motion_and_no_more(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(100, 140)) > 20
 
 
@@ -218,7 +221,7 @@ REFUSED = [
     for operation in (SYNC, RENAME)
     for error in sorted(REFUSALS)
 ]
-TOLD = r"cannot be written \(.+\).*nothing there was changed: make room"
+REFUSAL = r"cannot be written \(.+\).*nothing there was changed: make room"
 
 
 def names(folder: Path) -> list[str]:
@@ -235,7 +238,7 @@ class TestStudy:
         folder, settings = StudyFolder(disk.root / tmp_path.name), study_settings(quick=True)
         folder.root.mkdir()
         disk.do_wrong(rule)
-        with pytest.raises(OutputError, match=rf"study\.json {TOLD}"):
+        with pytest.raises(OutputError, match=rf"study\.json {REFUSAL}"):
             folder.begin(settings)
         assert disk.do_wrong()
         assert names(folder.root) == []
@@ -248,7 +251,7 @@ class TestStudy:
     ) -> None:
         path, record = disk.root / tmp_path.name / "a.json", Record(inputs="these archives")
         disk.do_wrong(rule)
-        with pytest.raises(OutputError, match=rf"a\.json {TOLD}"):
+        with pytest.raises(OutputError, match=rf"a\.json {REFUSAL}"):
             write_record(path, record)
         disk.do_wrong()
         assert names(path.parent) == []

@@ -1,0 +1,246 @@
+"""Disks to be put under a campaign that are slow, hang or refuse on demand.
+
+Through FUSE, or planted under Python's own functions. Beside the folder lie a file of the rules in
+force and one of what they have struck, so that whoever writes below may be another process.
+"""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import fnmatch
+import importlib.util
+import io
+import json
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import pytest
+
+from hil.files import write_atomically
+
+MOUNT_TIMEOUT = 20.0
+RULES, STRUCK = "rules.json", "struck.txt"
+CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
+CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # operations on which a disk may fail or hang
+REFUSALS: Final = {"EIO": errno.EIO, "EDQUOT": errno.EDQUOT, "ENOSPC": errno.ENOSPC}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One thing that goes wrong."""
+
+    operations: Sequence[str] = CHANGES  # on which of `CHANGES`
+    names: str = "*"  # pattern of the names of files it is about
+    after: int = 0  # how many matching operations pass before it begins
+    times: int = 0  # on how many it then acts; 0: on all
+    error: str = ""  # name of the error, "" for none
+    delay: float = 0.0  # s that each of them takes longer
+    hang: float = 0.0  # s, counted from the first of them, until which none of them ends
+
+
+class Disk:
+    """A folder on which things go wrong."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self._count = root, 0
+
+    def do_wrong(self, *rules: Rule) -> list[str]:
+        """Put these rules in force, none: be well; what those before have struck."""
+        log = self.root.parent / STRUCK
+        struck = log.read_text().splitlines() if log.exists() else []
+        log.unlink(missing_ok=True)
+        self._count += 1  # the same rules again begin anew
+        text = json.dumps([self._count, *map(asdict, rules)])
+        write_atomically(self.root.parent / RULES, text)
+        return struck
+
+
+class Faults:
+    """The rules of a disk in a process that writes to it; any thread may ask."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self._folder = root, root.parent
+        self._lock, self._text = threading.Lock(), ""
+        self._rules: list[Rule] = []
+        self._seen: dict[int, int] = {}
+        self._until: dict[int, float] = {}
+
+    def meet(self, operation: str, path: str) -> None:
+        """Be late, or raise OSError, if a rule says so."""
+        with self._lock:
+            self._read()
+            delay, error = 0.0, 0
+            for number, rule in enumerate(self._rules):
+                name = Path(path).name
+                if operation not in rule.operations or not fnmatch.fnmatch(name, rule.names):
+                    continue
+                count = self._seen[number] = self._seen.get(number, 0) + 1
+                if count <= rule.after or (rule.times and count > rule.after + rule.times):
+                    continue
+                until = self._until.setdefault(number, time.monotonic() + rule.hang)
+                delay = max(delay, rule.delay, until - time.monotonic())
+                error = error or REFUSALS.get(rule.error, 0)
+                with (self._folder / STRUCK).open("a") as log:
+                    log.write(f"{operation} {name}\n")
+        if delay > 0.0:
+            time.sleep(delay)
+        if error:
+            raise OSError(error, os.strerror(error), path)
+
+    def meet_at(self, operation: str, where: object) -> None:
+        """The same of a path or an open file, if it is on this disk."""
+        path = _path(where)
+        if path is not None and path.is_relative_to(self.root):
+            self.meet(operation, str(path))
+
+    def _read(self) -> None:
+        file = self._folder / RULES
+        text = file.read_text() if file.exists() else "[0]"
+        if text != self._text:
+            self._text, self._seen, self._until = text, {}, {}
+            self._rules = [Rule(**one) for one in json.loads(text)[1:]]
+
+
+@contextmanager
+def fuse_disk(folder: Path) -> Iterator[Disk]:
+    """One behind a process of its own, seen by every process of this computer; or skip the test."""
+    if importlib.util.find_spec("mfusepy") is None:
+        pytest.skip("mfusepy (extra `fuse`) is not installed")
+    if not os.access("/dev/fuse", os.R_OK | os.W_OK):
+        pytest.skip("/dev/fuse cannot be opened")
+    behind, root = folder / "behind", folder / "mounted"
+    behind.mkdir()
+    root.mkdir()
+    command = [sys.executable, "-m", "tests.disk.passthrough", str(behind), str(root)]
+    with tempfile.TemporaryFile() as words:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words)
+        assert process.stdin is not None
+        try:
+            deadline = time.monotonic() + MOUNT_TIMEOUT
+            while not root.is_mount():
+                if process.poll() is not None or time.monotonic() > deadline:
+                    words.seek(0)
+                    said = words.read().decode(errors="replace").strip().splitlines()
+                    pytest.skip(f"cannot be mounted: {said[-1] if said else 'no word'}")
+                time.sleep(0.02)
+            yield Disk(root)
+        finally:
+            with suppress(OSError):
+                process.stdin.close()
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                subprocess.run(["umount", "--lazy", str(root)], check=False, capture_output=True)
+
+
+@contextmanager
+def planted_disk(folder: Path) -> Iterator[Disk]:
+    """One under the functions of this process, where nothing can be mounted."""
+    root = (folder / "planted").resolve()
+    root.mkdir()
+    with plant(Faults(root)):
+        yield Disk(root)
+
+
+@contextmanager
+def processes_disk(folder: Path) -> Iterator[Disk]:
+    """One under the functions of every process that is started while this is open."""
+    root, code = (folder / "planted").resolve(), folder / "code"
+    root.mkdir()
+    code.mkdir()
+    (code / "sitecustomize.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(Path(__file__).parents[2])!r})\n"
+        "from pathlib import Path\nfrom tests.disk.disks import Faults, plant\n"
+        f"undo = plant(Faults(Path({str(root)!r})))\n"
+    )
+    path = os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])
+    # The product hands on to its processes what this one can import.
+    with patch.dict(os.environ, PYTHONPATH=path), patch.object(sys, "path", [str(code), *sys.path]):
+        yield Disk(root)
+
+
+def _path(where: object) -> Path | None:
+    if isinstance(where, int):
+        with suppress(OSError):
+            return Path(f"/proc/self/fd/{where}").readlink()
+        return None
+    return Path.cwd() / os.fsdecode(where)  # type: ignore[arg-type]
+
+
+def plant(faults: Faults) -> ExitStack:
+    """Put a disk under the functions of `os` that write, create, flush and rename, and `open`."""
+
+    def met(
+        name: str, operation: str, which: int = 0, when: Callable[..., bool] = lambda *_: True
+    ) -> tuple[str, Callable[..., Any]]:
+        true = getattr(os, name)
+
+        def function(*arguments: Any, **named: Any) -> Any:
+            if when(*arguments):
+                faults.meet_at(operation, arguments[which])
+            return true(*arguments, **named)
+
+        return name, function
+
+    undo = ExitStack()
+    for name, function in (
+        met("write", WRITE),
+        met("fsync", SYNC, when=_is_file),
+        met("fdatasync", SYNC, when=_is_file),
+        met("rename", RENAME, which=1),
+        met("replace", RENAME, which=1),
+        met("open", CREATE, when=lambda _path, flags, *_: bool(flags & os.O_CREAT)),
+    ):
+        undo.enter_context(patch.object(os, name, function))
+    for module in (io, builtins):  # the first is what `Path.open` calls
+        undo.enter_context(patch.object(module, "open", _opening(faults, io.open)))
+    return undo
+
+
+def _is_file(descriptor: int) -> bool:
+    """Not a folder: whose names are flushed where its file system can do that, and else not."""
+    return stat.S_ISREG(os.fstat(descriptor).st_mode)
+
+
+class _Raw(io.FileIO):
+    """A file that asks the disk before it writes: `FileIO` does not call `os.write`."""
+
+    def __init__(self, faults: Faults, path: Path, mode: str) -> None:
+        self._faults, self._path = faults, path
+        super().__init__(path, mode)
+
+    def write(self, data: Any, /) -> int | None:  # type: ignore[override]  # as FileIO itself
+        self._faults.meet(WRITE, str(self._path))
+        return super().write(data)
+
+
+def _opening(faults: Faults, true: Callable[..., Any]) -> Callable[..., Any]:
+    """As `open`: a file that is made on this disk, or written to, asks it before."""
+
+    def function(file: Any, mode: str = "r", *arguments: Any, **named: Any) -> Any:
+        path = None if isinstance(file, int) else _path(file)
+        if path is None or not set(mode) & set("wax") or not path.is_relative_to(faults.root):
+            return true(file, mode, *arguments, **named)
+        faults.meet(CREATE, str(path))
+        raw = _Raw(faults, path, mode.replace("b", "").replace("t", ""))
+        buffered = io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+        if "b" in mode:
+            return buffered
+        words = {key: named[key] for key in ("encoding", "errors", "newline") if key in named}
+        return io.TextIOWrapper(buffered, **words)
+
+    return function
