@@ -32,7 +32,6 @@ SAFETY: Final = (
 LONG: Final = (
     "benchmarks",
     "docs/test_commands.py",
-    "docs/test_examples.py",
     "docs/test_typed_pages.py",
     "fuzz",
     "hil/test_any_robot.py",

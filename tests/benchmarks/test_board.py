@@ -3,44 +3,70 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from benchmarks import board
+from benchmarks import board, degradations, plain_fit
+from benchmarks.degradations import DEGRADATIONS, EXPECTED, FITTED_ONLY
 from benchmarks.joint_log import JointLog
+from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
-from tests.benchmarks.two_joint_log import two_joint_log
+from hil.importers import Robot
+
+URDF = Path(__file__).resolve().parents[2] / "examples" / "two_joints" / "robot.urdf"
+Logs, Archives = dict[str, JointLog], dict[str, Path]
+COULOMB, VISCOUS, ROTOR = np.array([4.0, 2.0]), np.array([2.0, 1.0]), np.array([0.5, 0.2])
+
+
+def two_joint_log(seed: int, *, noise: float = 1.0, seconds: float = 10.0) -> JointLog:
+    """A motion of sines with friction and rotors, at 100 Hz."""
+    random = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 0.01)
+    rate = 2.0 * np.pi * random.uniform(0.1, 0.6, (3, 2))
+    angle = rate * time[:, None, None] + random.uniform(0.0, 2.0 * np.pi, (3, 2))
+    size = 0.4
+    q = size * np.sin(angle).sum(axis=1)
+    qd = size * (rate * np.cos(angle)).sum(axis=1)
+    qdd = -size * (rate**2 * np.sin(angle)).sum(axis=1)
+    robot = pin.buildModelFromUrdf(str(URDF))
+    data = robot.createData()
+    torque = np.array([pin.rnea(robot, data, *row) for row in zip(q, qd, qdd, strict=True)])
+    torque += COULOMB * np.sign(qd) + VISCOUS * qd + ROTOR * qdd
+    return JointLog(
+        robot=Robot.from_urdf(URDF),
+        time=time,
+        position=q + noise * 1e-5 * random.standard_normal(q.shape),
+        velocity=qd,
+        torque=torque + noise * 0.3 * random.standard_normal(q.shape),
+        rated_payload=5.0,
+    )
 
 
 @pytest.fixture(scope="module")
-def logs() -> dict[str, JointLog]:
+def logs() -> Logs:
     return {name: two_joint_log(seed) for name, seed in (("one", 1), ("other", 2))}
 
 
 @pytest.fixture(scope="module")
-def archives(
-    logs: dict[str, JointLog], tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def archives(logs: Logs, tmp_path_factory: pytest.TempPathFactory) -> Archives:
     folder = tmp_path_factory.mktemp("archives")
     return {name: log.imported(folder / f"{name}.mcap") for name, log in logs.items()}
 
 
-class TestLog:
-    def test_a_log_comes_back_from_its_archive(
-        self, logs: dict[str, JointLog], archives: dict[str, Path]
-    ) -> None:
+class TestSplit:
+    def test_a_log_comes_back_from_its_archive(self, logs: Logs, archives: Archives) -> None:
         written, read = logs["one"], JointLog.read(archives["one"], 5.0)
         assert read.time == pytest.approx(written.time, abs=1e-9)
         for name in ("position", "velocity", "torque"):
             assert np.array_equal(getattr(read, name), getattr(written, name))
 
-
-class TestSplit:
     @pytest.mark.parametrize(("part", "fitted"), [("first", (0, 700)), ("last", (300, 1000))])
     def test_a_part_is_fitted_and_the_rest_predicted(
-        self, logs: dict[str, JointLog], part: str, fitted: tuple[int, int]
+        self, logs: Logs, part: str, fitted: tuple[int, int]
     ) -> None:
         parts = board.cut(Split(fitted="one", part=part), logs)
         whole = logs["one"].time
@@ -50,7 +76,7 @@ class TestSplit:
         )
 
     def test_the_split_of_an_archive_is_that_of_its_log(
-        self, logs: dict[str, JointLog], archives: dict[str, Path], tmp_path: Path
+        self, logs: Logs, archives: Archives, tmp_path: Path
     ) -> None:
         """`Options.split` on the archive, and two files cut beforehand, are near each other.
 
@@ -67,9 +93,7 @@ class TestRow:
     @pytest.mark.parametrize(
         "split", [Split(fitted="one", predicted="other"), Split(fitted="one", part="all")], ids=str
     )
-    def test_both_are_near_the_noise(
-        self, split: Split, logs: dict[str, JointLog], archives: dict[str, Path]
-    ) -> None:
+    def test_both_are_near_the_noise(self, split: Split, logs: Logs, archives: Archives) -> None:
         found = board.row("arm", split, archives, logs)
         torque = board.cut(split, logs).predicted.torque
         floor = 0.3 * np.sqrt(torque.size) / np.linalg.norm(torque)
@@ -82,7 +106,7 @@ class TestRow:
         assert (found["inside"] is None) == split.in_sample
         assert found["inside"] is None or found["inside"] > 0.9
 
-    def test_the_line_of_json(self, logs: dict[str, JointLog], archives: dict[str, Path]) -> None:
+    def test_the_line_of_json(self, logs: Logs, archives: Archives) -> None:
         split = Split(fitted="one", predicted="other")
         rows = [board.row("arm", split, archives, logs)] * 2
         found = json.loads(json.dumps(board.summary(rows, [])))
@@ -93,10 +117,8 @@ class TestRow:
         }  # fmt: skip
         assert found["worst_ratio"] == pytest.approx(found["mean_ratio"])
 
-
-class TestDegradedRow:
-    def test_its_fields(
-        self, logs: dict[str, JointLog], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    def test_the_fields_of_a_degraded_one(
+        self, logs: Logs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         some = {name: board.DEGRADATIONS[name] for name in ("lost rows", "payload in half")}
         monkeypatch.setattr(board, "DEGRADATIONS", some)
@@ -109,14 +131,12 @@ class TestDegradedRow:
         assert lost["right"]
         assert board.summary([], [])["rows"] == []
 
-    def test_a_refused_recording_is_wrong(self, logs: dict[str, JointLog], tmp_path: Path) -> None:
+    def test_a_refused_recording_is_wrong(self, logs: Logs, tmp_path: Path) -> None:
         whole = board.identified_parts(board.Parts(logs["one"], logs["other"]), tmp_path)
         found = board.degraded_row("arm", "lost rows", whole, "refused: the clock repeats")
         assert (found["hil"], found["ratio"], found["right"]) == (None, None, False)
         assert found["words"] == ["refused: the clock repeats"]
 
-
-class TestRight:
     @pytest.mark.parametrize(
         ("case", "ratio", "named", "right"),
         [
@@ -151,3 +171,142 @@ class TestConfiguration:
     def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(SystemExit, match="name the folder of all with --data"):
             board.main(["--data", str(tmp_path), "--only", "kr300"])
+
+
+@pytest.fixture(scope="module")
+def log(logs: Logs) -> JointLog:
+    return logs["one"]
+
+
+@pytest.fixture(scope="module")
+def three(log: JointLog) -> JointLog:
+    """With the torque of a third joint."""
+    return replace(log, torque=np.column_stack([log.torque, log.torque[:, 0]]))
+
+
+@pytest.fixture(scope="module")
+def clean() -> JointLog:
+    return two_joint_log(1, noise=0.0)
+
+
+class TestDegradations:
+    """Each copy of a log has the one fault that it is named after."""
+
+    def test_every_fault_has_an_expected_cause(self) -> None:
+        assert DEGRADATIONS.keys() == EXPECTED.keys() >= FITTED_ONLY
+
+    def test_stamps_jitter_in_order(self, log: JointLog) -> None:
+        late = degradations.jittered_stamps(log).time - log.time
+        assert late.std() == pytest.approx(0.15 * 0.01, rel=0.1)
+        assert np.diff(log.time + late).min() > 0.0
+
+    def test_two_percent_of_the_rows_are_lost(self, log: JointLog) -> None:
+        fewer = degradations.lost_rows(log)
+        assert fewer.n_rows / log.n_rows == pytest.approx(0.98, abs=0.01)
+        assert np.isin(fewer.time, log.time).all()
+
+    def test_a_slower_log_has_the_values_of_its_time(self, clean: JointLog) -> None:
+        slow = degradations.resampled(clean)
+        assert np.diff(slow.time) == pytest.approx(1.0 / 94.0)
+        expected = np.interp(slow.time, clean.time, clean.position[:, 0])
+        assert slow.position[:, 0] == pytest.approx(expected)
+
+    def test_positions_have_twelve_bits(self, log: JointLog) -> None:
+        coarse = degradations.quantised_positions(log)
+        step = np.ptp(log.position, axis=0) / 4096
+        assert np.abs(coarse.position - log.position).max(axis=0) == pytest.approx(
+            step / 2, rel=0.1
+        )
+        assert all(len(np.unique(column)) <= 4098 for column in coarse.position.T)
+
+    def test_the_torque_comes_ten_milliseconds_late(self, log: JointLog) -> None:
+        late = degradations.delayed_torque(log)
+        assert late.torque[1:] == pytest.approx(log.torque[:-1])
+
+    def test_filters_leave_what_is_slow(self, clean: JointLog) -> None:
+        quick = np.sin(2.0 * np.pi * 30.0 * clean.time)[:, None]
+        noisy = replace(clean, torque=clean.torque + quick, position=clean.position + quick)
+        inner = slice(100, -100)
+        torque = degradations.filtered_torque(noisy).torque - clean.torque
+        position = degradations.filtered_positions(noisy).position - clean.position
+        assert np.abs(position[inner]).max() < 0.05
+        assert np.abs(torque[inner]).mean() < 0.5  # Coulomb friction is not slow
+
+    def test_two_neighbouring_torques_are_exchanged(self, three: JointLog) -> None:
+        mixed = degradations.exchanged_joints(three).torque
+        assert np.array_equal(mixed, three.torque[:, [0, 2, 1]])
+
+    def test_one_torque_is_turned(self, three: JointLog) -> None:
+        assert np.array_equal(degradations.turned_sign(three).torque, three.torque * [1, 1, -1])
+
+    def test_the_payload_is_there_in_the_second_half_only(self, clean: JointLog) -> None:
+        """Its weight, at rest and with the arm stretched out level, on the elbow."""
+        still = replace(
+            clean, position=np.zeros_like(clean.position), velocity=np.zeros_like(clean.position)
+        )
+        added = degradations.payload_in_second_half(still).torque - still.torque
+        assert not added[:500].any()
+        # 0.5 kg straight above the elbow, which is 0.45 m of level way from the shoulder.
+        assert added[500:, 1] == pytest.approx(0.0, abs=1e-9)
+        assert np.abs(added[500:, 0]) == pytest.approx(0.5 * 9.81 * 0.45)
+
+
+ROBOT = plain_fit.robot_from_urdf(URDF.read_text())
+
+
+def planted() -> np.ndarray:
+    """Parameters of the two links, their rotors and their friction."""
+    links = [ROBOT.inertias[joint].toDynamicParameters() for joint in (1, 2)]
+    return np.concatenate([*links, ROTOR, COULOMB, VISCOUS, np.zeros(2)])
+
+
+def of_the_regressor(cutoff: float, seed: int) -> Measured:
+    """A log whose torque is that of the planted parameters after a filter of this cut-off."""
+    measured = two_joint_log(seed, noise=0.0).measured._replace(velocity=None)
+    rough = 1e-4 * np.random.default_rng(2).standard_normal(measured.position.shape)
+    measured = measured._replace(position=measured.position + rough)
+    torque = plain_fit.regressor(ROBOT, measured, cutoff) @ planted()
+    return measured._replace(torque=torque)
+
+
+class TestPlainFit:
+    @pytest.mark.parametrize("cutoff", [5.0, 12.0])
+    def test_noise_free_data_are_predicted_exactly(self, cutoff: float) -> None:
+        """A torque that the model can make is predicted to rounding, by the cut-off it has."""
+        one, other = (of_the_regressor(cutoff, seed) for seed in (1, 2))
+        fitted = plain_fit.fit(ROBOT, one)
+        assert fitted.cutoff == cutoff
+        for measured in (one, other):
+            predicted = fitted.predicted_torque(measured)
+            assert plain_fit.relative_error(measured.torque, predicted) < 1e-8
+
+    def test_another_motion_of_the_simulated_arm_is_predicted(self) -> None:
+        """Torques of recursive Newton-Euler, with what filter and differences leave of it."""
+        one, other = (two_joint_log(seed, noise=0.0).measured for seed in (1, 2))
+        predicted = plain_fit.fit(ROBOT, one).predicted_torque(other)
+        assert plain_fit.relative_error(other.torque, predicted) < 0.01
+
+    def test_the_torque_to_be_predicted_is_not_looked_at(self) -> None:
+        one, other = (two_joint_log(seed).measured for seed in (1, 2))
+        fitted = plain_fit.fit(ROBOT, one)
+        blind = fitted.predicted_torque(other._replace(torque=np.full_like(other.torque, np.nan)))
+        assert np.array_equal(blind, fitted.predicted_torque(other))
+
+    def test_each_joint_is_weighted_by_its_own_residual(self) -> None:
+        """A hundred times the noise on one joint hardly moves what the other joint says."""
+        random = np.random.default_rng(3)
+        measured = two_joint_log(1, noise=0.0).measured
+        table = plain_fit.regressor(ROBOT, measured, 20.0)
+        noise = random.standard_normal(measured.torque.shape) * [10.0, 0.1]
+        found = plain_fit.solve(table, table @ planted() + noise)
+        left = (table @ (found - planted())).std(axis=0)
+        assert left[1] < 0.03 < left[0]
+
+    def test_gravity_and_locked_joints_are_those_that_are_named(self) -> None:
+        locked = plain_fit.robot_from_urdf(URDF.read_text(), (0.0, 9.81, 0.0), {"elbow": 0.5})
+        assert locked.nv == 1
+        whole = pin.buildModelFromUrdf(str(URDF))
+        whole.gravity.linear = np.array([0.0, 9.81, 0.0])
+        alone = pin.rnea(locked, locked.createData(), np.ones(1), np.zeros(1), np.zeros(1))
+        both = pin.rnea(whole, whole.createData(), np.array([1.0, 0.5]), np.zeros(2), np.zeros(2))
+        assert alone[0] == pytest.approx(both[0])

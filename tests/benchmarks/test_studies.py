@@ -1,23 +1,63 @@
-"""Studies of many seeds: coverage of intervals, excitations, payloads."""
+"""Studies of many seeds (coverage of intervals, excitations, payloads), and real recordings."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from numpy.typing import NDArray
 
 from benchmarks import excitation_study
 from benchmarks.identification_study import Covered, coverage, recorded, study
 from benchmarks.payload import arm_model, load_of, runs_of
 from benchmarks.payload import coverage as payload_coverage
+from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
 from identification.estimators.least_squares import estimate
 from identification.estimators.payload import find_difference
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.signals.samples import prepare
-from tests.benchmarks import by_pinocchio
+from identification.signals.samples import Samples, prepare
+
+Array = NDArray[np.float64]
+
+
+def pinocchios_torque(urdf: str, samples: Samples, weights: Array) -> Array:
+    """Torque of the usable rows that the fit with these joint weights (n,) predicts.
+
+    It shares nothing with the package: pinocchio's regressor with rotors, Coulomb, viscous and
+    offset, and numpy's lstsq. The columns are many more than the motion determines; the solution is
+    that of least norm, which the predicted torque does not depend on.
+    """
+    robot, usable = pin.buildModelFromXML(urdf), samples.usable
+    data = robot.createData()
+    q, qd, qdd = samples.motion[1:4]
+    n, joint = q.shape[1], np.arange(q.shape[1])
+    table = np.zeros((*q.shape, 14 * n))
+    for k, row in enumerate(zip(q, qd, qdd, strict=True)):
+        table[k, :, : 10 * n] = pin.computeJointTorqueRegressor(robot, data, *row)
+    for block, columns in enumerate((qdd, np.sign(qd), qd, np.ones_like(qd)), 10):
+        table[:, joint, block * n + joint] = columns
+    table = table[usable]
+    length = np.linalg.norm(table, axis=0)
+    # What only rounding has put there must not be scaled up to a column.
+    acting = length > 1e-10 * length.max()
+    table = table[:, acting] / length[acting]
+    scale = np.broadcast_to(np.sqrt(weights), usable.shape)[usable]
+    found = np.linalg.lstsq(scale[:, None] * table, scale * samples.torque[usable], rcond=1e-10)
+    return np.asarray(table @ found[0])
+
+
+def require_same_fit(model: RobotModel, urdf: str, samples: Samples, weights: Array) -> None:
+    """Least squares is what numpy makes of pinocchio's regressor."""
+    expected = pinocchios_torque(urdf, samples, weights)
+    values = estimate(model, Factor.of(model, samples), weights).values
+    ours = model.torque(values, *samples.motion[1:])[samples.usable]
+    assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
+
 
 P, SEEDS = 58, 400
 NAMES = [f"p{k}" for k in range(P)]
@@ -47,7 +87,7 @@ class TestCoverage:
         assert worst["reported_over_actual"] == pytest.approx(1.0, abs=0.15)
 
 
-def test_least_squares_is_what_numpy_makes_of_pinocchios_regressor() -> None:
+def test_the_fit_of_a_simulated_recording_is_pinocchios() -> None:
     sources, urdf = recorded(7), study()[0].urdf
     assert sources.noise_variance is not None and sources.torque_variance is not None
     law = FrictionLaw(third=None, offset=True, standstill=0.1)
@@ -55,10 +95,7 @@ def test_least_squares_is_what_numpy_makes_of_pinocchios_regressor() -> None:
     (one,) = sources.training
     samples = prepare(one.recording, model, noise_variance=sources.noise_variance)
     weights = 1.0 / sources.torque_variance
-    expected = by_pinocchio.fitted_torque(urdf, samples, weights)
-    values = estimate(model, Factor.of(model, samples), weights).values
-    ours = model.torque(values, *samples.motion[1:])[samples.usable]
-    assert np.abs(ours - expected).max() < 1e-6 * np.sqrt(np.mean(expected**2))
+    require_same_fit(model, urdf, samples, weights)
 
 
 def test_an_unknown_case_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,3 +135,49 @@ class TestPayload:
         model, load = arm_model(), load_of(3)
         runs = runs_of(3, model, loads=(None, load, load, None))
         assert find_difference(model, runs) is None
+
+
+@pytest.fixture(scope="module")
+def ur10(shared_data: Path) -> Case:
+    return load_case(shared_data / "ur10_unisa")
+
+
+@pytest.fixture(scope="module")
+def tx40(shared_data: Path) -> Case:
+    return load_case(shared_data / "tx40")
+
+
+def wls(one: Case, model: RobotModel, kind: str) -> float:
+    fitted, predicted, _ = one.prepared(model, splits_of(one.recording)[kind])
+    return error(model, ESTIMATORS["wls"](model, fitted), predicted)
+
+
+def test_ur10_is_predicted_as_well_as_it_can_be(ur10: Case) -> None:
+    model = list(ur10.models().values())[-1]
+    assert wls(ur10, model, "held_out") <= 0.068
+    assert wls(ur10, model, "in_sample") <= 0.0515
+
+
+def test_the_parts_of_a_split_do_not_overlap(ur10: Case) -> None:
+    splits = splits_of(ur10.recording)
+    for kind, share in (("held_out", 0.7), ("held_out_first", 0.7)):
+        fitted, predicted = splits[kind]
+        assert not np.isin(fitted.time, predicted.time).any()
+        assert fitted.n_samples + predicted.n_samples == ur10.recording.n_samples
+        assert fitted.n_samples / ur10.recording.n_samples == pytest.approx(share, abs=1e-3)
+
+
+def test_the_coupling_of_the_tx40_explains_its_wrist(tx40: Case) -> None:
+    models = tx40.models()
+    with_it = wls(tx40, models["quadratic_friction, with coupling"], "in_sample")
+    without = wls(tx40, models["quadratic_friction, without coupling"], "in_sample")
+    assert with_it <= 0.109
+    assert without > 1.2 * with_it
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_fit_of_a_real_recording_is_pinocchios(ur10: Case, weighted: bool) -> None:
+    model = RobotModel.from_urdf(ur10.urdf, friction=FrictionLaw(third=None, offset=True))
+    samples = prepare(ur10.recording, model)
+    weights = np.array([3.0, 0.5, 2.0, 10.0, 20.0, 7.0]) if weighted else np.ones(6)
+    require_same_fit(model, ur10.urdf, samples, weights)

@@ -43,7 +43,7 @@ OTHER_PROGRAMS = {
     ".": "is the shell's own",
     "cd": "is the shell's own",
     "cp": "is the system's own",
-    "python": "stands for programs that are looked up; tests/docs/test_examples.py runs examples",
+    "python": "is looked up; tests/docs/test_typed_pages.py runs examples",
 }  # Programs that are not run, and why
 
 NOT_TYPED = {
@@ -63,7 +63,7 @@ NOT_TYPED = {
     "hil gains empty.mcap": "typed in bring-your-own-robot.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
     "hil run runs/weigh --payload": "typed in payload.md",
-    "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_real_data.py",
+    "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_studies.py",
     "hil reidentify /data": "needs other people's archives",
     "hil reidentify s3:": "network",
     "hil reidentify https:": "network",
