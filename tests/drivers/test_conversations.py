@@ -13,9 +13,9 @@ from drivers import Guard, State
 from drivers.state_machine import Machine
 from drivers.states import TRANSITIONS, Input
 from tests.drivers.sources import Breaks, ScriptedMotion, smooth
-from tests.fuzz.conversation import Conversation
 from tests.fuzz.draw import Draw
 from tests.fuzz.targets import session
+from tests.fuzz.targets.session import Conversation
 
 
 def drawn(seed: int) -> bytes:

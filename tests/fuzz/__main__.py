@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import signal
 import sys
 import threading
@@ -27,11 +26,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hil.progress import Reporter, reporter
+from hil.progress import Reporter, Task, reporter
 from tests.arguments import at_least_one, time_above_0
-from tests.fuzz import journal, keeping, targets
-from tests.fuzz.findings import known
-from tests.fuzz.lives import Places, live, shorten
+from tests.fuzz import lives, targets
 from tests.journal import JournalError
 
 PIECE = 120.0  # s: what a kill loses of the figures, never of the inputs
@@ -45,60 +42,56 @@ def main(arguments: list[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("target", choices=(*targets.NAMES, "all"))
-    parser.add_argument(
-        "--minutes", type=time_above_0, default=1.0, help="of each target, in all pieces"
-    )
-    parser.add_argument(
-        "--stop-after", type=time_above_0, metavar="MIN", help="end this piece after that"
-    )
-    parser.add_argument("--jobs", type=at_least_one, default=1, help="targets at a time")
-    parser.add_argument("--journal", type=Path, required=True, help="JSON lines, added to")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    parser.add_argument("--keep", action="store_true", help="make the repository's corpora anew")
+    option = parser.add_argument
+    option("target", choices=(*targets.NAMES, "all"))
+    option("--minutes", type=time_above_0, default=1.0, help="of each target, in all pieces")
+    option("--stop-after", type=time_above_0, metavar="MIN", help="end this piece after that")
+    option("--jobs", type=at_least_one, default=1, help="targets at a time")
+    option("--journal", type=Path, required=True, help="JSON lines, added to")
+    option("--json", action="store_true", help="print the figures as JSON")
+    option("--keep", action="store_true", help="make the repository's corpora anew")
     given = parser.parse_args(arguments)
     names = targets.NAMES if given.target == "all" else (given.target,)
-    teller = reporter(quiet=given.json)
+    progress = reporter(quiet=given.json)
     if given.keep:
         for name in names:
-            teller.say(f"{name}: {keeping.keep(name, given.journal)}")
+            progress.say(f"{name}: {lives.keep(name, given.journal)}")
         return 0
     until = time.monotonic() + 60.0 * (given.stop_after or 1e6)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     try:
-        Run(names, 60.0 * given.minutes, until, given.journal, teller).work(given.jobs)
+        Run(names, 60.0 * given.minutes, until, given.journal).work(given.jobs, progress)
     except KeyboardInterrupt:
-        teller.say("stopped; the same command goes on from here")
+        progress.say("stopped; the same command goes on from here")
     except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     report = reported(names, given.journal)
-    sys.stdout.write(json.dumps(report) + "\n" if given.json else told(report))
+    sys.stdout.write(json.dumps(report) + "\n" if given.json else table(report))
     return int(bool(report["findings"] or report["not_reproduced"]))
 
 
 class Run:
     """Pieces of targets, the one that was fuzzed least before the others."""
 
-    def __init__(
-        self, names: tuple[str, ...], wanted: float, until: float, path: Path, teller: Reporter
-    ) -> None:
-        self._wanted, self._until, self._path, self._teller = wanted, until, path, teller
-        found = journal.pieces(path)
-        self._done = {name: journal.seconds_of(found, name) for name in names}
+    def __init__(self, names: tuple[str, ...], wanted: float, until: float, path: Path) -> None:
+        self._wanted, self._until, self._path = wanted, until, path
+        self._done = dict.fromkeys(names, 0.0)
+        for piece in lives.pieces(path):
+            if piece.target in self._done:
+                self._done[piece.target] += piece.seconds
         self._busy: set[str] = set()
-        self._lock = threading.Lock()
-        self._ended = threading.Event()
+        self._lock, self._ended = threading.Lock(), threading.Event()
         self._failed: list[BaseException] = []
 
-    def work(self, jobs: int) -> None:
+    def work(self, jobs: int, progress: Reporter) -> None:
         """Work until all have their time.
 
         Raises:
             RuntimeError: a target cannot be fuzzed at all.
         """
         left = sum(max(0.0, self._wanted - done) for done in self._done.values())
-        with self._teller.task("fuzzing", left) as task:
+        with progress.task("fuzzing", left) as task:
             workers = [threading.Thread(target=self._worker, args=(task,)) for _ in range(jobs)]
             try:
                 for worker in workers:
@@ -113,13 +106,18 @@ class Run:
         if self._failed:
             raise self._failed[0]
 
-    def _worker(self, task: Any) -> None:
+    def _worker(self, task: Task) -> None:
         try:
             while (given := self._next()) is not None:
                 name, seconds = given
-                piece = self._piece(name, seconds)
+                target = targets.load(name)
+                with lives.beside(self._path, name) as places:
+                    if not any(places.corpus.iterdir()):
+                        lives.plant(places.corpus, target.seeds())
+                    piece = lives.live(name, seconds, target.most, places, self._ended)
+                    lives.shorten(name, places, self._ended)
                 with self._lock:
-                    journal.append(self._path, piece)
+                    lives.append(self._path, piece)
                     self._done[name] += piece.seconds
                     self._busy.discard(name)
                     note = f"{name}: {piece.inputs} inputs, {piece.features} features"
@@ -140,26 +138,14 @@ class Run:
             self._busy.add(name)
             return name, min(left, PIECE)
 
-    def _piece(self, name: str, seconds: float) -> journal.Piece:
-        target = targets.load(name)
-        places = Places.beside(self._path, name)
-        try:
-            if not any(places.corpus.iterdir()):
-                keeping.plant(places.corpus, target.seeds())
-            piece = live(name, seconds, target.most, places, self._ended)
-            shorten(name, places, self._ended)
-        finally:
-            shutil.rmtree(places.scratch, ignore_errors=True)
-        return piece
-
 
 def reported(names: tuple[str, ...], path: Path) -> dict[str, Any]:
     """The figures of all pieces so far."""
-    totals = journal.summary(journal.pieces(path))
-    found = {
-        name: {**totals.get(name, {}), "findings": known(Path(f"{path}.files") / name / "findings")}
-        for name in names
-    }
+    totals = lives.summary(path)
+    found: dict[str, dict[str, Any]] = {}
+    for name in names:
+        findings = lives.known(Path(f"{path}.files") / name / "findings")
+        found[name] = {**totals.get(name, {}), "findings": findings}
     return {
         "inputs": sum(target.get("inputs", 0) for target in found.values()),
         "seconds": round(sum(target.get("seconds", 0.0) for target in found.values()), 1),
@@ -169,7 +155,7 @@ def reported(names: tuple[str, ...], path: Path) -> dict[str, Any]:
     }
 
 
-def told(report: dict[str, Any]) -> str:
+def table(report: dict[str, Any]) -> str:
     """The same for a person."""
     lines = [
         f"{'target':>10} {'inputs':>12} {'minutes':>8} {'edges':>7} {'features':>9} "

@@ -64,7 +64,7 @@ def _limit() -> None:
 def _fuzz(name: str, folder: Path, options: list[str]) -> int:
     import atheris
 
-    from tests.fuzz.findings import OURS, Findings, signature
+    from tests.fuzz.lives import OURS, Findings, signature
 
     with atheris.instrument_imports(include=[*OURS, "tomllib", "rosbags", "mcap"]):
         from tests.fuzz import targets
@@ -100,7 +100,7 @@ def _fuzz(name: str, folder: Path, options: list[str]) -> int:
 
 def _shorten(run: Callable[[bytes], object], folder: Path) -> None:
     """Take pieces out of an input, ever smaller ones, as long as the cause stays the same."""
-    from tests.fuzz.findings import INPUT, SHORTEST, signature
+    from tests.fuzz.lives import INPUT, SHORTEST, signature
 
     def cause(data: bytes) -> str:
         try:

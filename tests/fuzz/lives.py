@@ -1,7 +1,8 @@
-"""Lives of fuzzing processes: started, watched, and understood when they end."""
+"""Lives of fuzzing processes, what they found and reached, and what of it is worth keeping."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
@@ -11,14 +12,22 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
-from dataclasses import dataclass
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
-from tests.fuzz.findings import INPUT, ROOT, SHORTEST, Findings, named
-from tests.fuzz.journal import Piece
+from tests.fuzz import targets
+from tests.journal import Journal, entries
 
+ROOT = Path(__file__).resolve().parents[2]
 CORPORA = Path(__file__).parent / "corpora"
+OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
+INPUT, SHORTEST, STORY, COUNT = "input", "shortest", "traceback.txt", "count"
+MOST_FILES, MOST_BYTES, LARGEST = 40, 200_000, 20_000  # of a corpus in the repository
+_MERGES = 20  # inputs that may end the process that measures what inputs reach
 _PULSE = re.compile(
     r"^#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/\S+.*? rss: (\d+)Mb", re.MULTILINE
 )
@@ -31,56 +40,203 @@ _GRACE = 240.0  # s beyond the time that a process was given, for its start on a
 
 
 @dataclass(frozen=True)
+class Piece:
+    """One life of a fuzzing process, a line of the journal."""
+
+    target: str
+    seconds: float
+    inputs: int  # executed
+    edges: int  # covered at its end, as libFuzzer counts them
+    features: int  # likewise; an edge run through more often is another feature
+    corpus: int  # inputs at its end
+    memory: int  # resident at its end [MB]
+    ended: str = "whole"  # "stopped" by the user; or "crash", "timeout", "memory", "killed"
+    reproduced: bool = False  # whether what ended it early ends the target again by itself
+
+
+def append(path: Path, piece: Piece) -> None:
+    """Add a piece; it survives the death of this process and of the computer."""
+    with Journal(path) as journal:
+        journal.add(**asdict(piece))
+
+
+def pieces(path: Path) -> list[Piece]:
+    """All pieces of a journal.
+
+    Raises:
+        JournalError: it cannot be read, or a line is none.
+    """
+    return entries(path, lambda line: Piece(**line), "piece of fuzzing")
+
+
+def summary(path: Path) -> dict[str, dict[str, Any]]:
+    """Per target: inputs and seconds summed, coverage at its largest."""
+    totals: dict[str, dict[str, Any]] = {}
+    for piece in pieces(path):
+        total = totals.setdefault(
+            piece.target,
+            {"pieces": 0, "seconds": 0.0, "inputs": 0, "edges": 0, "features": 0, "corpus": 0,
+             "memory": 0, "ended_early": 0, "not_reproduced": 0},
+        )  # fmt: skip
+        total["pieces"] += 1
+        total["seconds"] = round(total["seconds"] + piece.seconds, 1)
+        total["inputs"] += piece.inputs
+        for name in ("edges", "features", "corpus", "memory"):
+            total[name] = max(total[name], getattr(piece, name))
+        early = piece.ended not in ("whole", "stopped")
+        total["ended_early"] += early
+        total["not_reproduced"] += early and not piece.reproduced
+    return totals
+
+
+# Findings: one folder per cause, with the input, its shortest form and the traceback
+
+
+def signature(error: BaseException) -> str:
+    """A name of the cause: the kind of error and the line of ours that it left last.
+
+    Of an error from too deep a recursion it is the first line, since the last is anywhere.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    places = _places([(one.filename, str(one.lineno)) for one in frames])
+    ours = [place for place in places if place.split("/")[0] in OURS] or places or ["nowhere"]
+    place = ours[0] if isinstance(error, RecursionError) else ours[-1]
+    return _named(type(error).__name__, place)
+
+
+def _named(kind: str, place: str) -> str:
+    return f"{kind}-{place.replace('/', '.')}".replace(":", "-")
+
+
+def _places(frames: list[tuple[str, str]]) -> list[str]:
+    """``file:line`` of those frames that are of this project."""
+    return [
+        f"{Path(name).relative_to(ROOT)}:{line}"
+        for name, line in frames
+        if Path(name).is_relative_to(ROOT) and ".venv" not in Path(name).parts
+    ]
+
+
+@dataclass
+class Findings:
+    """The findings of one target, below `folder`."""
+
+    folder: Path
+    new: list[str] = field(default_factory=list)  # causes met for the first time by this object
+    _counts: dict[str, int] = field(default_factory=dict)
+
+    def keep(self, name: str, data: bytes, story: str) -> bool:
+        """Keep an input that broke a law; True if its cause was not known.
+
+        How often a cause was met is on disk at 1, 2, 4, 8 ... and every thousand times.
+        """
+        place = self.folder / name
+        is_new = not place.exists()
+        if is_new:
+            place.mkdir(parents=True, exist_ok=True)
+            (place / INPUT).write_bytes(data)
+            (place / STORY).write_text(story, "utf-8", errors="backslashreplace")
+            self.new.append(name)
+        if name not in self._counts:
+            self._counts[name] = int(_text(place / COUNT) or 0)
+        self._counts[name] = count = self._counts[name] + 1
+        if count & (count - 1) == 0 or count % 1000 == 0:
+            (place / COUNT).write_text(str(count))
+        return is_new
+
+
+def known(folder: Path) -> dict[str, int]:
+    """Causes below a folder of findings and how often each was met at least."""
+    places = [place for place in sorted(folder.glob("*")) if (place / INPUT).exists()]
+    return {place.name: int(_text(place / COUNT) or 1) for place in places}
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
+# Processes
+
+
+@dataclass(frozen=True)
 class Places:
     """Where a target's inputs lie."""
 
-    corpus: Path  # all that was kept so far, outside of the repository
+    corpus: Path  # all inputs so far, outside of the repository
     findings: Path  # a folder per cause
-    scratch: Path  # for artefacts of libFuzzer and temporary files; lives in memory where it can
+    scratch: Path  # for artefacts of libFuzzer and temporary files; in memory where it can be
 
-    @classmethod
-    def beside(cls, journal: Path, target: str) -> Places:
-        """Those that belong to a journal, made if they are not there."""
-        own = Path(f"{journal}.files") / target
-        shm = Path("/dev/shm")
-        base = shm if shm.is_dir() and os.access(shm, os.W_OK) else None
-        places = cls(own / "corpus", own / "findings", Path(tempfile.mkdtemp("fuzz", dir=base)))
-        places.corpus.mkdir(parents=True, exist_ok=True)
-        places.findings.mkdir(parents=True, exist_ok=True)
-        return places
+
+@contextmanager
+def beside(journal: Path, target: str) -> Iterator[Places]:
+    """The places that belong to a journal, made if they are not there; the scratch goes again."""
+    own = Path(f"{journal}.files") / target
+    for name in ("corpus", "findings"):
+        (own / name).mkdir(parents=True, exist_ok=True)
+    base = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    scratch = Path(tempfile.mkdtemp("fuzz", dir=base))
+    try:
+        yield Places(own / "corpus", own / "findings", scratch)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _child(target: str, *arguments: str, places: Places, **more: Any) -> subprocess.Popen[str]:
+    """One process of a target: a thread for linear algebra, temporary files in the scratch."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    environment = {"TMPDIR": str(places.scratch), "PYTHONHASHSEED": "0"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.fuzz.child", target, *arguments], cwd=ROOT,
+        env={**os.environ, **threads, **environment}, text=True, errors="replace",
+        start_new_session=True, **more,
+    )  # fmt: skip
+
+
+def _run(target: str, *arguments: str, places: Places, timeout: float) -> tuple[int, str]:
+    """Exit status and errors of a process that ends by itself, or is killed."""
+    process = _child(target, *arguments, places=places, stderr=subprocess.PIPE)
+    try:
+        _, errors = process.communicate(timeout=timeout)
+    except subprocess.TimeoutExpired:
+        return -signal.SIGKILL, f"did not end within {timeout:g} s"
+    finally:
+        _kill(process)
+    return process.returncode, errors
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def live(target: str, seconds: float, most: int, places: Places, ended: threading.Event) -> Piece:
     """Fuzz a target in a process of its own for some time, or until that or `ended` ends it."""
     begun = time.monotonic()
     log = places.scratch / "log"
-    options = [
-        f"-max_total_time={max(1, round(seconds))}", f"-max_len={most}", "-print_final_stats=1",
-        f"-artifact_prefix={places.scratch}/", "-reload=0", "-close_fd_mask=3", str(places.corpus),
-        str(CORPORA / target),
-    ]  # fmt: skip
     with log.open("wb") as stream:
-        process = subprocess.Popen(
-            [*command_of(target), "--fuzz", str(places.findings), *options],
-            stdout=stream, stderr=stream, cwd=ROOT, env=environment_of(places),
-            start_new_session=True,
+        process = _child(
+            target, "--fuzz", str(places.findings), f"-max_total_time={max(1, round(seconds))}",
+            f"-max_len={most}", "-print_final_stats=1", f"-artifact_prefix={places.scratch}/",
+            "-reload=0", "-close_fd_mask=3", str(places.corpus), str(CORPORA / target),
+            places=places, stdout=stream, stderr=stream,
         )  # fmt: skip
         stopped = _watched(process, seconds + _GRACE, ended)
     text = log.read_text("utf-8", errors="replace")
     pulses = _PULSE.findall(text)
     _, edges, features, corpus, memory = map(int, pulses[-1]) if pulses else (0,) * 5
-    counted = _TOTAL.findall(text) or _OPEN.findall(text)
-    inputs = int(counted[-1]) if counted else 0
+    totals = _TOTAL.findall(text) or _OPEN.findall(text) or ["0"]
+    inputs = int(totals[-1])
     how, reproduced = "stopped" if stopped else "whole", False
     if process.returncode and not stopped:
         how, reproduced = _understood(target, process.returncode, text, places)
     if process.returncode > 0 and not inputs and not reproduced and not stopped:
         raise RuntimeError(f"{target} cannot be fuzzed:\n{text[-3000:]}")
-    lasted = time.monotonic() - begun
-    return Piece(target, round(lasted, 1), inputs, edges, features, corpus, memory, how, reproduced)
+    lasted = round(time.monotonic() - begun, 1)
+    return Piece(target, lasted, inputs, edges, features, corpus, memory, how, reproduced)
 
 
-def _watched(process: subprocess.Popen[bytes], seconds: float, ended: threading.Event) -> bool:
+def _watched(process: subprocess.Popen[str], seconds: float, ended: threading.Event) -> bool:
     """Wait until a process ends, and end it after `seconds`; True if `ended` ended it."""
     until = time.monotonic() + seconds
     try:
@@ -93,55 +249,35 @@ def _watched(process: subprocess.Popen[bytes], seconds: float, ended: threading.
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_PATIENCE)
     finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        _kill(process)
     return stopped
 
 
 def _understood(target: str, status: int, text: str, places: Places) -> tuple[str, bool]:
-    """How a process ended that did not end by itself; its input is tried again, and kept."""
+    """How a process ended that did not end by itself; its input is tried again, and stays."""
     found = sorted(places.scratch.glob("*-*"), key=lambda path: path.stat().st_mtime)
     artefacts = [path for path in found if path.name.split("-")[0] in _ENDINGS]
     if not artefacts:
         return "killed" if status < 0 else "crash", False
-    artefact = artefacts[-1]
-    ended = _ENDINGS[artefact.name.split("-")[0]]
-    data = artefact.read_bytes()
+    ended = _ENDINGS[artefacts[-1].name.split("-")[0]]
+    data = artefacts[-1].read_bytes()
     for path in artefacts:
         path.unlink()
     again = places.scratch / "again"
     again.write_bytes(data)
-    try:
-        tried = subprocess.run(
-            [*command_of(target), "--once", str(again)], capture_output=True, timeout=_GRACE,
-            cwd=ROOT, env=environment_of(places), text=True, errors="replace", check=False,
-        )  # fmt: skip
-        status, story = tried.returncode, tried.stderr
-    except subprocess.TimeoutExpired as hung:
-        status, story = -signal.SIGKILL, f"did not end within {hung.timeout:g} s"
-    reproduced = status != 0
-    if reproduced:
+    status, story = _run(target, "--once", str(again), places=places, timeout=_GRACE)
+    if status:
+        ours = _places(_PLACE.findall(story)) or ["nowhere"]
+        # What faulthandler writes begins with the innermost line, what Python writes ends with it.
+        innermost = ours[-1 if "Traceback (most recent call last)" in story else 0]
         kind = signal.Signals(-status).name if status < 0 else ended
-        Findings(places.findings).keep(named(kind, _innermost(story)), data, story[-20_000:])
+        Findings(places.findings).keep(_named(kind, innermost), data, story[-20_000:])
     else:
-        kept = places.findings.parent / "not_reproduced"
-        kept.mkdir(exist_ok=True)
-        (kept / f"{ended}-{len(list(kept.iterdir()))}").write_bytes(data)
-        (kept / "last.log").write_text(text[-10_000:], "utf-8")
-    return ended, reproduced
-
-
-def _innermost(story: str) -> str:
-    """The innermost line of ours in what faulthandler or Python wrote (a fault's comes first)."""
-    ours = []
-    for name, line in _PLACE.findall(story):
-        path = Path(name)
-        if path.is_relative_to(ROOT) and ".venv" not in path.parts:
-            ours.append(f"{path.relative_to(ROOT)}:{line}")
-    if not ours:
-        return "nowhere"
-    return ours[-1] if "Traceback (most recent call last)" in story else ours[0]
+        lost = places.findings.parent / "not_reproduced"
+        lost.mkdir(exist_ok=True)
+        (lost / f"{ended}-{len(list(lost.iterdir()))}").write_bytes(data)
+        (lost / "last.log").write_text(text[-10_000:], "utf-8")
+    return ended, status != 0
 
 
 def shorten(target: str, places: Places, ended: threading.Event) -> None:
@@ -152,20 +288,108 @@ def shorten(target: str, places: Places, ended: threading.Event) -> None:
         if (folder / INPUT).exists() and not (folder / SHORTEST).exists():
             # A fault or a hang cannot be shortened from within; its input stays as it is.
             if not folder.name.startswith("SIG"):
-                subprocess.run(
-                    [*command_of(target), "--shorten", str(folder)], capture_output=True,
-                    timeout=4 * _GRACE, cwd=ROOT, env=environment_of(places), check=False,
-                )  # fmt: skip
+                _run(target, "--shorten", str(folder), places=places, timeout=4 * _GRACE)
             if not (folder / SHORTEST).exists():
                 shutil.copy(folder / INPUT, folder / SHORTEST)
 
 
-def command_of(target: str) -> list[str]:
-    """What begins the command line of a target's process."""
-    return [sys.executable, "-m", "tests.fuzz.child", target]
+# Corpora
 
 
-def environment_of(places: Places) -> dict[str, str]:
-    """One thread for linear algebra, temporary files in the scratch folder."""
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**os.environ, **threads, "TMPDIR": str(places.scratch), "PYTHONHASHSEED": "0"}
+def digest(data: bytes) -> str:
+    """Name of an input's file, as libFuzzer has it."""
+    return hashlib.sha1(data, usedforsecurity=False).hexdigest()
+
+
+def plant(folder: Path, inputs: list[bytes]) -> None:
+    """Write inputs under their digests."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for data in inputs:
+        (folder / digest(data)).write_bytes(data)
+
+
+def keep(name: str, journal: Path) -> str:
+    """Choose anew what lies in the repository for a target; says how much that is.
+
+    Inputs that once broke a law (found-*), or were put there on purpose (seed-*), stay; beside
+    them come, one after the other, those that add most to what the others reach, by libFuzzer's
+    own count, as far as there is room.
+    """
+    own = CORPORA / name
+    chosen_inputs = {path.name: path.read_bytes() for path in own.glob("*-*")}
+    too_long = []
+    with beside(journal, name) as places:
+        for shortest in sorted(places.findings.glob(f"*/{SHORTEST}")):
+            data = shortest.read_bytes()
+            if len(data) > LARGEST:
+                too_long.append(f"{shortest.parent.name} ({len(data)} bytes)")
+            else:
+                chosen_inputs[f"found-{digest(data)[:12]}"] = data
+        first = places.scratch / "first"
+        first.mkdir()
+        for file_name, data in chosen_inputs.items():
+            (first / file_name).write_bytes(data)
+        others = [*places.corpus.iterdir(), *own.iterdir()]
+        added = {digest(path.read_bytes()): path for path in others if "-" not in path.name}
+        reached = _reached(name, [*sorted(first.iterdir()), *sorted(added.values())], places)
+        common = frozenset[int]().union(*(reached.pop(path, ()) for path in first.iterdir()))
+        room = MOST_BYTES - sum(map(len, chosen_inputs.values()))
+        for path in chosen(reached, MOST_FILES - len(chosen_inputs), room, common):
+            data = path.read_bytes()
+            chosen_inputs[digest(data)] = data
+    own.mkdir(parents=True, exist_ok=True)
+    for path in own.iterdir():
+        path.unlink()
+    for file_name, data in chosen_inputs.items():
+        (own / file_name).write_bytes(data)
+    words = f"{len(chosen_inputs)} inputs, {sum(map(len, chosen_inputs.values()))} bytes"
+    if too_long:
+        words += f"; left out, being longer than {LARGEST} bytes: {', '.join(too_long)}"
+    return words
+
+
+def _reached(name: str, tried: list[Path], places: Places) -> dict[Path, frozenset[int]]:
+    """What each input reaches."""
+    control = places.scratch / "control"
+    control.write_text("\n".join([str(len(tried)), "0", *map(str, tried)]) + "\n")
+    # merge_inner=2 asks for all that an input reaches, 1 only for what no earlier one did.
+    options = ("-merge_inner=2", "-close_fd_mask=3", f"-max_len={targets.load(name).most}",
+               f"-merge_control_file={control}")  # fmt: skip
+    for _ in range(_MERGES):  # one that ends the process is passed over by the next
+        status, _ = _run(name, "--fuzz", str(places.findings), *options, places=places, timeout=1e6)
+        if not status:
+            break
+    return features_of(control.read_text("utf-8"))
+
+
+def features_of(control: str) -> dict[Path, frozenset[int]]:
+    """What each input reaches, from libFuzzer's control file of a merge."""
+    lines = control.splitlines()
+    count = int(lines[0])
+    paths = [Path(line) for line in lines[2 : 2 + count]]
+    numbers = [line.split()[1:] for line in lines[2 + count :] if line.startswith("FT ")]
+    return {paths[int(first)]: frozenset(map(int, rest)) for first, *rest in numbers}
+
+
+def chosen(
+    reached: dict[Path, frozenset[int]], files: int, size: int, known: frozenset[int] = frozenset()
+) -> list[Path]:
+    """Inputs that together reach most beyond `known`, greedily, within a number of files, bytes."""
+    left = {
+        path: set(features - known)
+        for path, features in reached.items()
+        if path.exists() and path.stat().st_size <= LARGEST
+    }
+    found: list[Path] = []
+    while left and len(found) < files:
+        best = max(left, key=lambda path: (len(left[path]), -path.stat().st_size))
+        gained = left.pop(best)
+        if not gained:
+            break
+        if best.stat().st_size > size:
+            continue
+        size -= best.stat().st_size
+        found.append(best)
+        for others in left.values():
+            others -= gained
+    return found

@@ -7,18 +7,252 @@ import numpy as np
 from drivers import CyclicPacket, InitPacket
 from drivers.errors import PacketError
 from drivers.packets import (
+    DRIVE_ON,
+    EXIT_FROM_OPEN,
     INIT_LENGTH,
     MAX_AXES,
+    Mode,
     cyclic_length,
     echo,
     is_init,
     next_number,
     packet_number,
 )
-from drivers.transports.can.bus_load import BusRates
-from tests.fuzz.can_talk import Talk
+from drivers.transports.can.bus_load import BusRates, CanError
+from drivers.transports.can.ends import ControllerEnd, PcEnd
+from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, Frame
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
+
+CYCLES = 12  # of one conversation
+PER_REVOLUTION, PER_AMPERE = 65536, 64
+D1, D3, D5 = (1 << 16) - 1, (1 << 26) - 1, (1 << 11) - 1
+"""Most counts that the classic fields of D1 - D3, D3 (and D1 down) and D5 hold."""
+NEVER = 0xFFFF
+SLOW = ((1, "d", 1), (5, "extra", 0), (6, "extra", 1), (7, "extra", 2))
+"""Column of the ages, field and column of an axis for what goes up one value per cycle."""
+NO_TARGETS = (Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR)
+HELD = {0: 2, 501: 2, 10: 5}
+"""How many of D1..D5 an axis in this mode is given back with the drive on."""
+
+
+class Talk:
+    """One conversation; `play` says whether every packet of it had its answer."""
+
+    def __init__(self, draw: Draw, rates: BusRates) -> None:
+        self._draw, self._rates = draw, rates
+        self._pc, self._controller = PcEnd(rates), ControllerEnd(rates)
+        self._n = draw.between(1, 6)
+        self._time, self._untouched = 0.0, True
+        self._sent: dict[int, CyclicPacket] = {}
+        self._before: tuple[int, np.ndarray] | None = None
+
+    def play(self) -> bool:
+        """Init packet, then cycles until the bytes run out.
+
+        Raises:
+            AssertionError: a law is broken.
+        """
+        draw, number, answered = self._draw, 10, 0
+        init = InitPacket.build(self._n, draw.choice((2, 1)), {}).encode()
+        try:
+            begun = self._up(init, self._controller.packet(init))
+        except CanError:  # more than this bus carries: what follows goes as segments
+            begun = None
+        for cycle in range(CYCLES):
+            if not draw.left and cycle:
+                break
+            self._time += draw.choice((0.002, 0.002, 0.0, 0.05, 2.0))
+            number = next_number(number)
+            packet = self._packet(number)
+            got = self._up(packet, self._controller.packet(packet))
+            if got is None:
+                continue
+            if self._untouched and not self._controller.segmented:
+                self._as_sent(
+                    CyclicPacket.decode(got, self._n), CyclicPacket.decode(packet, self._n)
+                )
+            answered += self._answered(got, CyclicPacket.decode(packet, self._n))
+        return begun is not None and answered > 0
+
+    def _packet(self, number: int) -> bytes:
+        draw, n = self._draw, self._n
+        block = draw.raw(draw.choice((0, 36, 36 * n))).ljust(36 * n, b"\0")
+        axes = np.frombuffer(block, CyclicPacket.zeros(number, n).axes.dtype).copy()
+        if draw.chance(128):
+            axes["mode"] = draw.choice((0, 4, 5, 7, 501, 10, 1, 8))
+        status = bytes((draw.choice((DRIVE_ON, 0, 1, 4)), 0, 0, 0))
+        return CyclicPacket(number, status, draw.raw(4).ljust(4, b"\0"), axes).encode()
+
+    # Up ---------------------------------------------------------------------------------------
+
+    def _up(self, packet: bytes, frames: list[Frame]) -> bytes | None:
+        """What the PC makes of the frames of a packet."""
+        received, touched = harmed(frames, self._draw)
+        made = []
+        for frame in received:
+            try:
+                made.append(self._pc.receive(frame, self._time))
+            except CanError:
+                assert touched, "an init packet that the controller's end could carry"
+        got = [one for one in made if one is not None]
+        self._untouched &= not touched
+        if self._untouched:
+            assert len(got) == 1, f"{len(got)} packets of one"
+        if got and not touched and self._controller.segmented:
+            assert got == [packet], "segments carry every byte"
+        return got[-1] if got else None
+
+    def _as_sent(self, got: CyclicPacket, sent: CyclicPacket) -> None:
+        """Every field is what was sent, or as old as is said."""
+        self._sent[sent.number] = sent
+        assert (got.number, got.status) == (sent.number, sent.status)
+        assert (got.axes["mode"] == sent.axes["mode"]).all()
+        with np.errstate(invalid="ignore"):  # a signalling NaN is one like any other
+            of, to = sent.axes["d"].astype(float), got.axes["d"].astype(float)
+        if self._rates.profile == "fd":
+            assert np.array_equal(of[:, [0, 2, 3, 4]], to[:, [0, 2, 3, 4]], equal_nan=True)
+        else:
+            self._rounded(of, to, sent.number)
+        ages = self._pc.ages
+        assert ages is not None
+        for column, field, at in SLOW:
+            for axis, age in enumerate(ages[:, column].tolist()):
+                value = got.axes[field][axis, at]
+                known = (
+                    np.nan if age == NEVER else self._sent[sent.number - age].axes[field][axis, at]
+                )
+                assert np.array_equal(value, known, equal_nan=True), f"{field} {at} of axis {axis}"
+
+    def _rounded(self, of: np.ndarray, to: np.ndarray, number: int) -> None:
+        """Positions to half a count, NaN where the field does not hold them; D4 out of D3."""
+        with np.errstate(all="ignore"):
+            counts = np.rint(of[:, 2] * PER_REVOLUTION)
+            apart = np.rint(of[:, 0] * PER_REVOLUTION) - counts
+        counts[~(np.abs(counts) <= D3)] = np.nan
+        near(of[:, 2], to[:, 2], np.abs(counts) <= D3, PER_REVOLUTION)
+        near(of[:, 0], to[:, 0], (np.abs(counts) <= D3) & (np.abs(apart) <= D1), PER_REVOLUTION)
+        with np.errstate(all="ignore"):
+            currents = np.abs(np.rint(of[:, 4] * PER_AMPERE))
+        near(of[:, 4], to[:, 4], currents <= D5, PER_AMPERE)
+        known = np.full(len(of), np.nan)
+        if self._before is not None:
+            last, before = self._before
+            known = (counts - before) / (number - last) / PER_REVOLUTION
+        assert np.allclose(to[:, 3], known, rtol=1e-6, atol=0.0, equal_nan=True), "D4"
+        self._before = number, counts
+
+    # Down -------------------------------------------------------------------------------------
+
+    def _answered(self, got: bytes, sent: CyclicPacket) -> bool:
+        """The PC's answer to what it got, sent back; whether it arrived."""
+        try:
+            arrived = CyclicPacket.decode(got, self._n)
+        except PacketError:
+            assert not self._untouched
+            return False
+        answer = self._answer(arrived)
+        try:
+            frames, refused = self._pc.reply(answer.encode()), False
+        except CanError:
+            frames, refused = self._pc.drive_off(), True
+        received, touched = harmed(frames, self._draw)
+        made = [self._controller.receive(frame, self._time) for frame in received]
+        replies = [one for one in made if one is not None]
+        self._untouched &= not touched
+        if self._untouched:
+            assert len(replies) == 1, f"{len(replies)} answers of one"
+        for reply in () if touched else replies:
+            # A stranger's frame in place of one may state another number, and fit by its last bits.
+            if arrived.number == sent.number:
+                assert reply[:4] == answer.encode()[:4], "an answer to another packet"
+            if self._untouched and self._controller.segmented:
+                assert reply == answer.encode(), "segments carry every byte"
+            elif self._untouched:
+                told = CyclicPacket.decode(reply, self._n)
+                if refused:
+                    assert (told.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+                else:
+                    self._as_answered(told, answer, arrived, sent)
+        return bool(replies)
+
+    def _answer(self, received: CyclicPacket) -> CyclicPacket:
+        """Given back, as a session does while nothing moves; targets; or what no frame carries."""
+        draw, axes = self._draw, received.axes.copy()
+        kind = draw.below(4)
+        if kind < 3:
+            for axis in axes:
+                given_back(axis, received.status[0])
+        if kind in (1, 2):
+            mode = draw.choice((0, 4, 505, 508, 7, 1, 5))
+            for axis in axes[: draw.between(1, self._n)]:
+                axis["mode"], axis["d"], axis["extra"] = (
+                    mode if kind == 2 else axis["mode"],
+                    0.0,
+                    0.0,
+                )
+                axis["d"][0] = draw.float32() if draw.chance(64) else draw.integer() / 2.0**26
+                axis["d"][1] = draw.byte() / 1024.0
+        elif kind == 3:
+            axes["d"][:, 0] = draw.float32()
+        status = bytes((EXIT_FROM_OPEN if draw.chance(64) else 0, 0, 0, 0))
+        return CyclicPacket(next_number(received.number), status, bytes(4), axes)
+
+    def _as_answered(
+        self, reply: CyclicPacket, answer: CyclicPacket, got: CyclicPacket, sent: CyclicPacket
+    ) -> None:
+        """What is given back comes from the controller's own packet, the rest from the answer."""
+        classic = self._rates.profile == "classic"
+        # Classic frames have no room for a status: the controller's end says what it sent itself.
+        back = (answer.status[0], sent.status[0]) if classic else (answer.status[0],)
+        assert reply.status[0] in back, "status"
+        for slot in range(self._n):
+            received, own = got.axes[slot].copy(), sent.axes[slot].copy()
+            mirrors = given_back(received, sent.status[0])
+            given_back(own, sent.status[0])
+            wanted, found = answer.axes[slot], reply.axes[slot]
+            assert found["mode"] == wanted["mode"], f"mode of slot {slot}"
+            if mirrors and received.tobytes() == wanted.tobytes():
+                assert found.tobytes() == own.tobytes(), f"slot {slot} is not given back"
+            elif not classic:
+                assert (found["d"][:2] == wanted["d"][:2]).all(), f"targets of slot {slot}"
+            elif wanted["mode"] not in NO_TARGETS:
+                near(wanted["d"][:1], found["d"][:1], np.array([True]), PER_REVOLUTION)
+
+
+def given_back(axis: np.ndarray, status: int) -> bool:
+    """Leave of an axis what may be given back unchanged; whether that is anything."""
+    count = 5 if status != DRIVE_ON else HELD.get(int(axis["mode"]), 0)
+    axis["d"][max(count, 2) :] = 0.0
+    if status == DRIVE_ON:
+        axis["extra"] = 0.0
+    return count > 0
+
+
+def near(of: np.ndarray, to: np.ndarray, held: np.ndarray, per_unit: int) -> None:
+    """Half a count and a float's own rounding apart; NaN where the field does not hold it."""
+    apart = np.abs(to[held].astype(float) - of[held])
+    assert (apart <= 0.5 / per_unit + np.abs(of[held]) * 2.0**-23).all(), (of, to)
+    assert np.isnan(to[~held]).all(), (of, to)
+
+
+def harmed(sent: list[Frame], draw: Draw) -> tuple[list[Frame], bool]:
+    """The frames as they arrive, and whether anything happened to them."""
+    act = draw.below(8)
+    if act < 4 or not sent:
+        return sent, False
+    at = draw.below(len(sent))
+    if act == 4:
+        return sent[:at] + sent[at + 1 :], True
+    if act == 5:
+        return sent[: at + 1] + sent[at:], True
+    if act == 6:
+        frame = sent[at]
+        changed = draw.raw(8) + frame.data[8:] if draw.chance(128) else frame.data[: draw.below(9)]
+        return [*sent[:at], Frame(frame.id, changed), *sent[at + 1 :]], True
+    stranger = Frame(draw.choice((SEGMENT_UP, SEGMENT_DOWN, draw.below(2048))), draw.raw(8))
+    return [*sent[:at], stranger, *sent[at:]], True
+
 
 GENTLE = np.array((0, 0, 1, 192, 194, 201), np.uint8)
 """Bytes that draw no harm: their last three bits are below four."""
