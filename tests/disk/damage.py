@@ -191,7 +191,6 @@ SEED = 20261120
 
 
 def campaign(folder: Path, workers: Workers | None, repetitions: int = 3) -> Undamaged:
-    """A campaign of some repetitions and one validation run, finished."""
     made = fast_campaign(folder / "campaign", fast_cell(folder, repetitions=repetitions))
     made.run(durable=False, unrehearsed=True)
     return undamaged(made.folder.root, workers)
@@ -243,7 +242,6 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run rounds and print what came of all in the journal."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.disk.damage",
         description=__doc__,

@@ -39,8 +39,6 @@ REFUSALS: Final = {"EIO": errno.EIO, "EDQUOT": errno.EDQUOT, "ENOSPC": errno.ENO
 
 @dataclass(frozen=True)
 class Rule:
-    """One thing that goes wrong."""
-
     operations: Sequence[str] = CHANGES  # on which of `CHANGES`
     names: str = "*"  # pattern of the names of files it is about
     after: int = 0  # how many matching operations pass before it begins
@@ -51,8 +49,6 @@ class Rule:
 
 
 class Disk:
-    """A folder on which things go wrong."""
-
     def __init__(self, root: Path) -> None:
         self.root, self._count = root, 0
 

@@ -125,7 +125,6 @@ class Passthrough(mfusepy.Operations):  # type: ignore[misc]
 
 
 def main() -> None:
-    """Mount, and serve until the end of standard input."""
     root, mountpoint = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
 
     def unmount_at_the_end() -> None:

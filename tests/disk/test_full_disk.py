@@ -36,8 +36,6 @@ SIZE = 64  # MiB of the disk
 
 @dataclass(frozen=True)
 class Disk:
-    """A small disk."""
-
     root: Path  # where it is mounted
 
     @property
@@ -45,7 +43,6 @@ class Disk:
         return self.root / "ballast"
 
     def fill(self, left: int) -> None:
-        """Leave `left` KiB."""
         self.empty()
         free = os.statvfs(self.root)
         room = free.f_bavail * free.f_frsize - 1024 * left
@@ -53,7 +50,6 @@ class Disk:
             os.posix_fallocate(file.fileno(), 0, max(1, room))
 
     def empty(self) -> None:
-        """Take the ballast away."""
         self.ballast.unlink(missing_ok=True)
 
 
@@ -77,7 +73,6 @@ def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
 
 @pytest.fixture(scope="module")
 def campaign(disk: Disk, tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    """A plan that may be run."""
     cell = fast_cell(tmp_path_factory.mktemp("cell"), repetitions=3)
     made = fast_campaign(disk.root / "campaign", cell)
     pass_rehearsal(made.folder)

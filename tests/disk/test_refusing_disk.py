@@ -141,7 +141,6 @@ def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
 
 
 def rounds(disk: Disk, designed: Designed, seeds: range) -> int:
-    """How many refusals struck."""
     count = 0
     for seed in seeds:
         campaign = rehearsed(disk, f"round_{seed}", designed)

@@ -133,7 +133,6 @@ def put_two(workplace: Path, folder: Path, *names: str) -> None:
 
 
 def reason_not_to(words: list[str]) -> str | None:
-    """Why a command is not run."""
     if words[0] != "hil":
         return OTHER_PROGRAMS[words[0]]
     line = shlex.join(words)

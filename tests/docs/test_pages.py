@@ -19,11 +19,7 @@ FILES = ("py", "toml", "urdf", "mcap", "md", "json", "html", "dbc", "csv", "dot"
 
 
 def found(name: str) -> object:
-    """The module, or what it holds.
-
-    Raises:
-        LookupError: there is no such thing.
-    """
+    """The module, or what it holds; LookupError if there is no such thing."""
     parts = name.split(".")
     for count in range(len(parts), 0, -1):
         try:

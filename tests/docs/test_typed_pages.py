@@ -63,7 +63,6 @@ def saved(block: str) -> None:
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout."""
     (tmp_path / "runs").mkdir()
     for name in ("examples", "sim_fixtures"):
         (tmp_path / name).symlink_to(ROOT / name)

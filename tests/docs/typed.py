@@ -22,11 +22,7 @@ _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The commands of a page in order, split into words; output and comments are left out.
-
-    Raises:
-        AssertionError: a block mixes commands with something else.
-    """
+    """The commands of a page in order, split into words; output and comments are left out."""
     found = []
     for language, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         if language in SHELL:
@@ -48,11 +44,7 @@ def _of_block(page: Path, block: str) -> list[list[str]]:
 
 
 def command_of(words: Sequence[str]) -> tuple[Any, list[str]]:
-    """The command that words behind `hil` name, and the rest of them.
-
-    Raises:
-        AssertionError: there is none.
-    """
+    """The command that words behind `hil` name, and the rest of them."""
     command: Any = typer.main.get_command(app)
     rest = list(words)
     while hasattr(command, "commands"):
@@ -62,10 +54,6 @@ def command_of(words: Sequence[str]) -> tuple[Any, list[str]]:
 
 
 def parse(words: Sequence[str]) -> None:
-    """Let the command line read words behind `hil`, and do nothing.
-
-    Raises:
-        Exception: it does not understand them.
-    """
+    """Let the command line read words behind `hil`, and do nothing."""
     command, rest = command_of(words)
     command.make_context(command.name, rest)

@@ -83,7 +83,6 @@ def _read(journals: Sequence[Path]) -> list[Piece]:
 
 
 def _run(given: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Run a piece, and append to the journal."""
     if given.folder is None or given.minutes is None:
         parser.error("--minutes and --folder are needed to run a piece")
     if given.minutes > LONGEST:

@@ -92,8 +92,6 @@ def run_piece(
 
 @dataclass(eq=False)
 class _Piece:
-    """A piece while it runs."""
-
     folder: Path
     journal: Journal
     task: Task
@@ -241,7 +239,6 @@ def checked(folder: Path) -> dict[str, Any]:
 
 
 def count(folder: str) -> int:
-    """Entries of a folder."""
     return sum(1 for _ in Path(folder).iterdir())
 
 

@@ -31,11 +31,7 @@ def so_far(folder: Path) -> tuple[int, float]:
 
 @contextmanager
 def watched(folder: Path) -> Iterator[None]:
-    """One watcher a core, while this lasts; none sees any without the right to real-time priority.
-
-    Args:
-        folder: for what they write.
-    """
+    """One watcher a core writes into a folder; none sees any without real-time priority."""
     paths = tuple(folder / f"{_NAME}{core}" for core in sorted(os.sched_getaffinity(0)))
     with ExitStack() as undo:
         for path in paths:

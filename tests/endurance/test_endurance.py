@@ -73,7 +73,6 @@ def sound() -> Piece:
 
 
 def sampled(change: Callable[[int, Line], Line]) -> Change:
-    """Another piece by a change of each sample."""
     return lambda one: replace(
         one, samples=[s | change(place, s) for place, s in enumerate(one.samples)]
     )
@@ -102,7 +101,6 @@ def given_up(*numbers: int) -> Change:
 
 
 def with_one(**changes: Any) -> Change:
-    """One of the campaigns with changes."""
     return each_campaign(lambda ran: changes if ran["number"] == 159 else {})
 
 

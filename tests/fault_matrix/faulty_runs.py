@@ -101,12 +101,7 @@ def _broken_in_answer(packet: bytes, reply: bytes) -> Iterator[str]:
 
 
 def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterator[str]:
-    """What was commanded keeps the bounds, and nothing moves after the motion was lost.
-
-    Args:
-        records: (m,) all of the run.
-        still: those between a loss or refusal and the next request, if there was one.
-    """
+    """Records (m,) keep the bounds; none moves in `still`, between a loss and the next request."""
     sent = np.isfinite(records["commanded_position"]).all(axis=1)
     may = (records["mode"] == Mode.POSITION).all(axis=1) & (records["status"] == DRIVE_ON)
     if np.any(sent & ~may):
@@ -478,7 +473,6 @@ def behaviours(fault: str, situation: str) -> tuple[str, ...]:
 
 
 def cases() -> Iterator[tuple[str, str, str]]:
-    """Every fault, situation and behaviour."""
     for fault in FAULTS:
         for situation in SITUATIONS:
             for behaviour in behaviours(fault, situation):

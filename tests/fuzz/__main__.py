@@ -85,11 +85,7 @@ class Run:
         self._failed: list[BaseException] = []
 
     def work(self, jobs: int, progress: Reporter) -> None:
-        """Work until all have their time.
-
-        Raises:
-            RuntimeError: a target cannot be fuzzed at all.
-        """
+        """Work until all have their time; RuntimeError if a target cannot be fuzzed at all."""
         left = sum(max(0.0, self._wanted - done) for done in self._done.values())
         with progress.task("fuzzing", left) as task:
             workers = [threading.Thread(target=self._worker, args=(task,)) for _ in range(jobs)]

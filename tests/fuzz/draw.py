@@ -30,7 +30,6 @@ class Draw:
         return part
 
     def byte(self) -> int:
-        """0..255."""
         part = self.raw(1)
         return part[0] if part else 0
 
@@ -44,7 +43,6 @@ class Draw:
         return low + self.below(high - low + 1)
 
     def choice(self, options: Sequence[T]) -> T:
-        """One of these."""
         return options[self.below(len(options))]
 
     def chance(self, of_256: int) -> bool:
@@ -62,7 +60,6 @@ class Draw:
         return value
 
     def rest(self) -> bytes:
-        """All that is left."""
         return self.raw(self.left)
 
 

@@ -27,7 +27,6 @@ CORPORA = Path(__file__).parent / "corpora"
 OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
 INPUT, SHORTEST, STORY, COUNT = "input", "shortest", "traceback.txt", "count"
 MOST_FILES, MOST_BYTES, LARGEST = 40, 200_000, 20_000  # of a corpus in the repository
-_MERGES = 20  # inputs that may end the process that measures what inputs reach
 _PULSE = re.compile(
     r"^#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/\S+.*? rss: (\d+)Mb", re.MULTILINE
 )
@@ -61,11 +60,7 @@ def append(path: Path, piece: Piece) -> None:
 
 
 def pieces(path: Path) -> list[Piece]:
-    """All pieces of a journal.
-
-    Raises:
-        JournalError: it cannot be read, or a line is none.
-    """
+    """All pieces of a journal; JournalError if it cannot be read, or a line is none."""
     return entries(path, lambda line: Piece(**line), "piece of fuzzing")
 
 
@@ -160,8 +155,6 @@ def _text(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Places:
-    """Where a target's inputs lie."""
-
     corpus: Path  # all inputs so far, outside of the repository
     findings: Path  # a folder per cause
     scratch: Path  # for artefacts of libFuzzer and temporary files; in memory where it can be
@@ -311,12 +304,12 @@ def plant(folder: Path, inputs: list[bytes]) -> None:
 def keep(name: str, journal: Path) -> str:
     """Choose anew what lies in the repository for a target; says how much that is.
 
-    Inputs that once broke a law (found-*), or were put there on purpose (seed-*), stay; beside
-    them come, one after the other, those that add most to what the others reach, by libFuzzer's
-    own count, as far as there is room.
+    Inputs that once broke a law (found-*), or were put there on purpose (seed-*), stay; beside them
+    come those that by libFuzzer's own count reach more than these, short ones first, as far as
+    there is room.
     """
     own = CORPORA / name
-    chosen_inputs = {path.name: path.read_bytes() for path in own.glob("*-*")}
+    inputs = {path.name: path.read_bytes() for path in own.glob("*-*")}
     too_long = []
     with beside(journal, name) as places:
         for shortest in sorted(places.findings.glob(f"*/{SHORTEST}")):
@@ -324,72 +317,29 @@ def keep(name: str, journal: Path) -> str:
             if len(data) > LARGEST:
                 too_long.append(f"{shortest.parent.name} ({len(data)} bytes)")
             else:
-                chosen_inputs[f"found-{digest(data)[:12]}"] = data
-        first = places.scratch / "first"
-        first.mkdir()
-        for file_name, data in chosen_inputs.items():
-            (first / file_name).write_bytes(data)
-        others = [*places.corpus.iterdir(), *own.iterdir()]
-        added = {digest(path.read_bytes()): path for path in others if "-" not in path.name}
-        reached = _reached(name, [*sorted(first.iterdir()), *sorted(added.values())], places)
-        common = frozenset[int]().union(*(reached.pop(path, ()) for path in first.iterdir()))
-        room = MOST_BYTES - sum(map(len, chosen_inputs.values()))
-        for path in chosen(reached, MOST_FILES - len(chosen_inputs), room, common):
+                inputs[f"found-{digest(data)[:12]}"] = data
+        merged = places.scratch / "merged"
+        merged.mkdir()
+        for file_name, data in inputs.items():
+            (merged / file_name).write_bytes(data)
+        _merge(name, merged, [places.corpus, own], places)
+        for path in sorted(merged.iterdir(), key=lambda one: (one.stat().st_size, one.name)):
             data = path.read_bytes()
-            chosen_inputs[digest(data)] = data
-    own.mkdir(parents=True, exist_ok=True)
-    for path in own.iterdir():
-        path.unlink()
-    for file_name, data in chosen_inputs.items():
+            room = MOST_BYTES - sum(map(len, inputs.values()))
+            if len(inputs) < MOST_FILES and len(data) <= min(room, LARGEST):
+                inputs.setdefault(path.name, data)
+    shutil.rmtree(own, ignore_errors=True)
+    own.mkdir(parents=True)
+    for file_name, data in inputs.items():
         (own / file_name).write_bytes(data)
-    words = f"{len(chosen_inputs)} inputs, {sum(map(len, chosen_inputs.values()))} bytes"
+    words = f"{len(inputs)} inputs, {sum(map(len, inputs.values()))} bytes"
     if too_long:
         words += f"; left out, being longer than {LARGEST} bytes: {', '.join(too_long)}"
     return words
 
 
-def _reached(name: str, tried: list[Path], places: Places) -> dict[Path, frozenset[int]]:
-    """What each input reaches."""
-    control = places.scratch / "control"
-    control.write_text("\n".join([str(len(tried)), "0", *map(str, tried)]) + "\n")
-    # merge_inner=2 asks for all that an input reaches, 1 only for what no earlier one did.
-    options = ("-merge_inner=2", "-close_fd_mask=3", f"-max_len={targets.load(name).most}",
-               f"-merge_control_file={control}")  # fmt: skip
-    for _ in range(_MERGES):  # one that ends the process is passed over by the next
-        status, _ = _run(name, "--fuzz", str(places.findings), *options, places=places, timeout=1e6)
-        if not status:
-            break
-    return features_of(control.read_text("utf-8"))
-
-
-def features_of(control: str) -> dict[Path, frozenset[int]]:
-    """What each input reaches, from libFuzzer's control file of a merge."""
-    lines = control.splitlines()
-    count = int(lines[0])
-    paths = [Path(line) for line in lines[2 : 2 + count]]
-    numbers = [line.split()[1:] for line in lines[2 + count :] if line.startswith("FT ")]
-    return {paths[int(first)]: frozenset(map(int, rest)) for first, *rest in numbers}
-
-
-def chosen(
-    reached: dict[Path, frozenset[int]], files: int, size: int, known: frozenset[int] = frozenset()
-) -> list[Path]:
-    """Inputs that together reach most beyond `known`, greedily, within a number of files, bytes."""
-    left = {
-        path: set(features - known)
-        for path, features in reached.items()
-        if path.exists() and path.stat().st_size <= LARGEST
-    }
-    found: list[Path] = []
-    while left and len(found) < files:
-        best = max(left, key=lambda path: (len(left[path]), -path.stat().st_size))
-        gained = left.pop(best)
-        if not gained:
-            break
-        if best.stat().st_size > size:
-            continue
-        size -= best.stat().st_size
-        found.append(best)
-        for others in left.values():
-            others -= gained
-    return found
+def _merge(name: str, target: Path, sources: list[Path], places: Places) -> None:
+    """Add to a folder the inputs of others that reach more than what is in it."""
+    options = ("-merge=1", "-close_fd_mask=3", f"-max_len={targets.load(name).most}")
+    folders = map(str, (target, *sources))
+    _run(name, "--fuzz", str(places.findings), *options, *folders, places=places, timeout=1e6)

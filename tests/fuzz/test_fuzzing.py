@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,11 +61,8 @@ class TestBrokenLawsAreFound:
 
     def in_the_codec(self) -> bool:
         """Whether a law of the codec is broken by what it has in the corpus."""
-        laws = (
-            "AssertionError-tests.fuzz.targets.codec",
-            "AssertionError-tests.fuzz.targets.codec",
-        )
-        return any(cause.startswith(laws) for cause in self.broken("codec", 0))
+        law = "AssertionError-tests.fuzz.targets.codec"
+        return any(cause.startswith(law) for cause in self.broken("codec", 0))
 
     def test_a_guard_that_lets_everything_pass(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Guard, "check_set_point", lambda *_: None)
@@ -95,17 +93,17 @@ class TestBrokenLawsAreFound:
         monkeypatch.setattr(ControllerEnd, "packet", lambda *_: int("none"))
         assert any(cause.startswith("ValueError") for cause in self.broken("codec", 0))
 
-    @pytest.mark.parametrize(("end", "one_way"), [(PcEnd, "_packet"), (ControllerEnd, "_reply")])
+    @pytest.mark.parametrize("end", [PcEnd, ControllerEnd])
     def test_a_can_link_that_loses_the_axes(
-        self, monkeypatch: pytest.MonkeyPatch, end: type, one_way: str
+        self, monkeypatch: pytest.MonkeyPatch, end: Any
     ) -> None:
-        whole = getattr(end, one_way)
+        whole = end._packet
 
         def emptied(*given: object) -> bytes | None:
             packet: bytes | None = whole(*given)
             return packet and packet[:12] + bytes(len(packet) - 12)
 
-        monkeypatch.setattr(end, one_way, emptied)
+        monkeypatch.setattr(end, "_packet", emptied)
         assert self.in_the_codec()
 
     def test_a_header_whose_errors_are_not_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,42 +221,30 @@ class TestJournal:
         assert "deaths that" not in capsys.readouterr().out
 
 
-def test_inputs_worth_keeping_reach_most_with_few_bytes(tmp_path: Path) -> None:
-    for name, size in (("a", 10), ("b", 5), ("c", 5), ("d", 30)):
-        (tmp_path / name).write_bytes(bytes(size))
-    control = "\n".join(
-        ["4", "0", *(str(tmp_path / name) for name in "abcd"), "STARTED 0 10", "FT 0 1 2 3",
-         "COV 0 1", "FT 1 1 2", "FT 2 9", "FT 3 3 9 10 11"]
-    )  # fmt: skip
-    reached = lives.features_of(control)
-    assert [path.name for path in lives.chosen(reached, 3, 100)] == ["d", "b"]
-    assert [path.name for path in lives.chosen(reached, 3, 20)] == ["a", "c"]
-    known = frozenset((1, 2, 3, 10))
-    assert [path.name for path in lives.chosen(reached, 3, 100, known)] == ["d"]
-    assert [path.name for path in lives.chosen(reached, 3, 20, known)] == ["c"]
-
-
-def test_what_is_kept_is_no_copy_and_what_is_too_long_is_told(
+def test_of_what_is_found_short_inputs_that_reach_more_are_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lives, "CORPORA", tmp_path / "corpora")
-    monkeypatch.setattr(lives, "_reached", lambda name, tried, places: {
-        path: frozenset(path.read_bytes()) for path in tried
-    })  # fmt: skip
-    scratch = tmp_path / "scratch"
+    own, corpus = tmp_path / "corpora" / "codec", tmp_path / "j.files" / "codec" / "corpus"
+    findings, scratch = corpus.with_name("findings"), tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setattr("tempfile.mkdtemp", lambda *_, **__: str(scratch))
-    lives.plant(tmp_path / "corpora" / "codec", [b"olm"])
-    (tmp_path / "corpora" / "codec" / "seed-1").write_bytes(b"abc")
-    own = tmp_path / "j.files" / "codec"
-    lives.plant(own / "corpus", [b"abc", b"abcd", b"ab"])
+    monkeypatch.setattr(lives, "CORPORA", own.parent)
+    monkeypatch.setattr(lives, "MOST_FILES", 4)
+
+    def merged(name: str, target: Path, sources: list[Path], places: lives.Places) -> None:
+        assert sources == [corpus, own]
+        lives.plant(target, [b"reaches more", b"too", bytes(30_000)])
+
+    monkeypatch.setattr(lives, "_merge", merged)
+    lives.plant(own, [b"olm"])
+    (own / "seed-1").write_bytes(b"abc")
     for name, data in (("short", b"x"), ("long", bytes(30_000))):
-        (own / "findings" / name).mkdir(parents=True)
-        (own / "findings" / name / lives.SHORTEST).write_bytes(data)
-    told = lives.keep("codec", tmp_path / "j")
-    assert told.endswith("longer than 20000 bytes: long (30000 bytes)")
-    kept = sorted(path.read_bytes() for path in (tmp_path / "corpora" / "codec").iterdir())
-    assert kept == [b"abc", b"abcd", b"olm", b"x"]
+        (findings / name).mkdir(parents=True)
+        (findings / name / lives.SHORTEST).write_bytes(data)
+    words = lives.keep("codec", tmp_path / "j")
+    assert words.endswith("longer than 20000 bytes: long (30000 bytes)")
+    left = {path.read_bytes() for path in own.iterdir()}
+    assert left == {b"abc", b"x", b"too", b"reaches more"}
     assert not scratch.exists()
 
 

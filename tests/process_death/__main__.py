@@ -37,9 +37,8 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from tests.arguments import at_least_one, whole_number  # noqa: E402
 from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
-from tests.process_death.defects import DEFECTS, planted  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
-from tests.process_death.play import Stage, play  # noqa: E402
+from tests.process_death.play import DEFECTS, Stage, planted, play  # noqa: E402  # noqa: E402
 from tests.process_death.rounds import VICTIMS, drawn  # noqa: E402
 
 _stage: Stage | None = None  # What rounds share; their processes are forked from one that has it
@@ -110,7 +109,6 @@ def _parser() -> argparse.ArgumentParser:
 def _played(
     numbers: Sequence[int], jobs: int, folder: Path, defect: str | None
 ) -> Iterator[dict[str, Any]]:
-    """Results of rounds, as they come."""
     global _stage
     if not numbers:
         return
@@ -157,7 +155,6 @@ def _tell(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: bo
 
 
 def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What all rounds came to."""
     failed = sorted(one["round"] for one in results if one["broken"])
     lost = sorted(one["lost"] for one in results if "lost" in one)
     return {

@@ -13,7 +13,8 @@ import select
 import signal
 import time
 from dataclasses import replace
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import Request, Tally, UdpFarEnd
-from tests.process_death.product import listening
 from tests.process_death.rounds import Round
 
 Rows = NDArray[np.void]
@@ -46,30 +46,36 @@ exchange process was found dead, answers rejected so far, and the plant's joints
 rad/s]."""
 CAPACITY: Final = 40_000
 _HEADER: Final = 128
-_ROWS, _FINISH, _GIVE_UP, _EXCHANGE = range(4)
 WAIT: Final = 60.0  # s that a living PC is waited for
 REST: Final = 10  # Cycles of standing after which an arm is at rest
 _PDEATHSIG: Final = 1
 
 
+def _word(place: int) -> Any:
+    """A number in a page's header."""
+
+    def set_to(page: Page, value: int) -> None:
+        page.words[place] = value
+
+    return property(lambda page: int(page.words[place]), set_to)
+
+
 class Page:
     """Memory shared by the controller's process and the one that watches."""
 
+    count = _word(0)  # cycles written down
+    finished = _word(1)  # whether the controller's program is to end once the axes are closed
+    given_up = _word(2)  # whether the controller is to fall silent
+    exchange = _word(3)  # process id of the exchange that it waits for, 0 as long as there is none
+
     def __init__(self) -> None:
-        self._memory = mmap.mmap(-1, _HEADER + CAPACITY * ROW.itemsize)
-        self._words = memoryview(self._memory)[:_HEADER].cast("q")
-        self._all: Rows = np.frombuffer(self._memory, ROW, CAPACITY, _HEADER)
+        memory = mmap.mmap(-1, _HEADER + CAPACITY * ROW.itemsize)
+        self.words = memoryview(memory)[:_HEADER].cast("q")
+        self._all: Rows = np.frombuffer(memory, ROW, CAPACITY, _HEADER)
 
     def add(self, row: tuple[object, ...]) -> None:
-        """Write a cycle down."""
-        count = self._words[_ROWS]
-        self._all[count % CAPACITY] = row
-        self._words[_ROWS] = count + 1
-
-    @property
-    def count(self) -> int:
-        """Cycles written down."""
-        return int(self._words[_ROWS])
+        self._all[self.count % CAPACITY] = row
+        self.count += 1
 
     def rows(self) -> Rows:
         """A copy of all cycles."""
@@ -77,32 +83,13 @@ class Page:
             raise RuntimeError("the session was longer than any of these rounds should be")
         return self._all[: self.count].copy()
 
-    @property
-    def finished(self) -> bool:
-        """Whether the controller's program is to end once the axes are closed."""
-        return bool(self._words[_FINISH])
 
-    def finish(self) -> None:
-        """Have it end so."""
-        self._words[_FINISH] = 1
-
-    @property
-    def given_up(self) -> bool:
-        """Whether the controller is to fall silent."""
-        return bool(self._words[_GIVE_UP])
-
-    def give_up(self) -> None:
-        """Have the controller fall silent."""
-        self._words[_GIVE_UP] = 1
-
-    @property
-    def exchange(self) -> int:
-        """Process id of the exchange, 0 as long as there is none."""
-        return int(self._words[_EXCHANGE])
-
-    def tell(self, exchange: int) -> None:
-        """Say whom the controller is to wait for."""
-        self._words[_EXCHANGE] = exchange
+def listening(port: int) -> bool:
+    """Whether a process of this computer has a UDP port."""
+    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+        if line.split()[1].endswith(f":{port:04X}"):
+            return True
+    return False
 
 
 class _Life:
@@ -113,7 +100,6 @@ class _Life:
         self._dead = False
 
     def over(self, pid: int) -> bool:
-        """Whether it has ended."""
         if self._dead or not pid:
             return self._dead
         try:
@@ -156,11 +142,10 @@ class WaitingEnd:
         return None
 
     def close(self) -> None:
-        """Close the link."""
         self._link.close()
 
 
-class _Wishes(Buttons):
+class _PageButtons(Buttons):
     """Ends program and session when the page says so."""
 
     def __init__(self, page: Page) -> None:
@@ -203,7 +188,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
         serve_session(
             lambda: simulated_controller(cell, settings=settings, seed=played.seed),
             end,
-            _Wishes(page),
+            _PageButtons(page),
             patience=WAIT,
             stretch=WAIT,
             watch=note,

@@ -56,10 +56,7 @@ class Kept:
 def broken_by(
     seen: Seen, campaign: Campaign, earlier: frozenset[str] = frozenset()
 ) -> tuple[list[str], dict[str, int]]:
-    """What was broken, in sentences, and figures that are measured on the way.
-
-    `earlier` names the archives that lay there before the run that was seen.
-    """
+    """What was broken, and figures; `earlier` are archives of before the run that was seen."""
     figures: dict[str, int] = {}
     problems = [
         *_ends(seen),
@@ -185,7 +182,6 @@ def _entered(entered: list[Entry], campaign: Campaign) -> Iterator[str]:
 
 
 def sha256(path: Path) -> str:
-    """Checksum of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

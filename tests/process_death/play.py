@@ -27,8 +27,52 @@ from hil.progress import Silent
 from hil.simulation import simulated_controller
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.laws import broken_by
-from tests.process_death.rig import Seen, made, run
+from tests.process_death.rig import ARCHIVE, EXCHANGE, Seen, made, run
 from tests.process_death.rounds import Round, drawn
+
+
+@dataclass(frozen=True)
+class Defect:
+    module: str  # that the broken process runs
+    code: str  # what breaks it
+    found: str  # words of the law that finds it
+
+
+DEFECTS: Final = {
+    "archive-flushes-rarely": Defect(
+        ARCHIVE,
+        "from hil.archive import writer; writer.FLUSH_PERIOD = 5.0",
+        "lost with the archive process",
+    ),
+    "archive-drops-records": Defect(
+        ARCHIVE,
+        "from hil.archive.recorder import Recorder; write = Recorder._write; "
+        "Recorder._write = lambda self, rows: write(self, rows[rows['cycle'] % 61 != 0])",
+        "has gaps",
+    ),
+    "exchange-leaves-the-arm": Defect(
+        EXCHANGE,
+        "import os; from drivers.exchange.serving import Serving; "
+        "Serving._orphan = lambda *_: os._exit(0)",
+        "while the arm moved",
+    ),
+}
+
+_SITE: Final = """import sys
+if {module!r} in sys.orig_argv:
+    {code}
+"""
+
+
+def planted(name: str, folder: Path) -> Path:
+    """A folder that plants a defect in whoever has it on the path."""
+    defect, there = DEFECTS[name], folder / "planted"
+    there.mkdir()
+    (there / "sitecustomize.py").write_text(
+        _SITE.format(module=defect.module, code=defect.code), "utf-8"
+    )
+    return there
+
 
 SHORT: Final = {
     "repetitions": 2,
@@ -47,8 +91,6 @@ UNLIKELY: Final = 1e-9  # Chance that two estimates of one arm differ by more th
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """Parameters, and their covariance."""
-
     values: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
@@ -66,8 +108,6 @@ class Estimated:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What all rounds share."""
-
     folder: Path  # of the rounds
     cell: Cell  # of the small arm
     plan: CampaignPlan  # of its campaign
@@ -105,10 +145,7 @@ def estimate_of(campaign: Campaign) -> Estimated:
 
 
 def play(stage: Stage, number: int) -> dict[str, Any]:
-    """Play a round; what is worth writing down of it, `broken` among it.
-
-    Its folder is kept if something was broken.
-    """
+    """Play a round; what is worth writing down. Its folder stays if something was broken."""
     played, began = drawn(number), time.monotonic()
     used = os.times()
     folder = stage.folder / f"round_{number:05d}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import json
+import mmap
 import os
 import resource
 import select
@@ -26,7 +27,9 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.record import cycle_dtype
+from drivers import record
+from drivers.exchange.control import ControlBlock
+from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
 from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
 from hil.campaign.folder import Entry
@@ -34,9 +37,78 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port
 from hil.errors import HilError
 from hil.progress import Silent
-from tests.process_death import product
 from tests.process_death.controller import Page, Rows, at_rest, forked
 from tests.process_death.rounds import Round, Trigger, Victim
+
+EXCHANGE: Final = "drivers.exchange"
+ARCHIVE: Final = "hil.archive.process"
+JOINTS: Final = 2
+_RING, _CONTROL = 2, 4  # places in the exchange's command line, behind the module's name
+
+
+def started_by(supervisor: int, module: str) -> int:
+    """Process id of the child of a supervisor that runs a module, 0 if there is none."""
+    with suppress(OSError):
+        children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text()
+        for pid in map(int, children.split()):
+            if module in _words(pid):
+                return pid
+    return 0
+
+
+def marked(name: str, value: str) -> list[int]:
+    """Processes that were started with a variable in their environment, zombies left out."""
+    mark, found = f"{name}={value}".encode(), []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with suppress(OSError):
+                if mark in (entry / "environ").read_bytes().split(b"\0"):
+                    found.append(int(entry.name))
+    return found
+
+
+def _words(pid: int) -> list[str]:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    return []
+
+
+def _descriptor(exchange: int, place: int) -> int:
+    """One of the exchange's descriptors, opened here; OSError if it is gone."""
+    words = _words(exchange)
+    if EXCHANGE not in words:
+        raise ProcessLookupError(f"{exchange} is no exchange process any more")
+    number = words[words.index(EXCHANGE) + 1 + place]
+    return os.open(f"/proc/{exchange}/fd/{number}", os.O_RDWR)
+
+
+class Memory:
+    """The shared memory of an exchange, beyond its death; OSError if there is none any more."""
+
+    def __init__(self, exchange: int) -> None:
+        self._ring = _descriptor(exchange, _RING)
+        descriptor = _descriptor(exchange, _CONTROL)
+        self.control = ControlBlock(descriptor)
+        os.close(descriptor)
+        self._words = memoryview(mmap.mmap(self._ring, 4096)).cast("B").cast("q")
+
+    @property
+    def written(self) -> int:
+        return int(self._words[record._WRITTEN])
+
+    @property
+    def behind(self) -> int:
+        """Records written that the archive process has not taken; 0 before it has begun to."""
+        read = int(self._words[record._READ])
+        return self.written - read if read else 0
+
+    def records(self) -> NDArray[np.void]:
+        """All records of the session: the ring is larger than any of these."""
+        return RingReader(self._ring, JOINTS, acknowledge=False).drain()
+
+    def close(self) -> None:
+        os.close(self._ring)
+
 
 MARK: Final = "HIL_PROCESS_DEATH"
 """Variable in the environment of every process that a supervisor starts."""
@@ -76,7 +148,7 @@ class Watched:
     def __init__(self, page: Page, supervisor: int, controller: int, *, loops: bool) -> None:
         self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
         self.status: dict[int, int] = {}
-        self.memory: product.Memory | None = None
+        self.memory: Memory | None = None
         self._page, self._loops = page, loops
         self._ends: dict[int, int] = {}
         self._leaving: int | None = None
@@ -102,23 +174,21 @@ class Watched:
     def look(self) -> None:
         """Find what the supervisor has started meanwhile."""
         modules: tuple[tuple[Victim, str], ...] = (
-            ("exchange", product.EXCHANGE),
-            ("archive", product.ARCHIVE),
+            ("exchange", EXCHANGE),
+            ("archive", ARCHIVE),
         )
         for victim, module in modules:
-            if victim not in self.pids and (
-                pid := product.started_by(self.pids["supervisor"], module)
-            ):
+            if victim not in self.pids and (pid := started_by(self.pids["supervisor"], module)):
                 self._watch(pid)
                 self.pids[victim] = pid
-                self._page.tell(self.pids.get("exchange", 0))
+                self._page.exchange = self.pids.get("exchange", 0)
         if self.memory is None and "exchange" in self.pids:
             with suppress(OSError):
-                self.memory = product.Memory(self.pids["exchange"])
+                self.memory = Memory(self.pids["exchange"])
         if self.memory is not None:
             self._behind.append(self.memory.behind)
         if not self._loops and self._left_alone():
-            self._page.finish()  # as whoever stands at the cabinet would
+            self._page.finished = 1  # as whoever stands at the cabinet would
 
     def _left_alone(self) -> bool:
         """Whether nobody wants anything to move any more, and nothing does.
@@ -136,11 +206,7 @@ class Watched:
         return not moves and self._page.count - self._leaving > NOTICED
 
     def wait(self, *victims: Victim) -> None:
-        """Until they have ended.
-
-        Raises:
-            NeverHappenedError: one did not.
-        """
+        """Until they have ended; NeverHappenedError if one does not."""
         deadline = time.monotonic() + PATIENCE
         for victim in victims:
             while not self.over(victim):
@@ -165,7 +231,6 @@ class Watched:
         return Death(victim, written, max(self._behind, default=0))
 
     def close(self) -> None:
-        """End whatever is left, and let go."""
         for victim, pid in self.pids.items():
             if not self.over(victim):
                 with suppress(ProcessLookupError):
@@ -199,7 +264,6 @@ class Seen:
 
     @property
     def killed(self) -> tuple[Victim, ...]:
-        """Who was killed."""
         return tuple(death.victim for death in self.deaths)
 
 
@@ -210,10 +274,7 @@ def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
 
 
 def supervise(campaign: Path, said: Path, planted: Path | None) -> int:
-    """Be the supervisor: run what is missing; the exit status.
-
-    `said` tells what came of it: `complete`, or the name and the text of the error.
-    """
+    """Be the supervisor: run what is missing; the exit status, and in `said` what came of it."""
     os.environ[MARK] = str(campaign)
     if planted is not None:  # what this process can import, those that it starts can
         sys.path.insert(0, str(planted))
@@ -264,14 +325,13 @@ class _Due:
     def _modified(self) -> int:
         return (self._manifest.root / "manifest.json").stat().st_mtime_ns
 
-    def now(self, memory: product.Memory | None) -> bool:
-        """Look."""
+    def now(self, memory: Memory | None) -> bool:
         trigger = self._trigger
         match trigger.moment:
             case "start":
                 return True
             case "cycle":
-                return self._page.count >= trigger.count
+                return bool(self._page.count >= trigger.count)
             case "archive":
                 return sum(1 for _ in self._archives.iterdir()) >= trigger.count
             case "entered":
@@ -303,7 +363,7 @@ def _started(
         yield watched
     finally:
         watched.close()
-        for pid in product.marked(MARK, str(campaign.folder.root)):
+        for pid in marked(MARK, str(campaign.folder.root)):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
@@ -316,11 +376,7 @@ def run(
     planted: Path | None = None,
     how: Strike = "SIGKILL",
 ) -> Seen:
-    """Run a campaign with a controller of its own, and strike those `victims` when it is time.
-
-    Raises:
-        NeverHappenedError: something did not end.
-    """
+    """Run a campaign with a controller of its own, and strike those `victims` when it is time."""
     page = Page()
     with _started(campaign, played, page, said, planted) as watched:
         deaths: list[Death] = []
@@ -328,8 +384,8 @@ def run(
         watched.wait("supervisor", "exchange", "archive")
         rows = _until_the_arm_rests(watched, page)
         memory = watched.memory
-        records = np.zeros(0, cycle_dtype(product.JOINTS)) if memory is None else memory.records()
-        page.give_up()
+        records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
+        page.given_up = 1
         watched.wait("controller")
         supervisor = watched.pids["supervisor"]
         return Seen(
@@ -399,7 +455,7 @@ def _until_the_arm_rests(watched: Watched, page: Page) -> Rows:
 def _left(campaign: Campaign) -> list[int]:
     """Processes that should have ended; a child that plans a motion may take a moment."""
     deadline = time.monotonic() + 10.0
-    while left := product.marked(MARK, str(campaign.folder.root)):
+    while left := marked(MARK, str(campaign.folder.root)):
         if time.monotonic() > deadline:
             break
         time.sleep(20 * LOOK)

@@ -49,11 +49,7 @@ busybox poweroff -f
 
 
 def find_modules(kernel: Path) -> list[Path]:
-    """The modules needed with those they need, in the order of loading.
-
-    Raises:
-        FileNotFoundError: the kernel has no such module.
-    """
+    """The modules needed with those they need, in the order of loading."""
     files = {path.name.split(".")[0].replace("-", "_"): path for path in kernel.rglob("*.ko")}
     order: list[Path] = []
 

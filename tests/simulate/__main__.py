@@ -32,7 +32,6 @@ The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s f
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.simulate",
         description=__doc__,

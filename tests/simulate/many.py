@@ -30,11 +30,7 @@ _PREFIX: Final = "hil_simulate_"
 
 
 class Known:
-    """Verdicts by seed that a journal has, and those that are added to it; without a path none.
-
-    Raises:
-        JournalError: it is another file, or cannot be read or written.
-    """
+    """Verdicts by seed that a journal has, and those that are added to it; without a path none."""
 
     def __init__(self, path: Path | None) -> None:
         found = () if path is None else entries(path, Verdict.from_dict, "verdict on a seed")
@@ -42,17 +38,13 @@ class Known:
         self._journal = Journal(path, sync_every=60.0)  # s of which a loss of power costs
 
     def add(self, verdict: Verdict) -> None:
-        """Keep one more."""
         self.verdicts[verdict.seed] = verdict
         self._journal.add(**asdict(verdict))
 
 
 @contextmanager
 def stage_folder() -> Iterator[Path]:
-    """A folder in memory where there is one, taken away afterwards.
-
-    One that a killed process left behind is taken away by the next.
-    """
+    """A folder in memory where there is one, removed afterwards, or by the next if it is killed."""
     shared = Path("/dev/shm")
     where = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())
     for left in where.glob(f"{_PREFIX}*"):
@@ -69,10 +61,7 @@ def stage_folder() -> Iterator[Path]:
 def played(
     seeds: Sequence[int], known: Known, jobs: int, *, shrink: bool = True
 ) -> Iterator[Verdict]:
-    """Verdicts as they come, those first that are known; new ones are added to these.
-
-    Children end with this process, however it ends.
-    """
+    """Verdicts as they come, those first that are known. Children end with this process."""
     yield from (known.verdicts[seed] for seed in seeds if seed in known.verdicts)
     missing = [seed for seed in seeds if seed not in known.verdicts]
     groups = deque(deque(group) for _, group in groupby(missing, lambda seed: seed // NEIGHBOURS))

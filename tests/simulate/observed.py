@@ -137,7 +137,6 @@ class Observed:
 
     @property
     def ended(self) -> str:
-        """How the last life ended, in a word or a sentence."""
         last = self.runs[-1]
         if last.error is not None:
             return f"{type(last.error).__name__}: {last.error}"

@@ -107,14 +107,7 @@ def _twin(scene: Scene, folder: Path) -> Twin:
 
 
 def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Observed:
-    """Play a seed, or another script in its place.
-
-    Args:
-        seed: what is drawn.
-        twin: that of its group, seed // NEIGHBOURS.
-        root: where its campaign folder goes.
-        script: what goes wrong; None for what the seed draws.
-    """
+    """Play a seed in a folder below `root`, or another script in the place of the drawn one."""
     chance = random.Random(f"seed {seed}")
     settings = replace(
         twin.scene.controller,
@@ -152,10 +145,7 @@ def _observed(
 
 
 def estimated(root: Path) -> tuple[Estimated | None, str]:
-    """The estimate from a campaign folder, and why there is none.
-
-    As `hil identify` does it with fixed settings, without what it computes beside the parameters.
-    """
+    """The estimate from a folder as `hil identify` makes it with fixed settings, or why not."""
     folder = CampaignFolder(root)
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]

@@ -81,8 +81,6 @@ class Mishap:
 
 @dataclass(frozen=True)
 class Script:
-    """All that happens."""
-
     lines: tuple[str, ...]  # as written, in order
     faults: tuple[tuple[str, Fault], ...]  # of link, controller and arm, each with its line
     mishaps: tuple[Mishap, ...]  # of the PC, its disk and the person
@@ -92,7 +90,6 @@ class Script:
         return tuple(one for one in self.mishaps if KINDS[one.kind] == counts)
 
     def has(self, kind: str) -> bool:
-        """Whether there is a mishap of this kind."""
         return any(one.kind == kind for one in self.mishaps)
 
 
@@ -106,11 +103,7 @@ def kind_of(line: str) -> str:
 
 
 def parse_script(lines: Iterable[str]) -> Script:
-    """Read a script; empty lines and those that begin with # say nothing.
-
-    Raises:
-        ValueError: a line is none of the grammar's.
-    """
+    """Read a script; empty lines and # say nothing. ValueError if a line is none."""
     kept = [line.strip() for line in lines]
     kept = [line for line in kept if line and not line.startswith("#")]
     faults: list[tuple[str, Fault]] = []

@@ -24,13 +24,7 @@ Fails = Callable[[tuple[str, ...]], bool]
 
 
 def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple[str, ...]:
-    """A script of which no line can be left out or made plainer, as far as was tried.
-
-    Args:
-        lines: a script that fails.
-        fails: whether another one breaks the same law.
-        tries: how often that is asked, at most.
-    """
+    """A script that fails of which no line can be left out or simplified, as far as was tried."""
     left, current = [tries], tuple(lines)
 
     def still(candidate: tuple[str, ...]) -> bool:
@@ -144,22 +138,14 @@ class Verdict:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """From its fields, through JSON.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is none.
-        """
+        """From its fields, through JSON; KeyError, TypeError or ValueError if it is none."""
         lists = ("script", "struck", "met", "runs", "shrunk")
         broken = tuple((str(law), str(text)) for law, text in data["broken"])
         return cls(**data | {name: tuple(data[name]) for name in lists} | {"broken": broken})
 
 
 class Stage:
-    """Where seeds of one process are played; the run without faults is shared by neighbours.
-
-    Args:
-        root: folder for the campaigns, which are taken away again.
-    """
+    """Where seeds of one process are played; the run without faults is shared by neighbours."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -189,7 +175,6 @@ class Stage:
         return play(seed, twin, self._root, script)
 
     def clear(self) -> None:
-        """Take the folders of seeds away."""
         for old in self._root.glob("seed_*"):
             shutil.rmtree(old)
 
@@ -223,7 +208,6 @@ class Stage:
 
 
 def runs_of(seen: Observed) -> tuple[str, ...]:
-    """How each run ended, in a word."""
     return tuple(
         type(life.error).__name__
         if life.error is not None

@@ -27,12 +27,7 @@ LONGEST_STALL = 1.0  # s; a longer one is a loss
 
 
 class WatchedController:
-    """A peer that outlives the PC's processes, inflicts its faults, and keeps its history.
-
-    Attributes:
-        cycle: cycles begun so far, over all lives.
-        struck: lines that came to pass.
-    """
+    """A peer that outlives the PC's processes, inflicts its faults, and has its history."""
 
     def __init__(self, controller: SimulatedController, script: Script) -> None:
         self.controller = controller
@@ -51,7 +46,6 @@ class WatchedController:
 
     @property
     def ended(self) -> bool:
-        """Whether the controller's session is over."""
         return self.controller.phase is Phase.ENDED
 
     def next_packet(self) -> bytes | None:
@@ -153,12 +147,10 @@ class WatchedTransport(SimulatedTransport):
 
     @property
     def now(self) -> float:
-        """Time on the PC's clock."""
         return self._inner.now + self._clock.offset(self._inner.cycle)
 
     @property
     def at(self) -> int:
-        """The controller's cycle."""
         return self._inner.cycle
 
     def receive(self, timeout: float) -> bytes | None:
@@ -206,12 +198,7 @@ class StampedWatchedTransport(WatchedTransport):
 
 
 class SessionLog:
-    """What a link's session was told to do, and every record that it made.
-
-    Args:
-        link: just made.
-        transport: its own.
-    """
+    """What a new link's session was told to do, and every record that it made."""
 
     def __init__(self, link: Link, transport: WatchedTransport) -> None:
         self._transport, self._seen = transport, transport.seen
@@ -266,7 +253,6 @@ class SessionLog:
 
     @property
     def exchanged(self) -> tuple[Exchanged, ...]:
-        """All packets with their answers."""
         return tuple(
             Exchanged(
                 now, cycle, packet, tuple(replies), self._of.get(index, -1), index in self._given
@@ -276,5 +262,4 @@ class SessionLog:
 
     @property
     def records(self) -> NDArray[np.void]:
-        """All records."""
         return np.frombuffer(b"".join(self._rows), self._dtype)

@@ -85,7 +85,6 @@ class Disk:
         return {f"{what}s": count for what, count in self._count.items()}
 
     def begin(self) -> None:
-        """A new process begins."""
         self.dead = False
         self.failures, self.torn, self.refused = [], {}, set()
         self._paths.clear()
@@ -110,7 +109,6 @@ class Disk:
     # What stands in for `os` below archives.
 
     def open(self, path: Any, flags: int, mode: int = 0o777) -> int:
-        """Make an archive, or open a folder."""
         if flags & os.O_CREAT and self._due("create") is not None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         descriptor = os.open(path, flags, mode)
@@ -144,7 +142,6 @@ class Disk:
     # What stands in for `write_atomically` below manifests.
 
     def save(self, path: Path, content: str | bytes) -> None:
-        """Replace a file."""
         if self.dead:
             return
         mishap = self._due("save")
@@ -174,15 +171,7 @@ def planted(disk: Disk) -> Iterator[None]:
 
 
 class Person:
-    """An `Operator`.
-
-    Args:
-        script: wishes by the controller's cycle.
-        cycle: the present one.
-
-    Attributes:
-        struck: lines that came to pass.
-    """
+    """An `Operator` with requests by the controller's cycle."""
 
     can_answer = True
 
@@ -411,11 +400,7 @@ class World:
                 raise Killed(mishap.line)
 
     def _between(self, *, jog: bool) -> None:
-        """The controller goes on alone, and somebody sees to it before the next run.
-
-        Args:
-            jog: bring the arm home, as was asked for.
-        """
+        """The controller goes on alone, and somebody sees to it, or jogs the arm home if asked."""
         hurry = self.script.has("hurry") and self.controller.cycle <= self._last + _HURRIES
         hurried = hurry and not jog and not self.controller.ended
         if not hurried:

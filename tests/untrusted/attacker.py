@@ -90,7 +90,6 @@ def odd(rng: random.Random) -> Iterator[bytes]:
 
 
 def bodies(what: str, session: list[bytes], rng: random.Random) -> Iterator[bytes]:
-    """What is sent, without end."""
     if what == "odd":
         return odd(rng)
     if what == "init":
@@ -105,12 +104,7 @@ def bodies(what: str, session: list[bytes], rng: random.Random) -> Iterator[byte
 
 
 class Sender:
-    """Sends from this host's own address, or under another's.
-
-    Attributes:
-        sent: packets that the system took.
-        answered: packets that came back.
-    """
+    """Sends from this host's own address, or under another's."""
 
     def __init__(self, target: Address, source: Address | None) -> None:
         self._target, self._source = target, source
@@ -164,7 +158,6 @@ def address(text: str) -> Address:
 
 
 def main() -> int:
-    """Record or attack."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "what", choices=("record", "init", "sync", "cyclic", "later", "replay", "odd")

@@ -414,7 +414,6 @@ def read(folder: Path) -> list[str]:
 
 
 def doctored(path: Path, *place: str, value: object) -> None:
-    """Put another value into a JSON file."""
     content = at = json.loads(path.read_text())
     for key in place[:-1]:
         at = at[key]

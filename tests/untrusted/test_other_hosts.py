@@ -36,16 +36,12 @@ BROADCAST = "10.77.0.255"
 
 @dataclass(frozen=True)
 class Wire:
-    """The hosts, by the names in `HOSTS`."""
-
     prefix: str
 
     def command(self, host: str, *command: str) -> list[str]:
-        """What runs a command on one of the hosts."""
         return ["ip", "netns", "exec", f"{self.prefix}{host}", *command]
 
     def start(self, host: str, *command: str, **more: Any) -> subprocess.Popen[bytes]:
-        """Start a command on one of the hosts."""
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         return subprocess.Popen(self.command(host, *command), env=environment, **more)
 
@@ -230,7 +226,6 @@ class Hosts:
 
 
 def said(process: Process) -> dict[str, Any]:
-    """What a command says in the end."""
     out, errors = process.communicate(timeout=PATIENCE)
     assert out, errors.decode()
     return json.loads(out)
@@ -244,10 +239,7 @@ def moved(
     session: Path | None = None,
     begins: Literal["listening", "moving", "first"] = "listening",
 ) -> Told:
-    """Move the arm under an attack.
-
-    It begins when the PC's port is open, when the arm moves, or before there is a controller.
-    """
+    """Move the arm under an attack, which begins before there is a controller, or later."""
     with Hosts(net, folder, attack, session) as hosts:
         stranger = hosts.stranger()
         simulated = None if begins == "first" else hosts.controller()

@@ -29,7 +29,6 @@ CYCLES = 13
 
 @lru_cache
 def folder() -> Path:
-    """Where the archive lies."""
     return place_of("archive")
 
 

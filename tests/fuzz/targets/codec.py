@@ -48,11 +48,7 @@ class Talk:
         self._before: tuple[int, np.ndarray] | None = None
 
     def play(self) -> bool:
-        """Init packet, then cycles until the bytes run out.
-
-        Raises:
-            AssertionError: a law is broken.
-        """
+        """Init packet, then cycles until the bytes run out; AssertionError if a law is broken."""
         draw, number, answered = self._draw, 10, 0
         init = InitPacket.build(self._n, draw.choice((2, 1)), {}).encode()
         try:

@@ -34,7 +34,6 @@ _SEALED = re.compile(r'^sha256 = "[^"]*"', re.MULTILINE)
 
 @lru_cache
 def folder() -> Path:
-    """A campaign's folder."""
     return place_of("documents")
 
 

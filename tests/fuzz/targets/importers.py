@@ -72,13 +72,11 @@ TOPICS = ColumnMap.model_validate(
 
 @lru_cache
 def folder() -> Path:
-    """Where the recording lies."""
     return place_of("log")
 
 
 @lru_cache
 def robot() -> Robot:
-    """Whose it is."""
     path = folder() / "two.urdf"
     path.write_text(URDF)
     return Robot.from_urdf(path)

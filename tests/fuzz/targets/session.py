@@ -60,12 +60,10 @@ class Arm:
 
     @property
     def slots(self) -> tuple[int, ...]:
-        """Slot of each joint."""
         return tuple(self.axes.index((self.number, joint)) for joint in range(self.n))
 
     @property
     def arms(self) -> tuple[int, ...]:
-        """Arm of each slot."""
         return tuple(arm for arm, _ in self.axes)
 
 
@@ -171,11 +169,7 @@ class Conversation(Judged):
         self.run(1)
 
     def play(self) -> None:
-        """Begin, then step by step until the bytes run out.
-
-        Raises:
-            AssertionError: a law is broken.
-        """
+        """Begin, then step by step until the bytes run out; AssertionError if a law is broken."""
         draw = self._draw
         self.begin()
         for _ in range(STEPS):
@@ -311,7 +305,6 @@ class Conversation(Judged):
         self.ask_for(self._motion(other_kind=self._draw.chance(8)))
 
     def ask_for(self, source: ScriptedMotion | ScriptedCorrection) -> None:
-        """Request a motion or correction."""
         try:
             self.session.request(source)
         except RequestError:

@@ -46,7 +46,6 @@ DRAKES = '<?xml version="1.0" encoding="GB2312"?>' + TURNING.replace(
 
 @lru_cache
 def folder() -> Path:
-    """Where the description lies."""
     return place_of("urdf")
 
 
@@ -117,7 +116,6 @@ def as_a_model(text: str) -> bool:
 
 
 def refuses(read: Callable[[str], object], text: str) -> bool:
-    """Whether a reader refuses a description."""
     try:
         read(text)
     except ModelError:
