@@ -189,16 +189,8 @@ FAULTS: Final[Mapping[str, str]] = {
 }  # Each fault as the command line takes it, {c} for the cycle
 
 SITUATIONS: Final = (
-    "sync",
-    "init packet",
-    "init",
-    "drive off",
-    "driving on",
-    "closed",
-    "opening",
-    "open at rest",
-    "moving",
-    "exiting",
+    *("sync", "init packet", "init", "drive off", "driving on"),
+    *("closed", "opening", "open at rest", "moving", "exiting"),
 )
 ANSWER_MISSING: Final = frozenset(
     name for name in FAULTS if "lost" in name or "past" in name or "swap" in name or "dead" in name

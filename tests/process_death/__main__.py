@@ -46,7 +46,20 @@ _stage: Stage | None = None  # What rounds share; their processes are forked fro
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run rounds, or what is missing of them."""
-    given = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.process_death",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    option = parser.add_argument
+    option("--rounds", type=whole_number, default=50, help="how many (50)")
+    option("--start", type=whole_number, default=0, help="number of the first (0)")
+    option("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
+    option("--only", choices=VICTIMS, help="those rounds in which this process dies first")
+    option("--journal", type=Path, help="JSON lines with the results; made, and gone on with")
+    option("--json", action="store_true", help="print nothing but one JSON object")
+    option("--defect", choices=sorted(DEFECTS), help="break the product, to see that it is found")
+    given = parser.parse_args(arguments)
     # Also where a shell has started this in the background, and ignores SIGINT.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
@@ -82,28 +95,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         sys.stdout.writelines(f"{name:>16} {value}\n" for name, value in report.items())
     return 130 if interrupted else 1 if report["failed"] else 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.process_death",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--rounds", type=whole_number, default=50, help="how many (50)")
-    parser.add_argument("--start", type=whole_number, default=0, help="number of the first (0)")
-    parser.add_argument("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
-    parser.add_argument(
-        "--only", choices=VICTIMS, help="of these rounds, those in which this process dies first"
-    )
-    parser.add_argument(
-        "--journal", type=Path, help="file of JSON lines with the results; made, and gone on with"
-    )
-    parser.add_argument("--json", action="store_true", help="print nothing but one JSON object")
-    parser.add_argument(
-        "--defect", choices=sorted(DEFECTS), help="break the product so, to see that it is found"
-    )
-    return parser
 
 
 def _played(

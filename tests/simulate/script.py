@@ -39,27 +39,15 @@ with-dry-run@0                   the campaign is rehearsed and does its dry run
 declines@0x1                     the person does not accept the dry run the first time
 hurry@0                          runs are begun again at once, the controller left as it is"""
 
-KINDS: Final[dict[str, str]] = {
-    "stall": "cycle",
-    "clock": "cycle",
-    "kill": "cycle",
-    "interrupt": "cycle",
-    "power-cut": "cycle",
-    "lurch": "cycle",
-    "stop": "cycle",
-    "override": "cycle",
-    "hold": "cycle",
-    "kill-at-write": "write",
-    "disk-full": "write",
-    "disk-error": "write",
-    "short-write": "write",
-    "kill-at-save": "save",
-    "save-full": "save",
-    "create-full": "create",
-    "with-dry-run": "always",
-    "declines": "always",
-    "hurry": "always",
-}  # What `AT` of each kind counts
+_COUNTED: Final = {
+    "cycle": "stall clock kill interrupt power-cut lurch stop override hold",
+    "write": "kill-at-write disk-full disk-error short-write",
+    "save": "kill-at-save save-full",
+    "create": "create-full",
+    "always": "with-dry-run declines hurry",
+}
+KINDS: Final = {kind: what for what, kinds in _COUNTED.items() for kind in kinds.split()}
+"""What `AT` of each kind counts."""
 _LINE: Final = re.compile(
     r"(?P<kind>[a-z-]+)@(?P<at>\d{1,9})(?:x(?P<count>\d{1,6}))?(?P<options>(?::[^:\s]+)*)"
 )

@@ -620,10 +620,6 @@ def test_a_campaign_that_never_completes_is_found(observed: Observed) -> None:
     assert "not identified" in found(replace(observed, found=None), "completion")
 
 
-def test_a_run_that_ends_with_any_other_error_is_found(observed: Observed) -> None:
-    assert "TypeError" in found(with_life(observed, 0, error=TypeError("?")), "resume")
-
-
 def test_a_motion_that_completes_though_too_many_packets_were_missed_is_found(
     observed: Observed,
 ) -> None:

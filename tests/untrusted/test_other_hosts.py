@@ -71,7 +71,7 @@ def missing() -> str:
     done = subprocess.run(["ip", "netns", "add", name], capture_output=True, check=False)
     if done.returncode:
         return f"network namespaces are not permitted ({done.stderr.decode().strip()})"
-    _ip("netns", "del", name)
+    _ip(f"netns del {name}")
     return ""
 
 
@@ -91,36 +91,22 @@ def wire() -> Iterator[Wire]:
 
 def _make(prefix: str) -> None:
     switch = prefix + SWITCH
-    _ip("netns", "add", switch)
-    _ip("-n", switch, "link", "add", "br0", "type", "bridge")
-    _ip("-n", switch, "link", "set", "br0", "up")
+    _ip(f"netns add {switch}")
+    _ip(f"-n {switch} link add br0 type bridge")
+    _ip(f"-n {switch} link set br0 up")
     for host, address in HOSTS.items():
         space, plug = prefix + host, f"to_{host}"[:15]
-        _ip("netns", "add", space)
-        _ip(
-            "-n",
-            switch,
-            "link",
-            "add",
-            plug,
-            "type",
-            "veth",
-            "peer",
-            "name",
-            "eth0",
-            "netns",
-            space,
-        )
-        _ip("-n", switch, "link", "set", plug, "master", "br0")
-        _ip("-n", switch, "link", "set", plug, "up")
-        _ip("-n", space, "addr", "add", f"{address}/24", "brd", "+", "dev", "eth0")
+        _ip(f"netns add {space}")
+        _ip(f"-n {switch} link add {plug} type veth peer name eth0 netns {space}")
+        _ip(f"-n {switch} link set {plug} master br0")
+        _ip(f"-n {switch} link set {plug} up")
+        _ip(f"-n {space} addr add {address}/24 brd + dev eth0")
         for device in ("lo", "eth0"):
-            _ip("-n", space, "link", "set", device, "up")
+            _ip(f"-n {space} link set {device} up")
 
 
-def _ip(*words: str) -> None:
-    arguments: Sequence[str] = ("ip", *words)
-    subprocess.run(arguments, capture_output=True, check=True)
+def _ip(words: str) -> None:
+    subprocess.run(["ip", *words.split()], capture_output=True, check=True)
 
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,7 @@ JOINTS = ("shoulder", "elbow")
 CYCLES = 13
 
 
-@lru_cache
-def folder() -> Path:
-    return place_of("archive")
+folder = lru_cache(partial(place_of, "archive"))
 
 
 def run(data: bytes) -> bool:

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 from hil.campaign.dry_run import DryRun
@@ -32,9 +32,7 @@ NAMES = (
 _SEALED = re.compile(r'^sha256 = "[^"]*"', re.MULTILINE)
 
 
-@lru_cache
-def folder() -> Path:
-    return place_of("documents")
+folder = lru_cache(partial(place_of, "documents"))
 
 
 def run(data: bytes) -> bool:

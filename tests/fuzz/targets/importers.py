@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sqlite3
 from contextlib import closing
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -70,9 +70,7 @@ TOPICS = ColumnMap.model_validate(
 )
 
 
-@lru_cache
-def folder() -> Path:
-    return place_of("log")
+folder = lru_cache(partial(place_of, "log"))
 
 
 @lru_cache

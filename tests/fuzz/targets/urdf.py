@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +44,7 @@ DRAKES = '<?xml version="1.0" encoding="GB2312"?>' + TURNING.replace(
 )
 
 
-@lru_cache
-def folder() -> Path:
-    return place_of("urdf")
+folder = lru_cache(partial(place_of, "urdf"))
 
 
 def run(data: bytes) -> bool:
