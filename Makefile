@@ -48,7 +48,7 @@ test-all: $(STAMP)  ## every test but those that take minutes
 	$(PYTEST)
 
 test-slow: $(STAMP)  ## the tests that take minutes
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,fuzz,fuse]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,fuzz]'
 	$(BIN)/pytest -m slow
 
 coverage: $(STAMP)  ## lines and branches of drivers, planner and identification that tests reach

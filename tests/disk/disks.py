@@ -1,7 +1,7 @@
 """Disks to be put under a campaign that are slow, hang or refuse on demand.
 
-Through FUSE, or planted under Python's own functions. Beside the folder lie a file of the rules in
-force and one of what they have struck, so that whoever writes below may be another process.
+They are planted under Python's own functions. Beside the folder lie a file of the rules in force
+and one of what they have struck, so that whoever writes below may be another process.
 """
 
 from __future__ import annotations
@@ -9,14 +9,11 @@ from __future__ import annotations
 import builtins
 import errno
 import fnmatch
-import importlib.util
 import io
 import json
 import os
 import stat
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,11 +23,8 @@ from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
 
-import pytest
-
 from hil.files import write_atomically
 
-MOUNT_TIMEOUT = 20.0
 RULES, STRUCK = "rules.json", "struck.txt"
 CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
 CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # operations on which a disk may fail or hang
@@ -44,7 +38,6 @@ class Rule:
     after: int = 0  # how many matching operations pass before it begins
     times: int = 0  # on how many it then acts; 0: on all
     error: str = ""  # name of the error, "" for none
-    delay: float = 0.0  # s that each of them takes longer
     hang: float = 0.0  # s, counted from the first of them, until which none of them ends
 
 
@@ -86,7 +79,7 @@ class Faults:
                 if count <= rule.after or (rule.times and count > rule.after + rule.times):
                     continue
                 until = self._until.setdefault(number, time.monotonic() + rule.hang)
-                delay = max(delay, rule.delay, until - time.monotonic())
+                delay = max(delay, until - time.monotonic())
                 error = error or REFUSALS.get(rule.error, 0)
                 with (self._folder / STRUCK).open("a") as log:
                     log.write(f"{operation} {name}\n")
@@ -110,42 +103,8 @@ class Faults:
 
 
 @contextmanager
-def fuse_disk(folder: Path) -> Iterator[Disk]:
-    """One behind a process of its own, seen by every process of this computer; or skip the test."""
-    if importlib.util.find_spec("mfusepy") is None:
-        pytest.skip("mfusepy (extra `fuse`) is not installed")
-    if not os.access("/dev/fuse", os.R_OK | os.W_OK):
-        pytest.skip("/dev/fuse cannot be opened")
-    behind, root = folder / "behind", folder / "mounted"
-    behind.mkdir()
-    root.mkdir()
-    command = [sys.executable, "-m", "tests.disk.passthrough", str(behind), str(root)]
-    with tempfile.TemporaryFile() as words:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words)
-        assert process.stdin is not None
-        try:
-            deadline = time.monotonic() + MOUNT_TIMEOUT
-            while not root.is_mount():
-                if process.poll() is not None or time.monotonic() > deadline:
-                    words.seek(0)
-                    said = words.read().decode(errors="replace").strip().splitlines()
-                    pytest.skip(f"cannot be mounted: {said[-1] if said else 'no word'}")
-                time.sleep(0.02)
-            yield Disk(root)
-        finally:
-            with suppress(OSError):
-                process.stdin.close()
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                subprocess.run(["umount", "--lazy", str(root)], check=False, capture_output=True)
-
-
-@contextmanager
 def planted_disk(folder: Path) -> Iterator[Disk]:
-    """One under the functions of this process, where nothing can be mounted."""
+    """One under the functions of this process."""
     root = (folder / "planted").resolve()
     root.mkdir()
     with plant(Faults(root)):

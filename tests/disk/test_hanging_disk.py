@@ -20,7 +20,7 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port, loopback_link
 from hil.errors import ControllerFault
 from hil.progress import Silent
-from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, fuse_disk, processes_disk
+from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 PATIENCE = 120.0  # s for a process to get on, on a machine that does other things as well
@@ -28,12 +28,10 @@ RUN = (sys.executable, "-m", "hil", "run")
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 
 
-@pytest.fixture(scope="module", params=[fuse_disk, processes_disk])
-def disk(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Disk]:
-    with request.param(tmp_path_factory.mktemp("disk")) as mounted:
-        yield mounted
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
+    with processes_disk(tmp_path_factory.mktemp("disk")) as made:
+        yield made
 
 
 @dataclass(frozen=True)

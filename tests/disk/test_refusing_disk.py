@@ -1,7 +1,7 @@
 """A disk that refuses (EIO, EDQUOT, ENOSPC) at a drawn operation of a campaign.
 
 What was whole stays whole, the error names the file and what to do, and with the disk well again
-the same command completes. Each law is tried on a planted disk and on one mounted through FUSE.
+the same command completes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from tests.disk.disks import (
     WRITE,
     Disk,
     Rule,
-    fuse_disk,
     planted_disk,
 )
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -46,14 +45,10 @@ WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")
 REMEDIES = ("make room", "mend the disk", "another folder", "record again", "writable")
 
 
-@pytest.fixture(
-    scope="module", params=[planted_disk, pytest.param(fuse_disk, marks=pytest.mark.slow)]
-)
-def disk(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Disk]:
-    with request.param(tmp_path_factory.mktemp("disk")) as mounted:
-        yield mounted
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
+    with planted_disk(tmp_path_factory.mktemp("disk")) as made:
+        yield made
 
 
 @pytest.fixture(autouse=True)
