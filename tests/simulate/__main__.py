@@ -12,11 +12,10 @@ from pathlib import Path
 
 from hil.progress import reporter
 from tests.arguments import at_least_one, whole_number
-from tests.simulate.judging import judged
 from tests.simulate.many import Known, played, stage_folder
-from tests.simulate.playing import UndisturbedError
 from tests.simulate.script import GRAMMAR
-from tests.simulate.verdicts import Stage, Verdict, runs_of, summary
+from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
+from tests.simulate.world import UndisturbedError
 
 EPILOG = f"""\
 One seed is one arm, plan, person and script of faults, and always the same run:

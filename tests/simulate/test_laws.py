@@ -26,7 +26,6 @@ from hil.campaign.status import CampaignStatus
 from hil.errors import ControllerFault
 from tests.drivers import oracle
 from tests.hil.mcap_bytes import chunks
-from tests.simulate.judging import LAWS
 from tests.simulate.laws.archived import read
 from tests.simulate.laws.conversation import heard, talks_of
 from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
@@ -34,8 +33,9 @@ from tests.simulate.laws.judged import judge_whole
 from tests.simulate.laws.open_mode import modes_of, stretches
 from tests.simulate.laws.wire import Packets, safe_answers
 from tests.simulate.observed import Broken, Life, Observed
-from tests.simulate.playing import NEIGHBOURS, play, twin_of
 from tests.simulate.script import parse_script
+from tests.simulate.verdicts import LAWS
+from tests.simulate.world import NEIGHBOURS, play, twin_of
 
 SEED = 5
 FAULTS = (

@@ -22,10 +22,9 @@ from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.run import Runner
 from planner import TrajectoryPlayer
-from tests.simulate.judging import judged
 from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.verdicts import Stage
+from tests.simulate.verdicts import Stage, judged
 
 SEED = 6
 """Its controller goes on at the last velocity where answers are missing, up to eight of them."""

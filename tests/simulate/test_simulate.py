@@ -11,12 +11,11 @@ import pytest
 
 from tests.simulate import world
 from tests.simulate.__main__ import main
-from tests.simulate.judging import judged
 from tests.simulate.many import Known, stage_folder
-from tests.simulate.playing import SceneError, _twin, twin_of
 from tests.simulate.scenes import NEIGHBOURS, scene_of
 from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script, simpler
-from tests.simulate.verdicts import Stage, Verdict, shrunk, summary
+from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
+from tests.simulate.world import SceneError, _twin, twin_of
 
 STORY = Story(900, tuple(range(100, 800)), 3, 120, 40, 6, 6)
 
