@@ -11,7 +11,11 @@ import mmap
 import os
 import select
 import signal
+import sys
 import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -159,7 +163,12 @@ class _PageButtons(Buttons):
 
 
 def serve(cell: Cell, played: Round, page: Page) -> None:
-    """Be the controller of a round until the session has ended, or the page says so."""
+    """Be the controller of a round until the session has ended, or the page says so.
+
+    It does not outlive the process that watches.
+    """
+    die_with_parent(signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end = WaitingEnd(cell.controller.host or "", cell.controller.port or 0, page)
     settings = replace(
         controller_settings(cell),
@@ -200,18 +209,19 @@ def die_with_parent(how: int = signal.SIGTERM) -> None:
     ctypes.CDLL(None).prctl(_PDEATHSIG, int(how))
 
 
-def forked(cell: Cell, played: Round, page: Page) -> int:
-    """Process id of the controller of a round; it does not outlive this process."""
+def forked(serve: Callable[[], int | None]) -> int:
+    """Process id of a process that does this; its exit status is what that returns."""
     pid = os.fork()
     if pid:
         return pid
     status = 70
     try:
-        die_with_parent(signal.SIGKILL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        serve(cell, played, page)
-        status = 0
+        status = serve() or 0
+    except BaseException:
+        traceback.print_exc()
     finally:
+        with suppress(Exception):
+            sys.stderr.flush()
         os._exit(status)
 
 

@@ -17,12 +17,12 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,12 @@ from hil.cell import Cell
 from hil.demo_link import LOOPBACK, free_port
 from hil.errors import HilError
 from hil.progress import Silent
-from tests.process_death.controller import Page, Rows, at_rest, forked
-from tests.process_death.rounds import Round, Trigger, Victim
+from tests.process_death.controller import Page, Rows, at_rest, forked, serve
+from tests.process_death.rounds import Round, Victim
 
 EXCHANGE: Final = "drivers.exchange"
 ARCHIVE: Final = "hil.archive.process"
+MODULES: Final[dict[Victim, str]] = {"exchange": EXCHANGE, "archive": ARCHIVE}
 JOINTS: Final = 2
 _RING, _CONTROL = 2, 4  # places in the exchange's command line, behind the module's name
 
@@ -130,128 +131,16 @@ class NeverHappenedError(AssertionError):
 
 @dataclass(eq=False)
 class Death:
-    """One kill.
-
-    Attributes:
-        behind: of them, how many the archive process had not taken at some moment of the last
-            second.
-    """
+    """One kill."""
 
     victim: Victim  # who died
     written: int  # records that the exchange had written just before
-    behind: int = 0
-
-
-class Watched:
-    """The processes of one run while it goes on."""
-
-    def __init__(self, page: Page, supervisor: int, controller: int, *, loops: bool) -> None:
-        self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
-        self.status: dict[int, int] = {}
-        self.memory: Memory | None = None
-        self._page, self._loops = page, loops
-        self._ends: dict[int, int] = {}
-        self._leaving: int | None = None
-        self._behind: deque[int] = deque(maxlen=round(1.0 / LOOK))
-        self._watch(supervisor)
-        self._watch(controller)
-
-    def _watch(self, pid: int) -> None:
-        with suppress(ProcessLookupError):
-            self._ends[pid] = os.pidfd_open(pid)
-
-    def over(self, victim: Victim) -> bool:
-        """Whether a process has ended; one that never began counts as ended."""
-        pid = self.pids.get(victim, 0)
-        if pid not in self._ends:
-            return True
-        if not select.select([self._ends[pid]], [], [], 0.0)[0]:
-            return False
-        if victim in ("supervisor", "controller") and pid not in self.status:
-            self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        return True
-
-    def look(self) -> None:
-        """Find what the supervisor has started meanwhile."""
-        modules: tuple[tuple[Victim, str], ...] = (
-            ("exchange", EXCHANGE),
-            ("archive", ARCHIVE),
-        )
-        for victim, module in modules:
-            if victim not in self.pids and (pid := started_by(self.pids["supervisor"], module)):
-                self._watch(pid)
-                self.pids[victim] = pid
-                self._page.exchange = self.pids.get("exchange", 0)
-        if self.memory is None and "exchange" in self.pids:
-            with suppress(OSError):
-                self.memory = Memory(self.pids["exchange"])
-        if self.memory is not None:
-            self._behind.append(self.memory.behind)
-        if not self._loops and self._left_alone():
-            self._page.finished = 1  # as whoever stands at the cabinet would
-
-    def _left_alone(self) -> bool:
-        """Whether nobody wants anything to move any more, and nothing does.
-
-        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
-        meanwhile. A controller that is told to end closes its axes as soon as their targets stand,
-        which they also do at the begin of a motion.
-        """
-        control = None if self.memory is None else self.memory.control
-        if not (self.over("supervisor") or (control is not None and control.finish)):
-            return False
-        if self._leaving is None:
-            self._leaving = self._page.count
-        moves = control is not None and control.state in MAY_MOVE and not self.over("exchange")
-        return not moves and self._page.count - self._leaving > NOTICED
-
-    def wait(self, *victims: Victim) -> None:
-        """Until they have ended; NeverHappenedError if one does not."""
-        deadline = time.monotonic() + PATIENCE
-        for victim in victims:
-            while not self.over(victim):
-                self.look()
-                if time.monotonic() > deadline:
-                    raise NeverHappenedError(f"the {victim} never ended")
-                time.sleep(5 * LOOK)
-
-    def strike(self, victim: Victim, how: Strike, archives: Path) -> Death:
-        """Kill a process, or do something else to it."""
-        pid, written = self.pids[victim], 0 if self.memory is None else self.memory.written
-        with suppress(ProcessLookupError):
-            match how:
-                case "full disk":
-                    newest = max(archives.iterdir(), key=lambda one: one.stat().st_mtime_ns)
-                    most = newest.stat().st_size + 1000
-                    resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
-                case "SIGINT" | "SIGHUP":  # as a terminal sends them
-                    os.killpg(pid, signal.Signals[how])
-                case _:
-                    os.kill(pid, signal.Signals[how])
-        return Death(victim, written, max(self._behind, default=0))
-
-    def close(self) -> None:
-        for victim, pid in self.pids.items():
-            if not self.over(victim):
-                with suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-        for victim in ("supervisor", "controller"):
-            pid = self.pids[victim]
-            if pid not in self.status:
-                self.status[pid] = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        for end in self._ends.values():
-            os.close(end)
-        if self.memory is not None:
-            self.memory.close()
+    behind: int = 0  # of them those not archived yet at some moment of the last second, at most
 
 
 @dataclass(eq=False)
 class Seen:
-    """What was seen of one run of a campaign.
-
-    Attributes:
-        left: process ids that were still there when all should have ended.
-    """
+    """What was seen of one run of a campaign."""
 
     deaths: list[Death]  # in order
     status: int | None  # exit status of the supervisor, None if it was killed
@@ -259,12 +148,177 @@ class Seen:
     rows: Rows  # the controller's account up to when everything else had ended
     records: NDArray[np.void]  # the exchange's, from its memory
     entered: list[Entry]  # manifest as it was before the first kill
-    left: list[int] = field(default_factory=list)
+    left: list[int] = field(default_factory=list)  # processes that should have ended
     port_taken: bool = False  # whether nobody else could have had the port afterwards
 
     @property
     def killed(self) -> tuple[Victim, ...]:
         return tuple(death.victim for death in self.deaths)
+
+
+class Watched:
+    """The processes of one run while it goes on; they end with the block."""
+
+    def __init__(self, campaign: Campaign, played: Round, said: Path, planted: Path | None) -> None:
+        self.campaign, self.played, self.page = campaign, played, Page()
+        controller = forked(lambda: serve(campaign.cell, played, self.page))
+        supervisor = forked(lambda: supervise(campaign.folder.root, said, planted))
+        self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
+        self.status: dict[Victim, int] = {}
+        self.memory: Memory | None = None
+        self._ends: dict[Victim, int] = {}
+        self._leaving: int | None = None
+        self._behind: deque[int] = deque(maxlen=round(1.0 / LOOK))
+        for victim in ("supervisor", "controller"):
+            self._watch(victim)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for victim, pid in self.pids.items():
+            if not self.over(victim):
+                _kill(pid)
+        for victim in ("supervisor", "controller"):
+            self._reap(victim)
+        for end in self._ends.values():
+            os.close(end)
+        if self.memory is not None:
+            self.memory.close()
+        for pid in marked(MARK, str(self.campaign.folder.root)):
+            _kill(pid)
+
+    def _watch(self, victim: Victim) -> None:
+        with suppress(ProcessLookupError):
+            self._ends[victim] = os.pidfd_open(self.pids[victim])
+
+    def _reap(self, victim: Victim) -> None:
+        if victim in ("supervisor", "controller") and victim not in self.status:
+            status = os.waitpid(self.pids[victim], 0)[1]
+            self.status[victim] = os.waitstatus_to_exitcode(status)
+
+    def over(self, victim: Victim) -> bool:
+        """Whether a process has ended; one that never began counts as ended."""
+        if victim not in self._ends:
+            return True
+        if not select.select([self._ends[victim]], [], [], 0.0)[0]:
+            return False
+        self._reap(victim)
+        return True
+
+    def look(self) -> None:
+        """Find what the supervisor has started meanwhile."""
+        for victim, module in MODULES.items():
+            if victim not in self.pids and (pid := started_by(self.pids["supervisor"], module)):
+                self.pids[victim] = pid
+                self._watch(victim)
+                self.page.exchange = self.pids.get("exchange", 0)
+        if self.memory is None and "exchange" in self.pids:
+            with suppress(OSError):
+                self.memory = Memory(self.pids["exchange"])
+        if self.memory is not None:
+            self._behind.append(self.memory.behind)
+        if not self.played.loops and self._left_alone():
+            self.page.finished = 1  # as whoever stands at the cabinet would
+
+    def _left_alone(self) -> bool:
+        """Whether nobody wants anything to move any more, and nothing does.
+
+        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
+        meanwhile. A controller that is to end closes its axes as soon as their targets stand, which
+        they also do at the begin of a motion.
+        """
+        control = None if self.memory is None else self.memory.control
+        if not (self.over("supervisor") or (control is not None and control.finish)):
+            return False
+        if self._leaving is None:
+            self._leaving = self.page.count
+        moves = control is not None and control.state in MAY_MOVE and not self.over("exchange")
+        return not moves and self.page.count - self._leaving > NOTICED
+
+    def until(self, done: Callable[[], bool], what: str, every: float = LOOK) -> None:
+        """Look until something has come about; NeverHappenedError if it does not."""
+        deadline = time.monotonic() + PATIENCE
+        while not done():
+            self.look()
+            if time.monotonic() > deadline:
+                raise NeverHappenedError(f"{what} never happened")
+            time.sleep(every)
+
+    def wait(self, *victims: Victim) -> None:
+        """Until they have ended."""
+        for victim in victims:
+            self.until(
+                lambda victim=victim: self.over(victim), f"the end of the {victim}", 5 * LOOK
+            )  # type: ignore[misc]
+
+    def struck(self, victims: tuple[Victim, ...], how: Strike) -> tuple[list[Death], list[Entry]]:
+        """Wait for the moment and strike; who died, and the manifest as it was before."""
+        due, deaths = _Due(self), list[Death]()
+        self.until(
+            lambda: self.over("supervisor") or (bool(victims) and due.now()),
+            "neither the campaign's end nor the kill",
+        )
+        if self.over("supervisor"):
+            return deaths, self.campaign.folder.manifest()
+        entered = self.campaign.folder.manifest()
+        until = time.monotonic() + self.played.trigger.delay
+        while (left := until - time.monotonic()) > 0.0:
+            self.look()
+            time.sleep(min(left, LOOK))
+        for place, victim in enumerate(victims):
+            if place:
+                time.sleep(self.played.apart)
+            while victim not in self.pids and not self.over("supervisor"):
+                self.look()
+                time.sleep(LOOK)
+            if victim in self.pids and not self.over(victim):
+                written = 0 if self.memory is None else self.memory.written
+                self._strike(victim, how)
+                if how not in ("SIGINT", "SIGHUP"):  # which nobody dies of
+                    deaths.append(Death(victim, written, max(self._behind, default=0)))
+        return deaths, entered
+
+    def _strike(self, victim: Victim, how: Strike) -> None:
+        pid = self.pids[victim]
+        with suppress(ProcessLookupError):
+            if how == "full disk":
+                archives = self.campaign.folder.archives.iterdir()
+                newest = max(archives, key=lambda one: one.stat().st_mtime_ns)
+                most = newest.stat().st_size + 1000
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, most))
+            elif how in ("SIGINT", "SIGHUP"):  # as a terminal sends them
+                os.killpg(pid, signal.Signals[how])
+            else:
+                os.kill(pid, signal.Signals[how])
+
+    def rest(self) -> Rows:
+        """Nobody replies any more: the account until the controller alone has its arm at rest.
+
+        And no longer: some open their axes again and again, whoever listens.
+        """
+        deadline = time.monotonic() + PATIENCE  # after which the laws will say so
+        while True:
+            # One that nobody ever answered has not begun; one that ended its session is done.
+            done = self.over("controller") or time.monotonic() > deadline
+            rows = self.page.rows()
+            if done or not len(rows) or at_rest(rows):
+                return rows
+            time.sleep(5 * LOOK)
+
+    def left(self) -> list[int]:
+        """Processes that should have ended; a child that plans a motion may take a moment."""
+        deadline = time.monotonic() + 10.0
+        while left := marked(MARK, str(self.campaign.folder.root)):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(20 * LOOK)
+        return left
+
+
+def _kill(pid: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
 
 
 def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
@@ -275,73 +329,56 @@ def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
 
 def supervise(campaign: Path, said: Path, planted: Path | None) -> int:
     """Be the supervisor: run what is missing; the exit status, and in `said` what came of it."""
+    os.setsid()
+    words = os.open(said.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for ours, standard in ((nothing, 0), (words, 1), (words, 2)):
+        os.dup2(ours, standard)
     os.environ[MARK] = str(campaign)
     if planted is not None:  # what this process can import, those that it starts can
         sys.path.insert(0, str(planted))
-    told: dict[str, object]
+    outcome: dict[str, object]
     try:
         with stop_on_interrupt() as stop:
             result = Campaign.open(campaign).run(None, stop, Silent(), unrehearsed=True)
-        told, status = {"complete": result.complete, "rejected": len(result.rejected)}, 0
+        outcome, status = {"complete": result.complete, "rejected": len(result.rejected)}, 0
     except HilError as error:
-        told = {"error": type(error).__name__, "text": str(error)}
+        outcome = {"error": type(error).__name__, "text": str(error)}
         status = error.exit_code
-    said.write_text(json.dumps(told))
+    said.write_text(json.dumps(outcome))
     return status
-
-
-def _forked_supervisor(campaign: Path, said: Path, planted: Path | None) -> int:
-    pid = os.fork()
-    if pid:
-        return pid
-    status = 70
-    try:
-        os.setsid()
-        words = os.open(said.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        nothing = os.open(os.devnull, os.O_RDONLY)
-        for ours, standard in ((nothing, 0), (words, 1), (words, 2)):
-            os.dup2(ours, standard)
-        status = supervise(campaign, said, planted)
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-    finally:
-        with suppress(Exception):
-            sys.stderr.flush()
-        os._exit(status)
 
 
 class _Due:
     """Whether the moment of a trigger has come."""
 
-    def __init__(self, trigger: Trigger, campaign: Campaign, page: Page) -> None:
-        self._trigger, self._page = trigger, page
-        self._archives, self._manifest = campaign.folder.archives, campaign.folder
+    def __init__(self, watched: Watched) -> None:
+        self._watched, self._trigger = watched, watched.played.trigger
+        self._folder = watched.campaign.folder
         self._begun = self._modified()
         self._entered = 0
         self._state, self._times = -1, 0
 
     def _modified(self) -> int:
-        return (self._manifest.root / "manifest.json").stat().st_mtime_ns
+        return (self._folder.root / "manifest.json").stat().st_mtime_ns
 
-    def now(self, memory: Memory | None) -> bool:
+    def now(self) -> bool:
         trigger = self._trigger
         match trigger.moment:
             case "start":
                 return True
             case "cycle":
-                return bool(self._page.count >= trigger.count)
+                return bool(self._watched.page.count >= trigger.count)
             case "archive":
-                return sum(1 for _ in self._archives.iterdir()) >= trigger.count
+                return sum(1 for _ in self._folder.archives.iterdir()) >= trigger.count
             case "entered":
                 modified = self._modified()
                 self._entered += modified != self._begun
                 self._begun = modified
                 return self._entered >= trigger.count
-        if memory is None:
+        if self._watched.memory is None:
             return False
-        control = memory.control
+        control = self._watched.memory.control
         if trigger.moment == "motion":
             ended, going_on = control.ended_count, control.program_accepted
             on_the_way = going_on == trigger.count and control.motion_time >= trigger.way
@@ -350,22 +387,6 @@ class _Due:
         self._times += state == trigger.state and state != self._state
         self._state = state
         return self._times >= trigger.count
-
-
-@contextmanager
-def _started(
-    campaign: Campaign, played: Round, page: Page, said: Path, planted: Path | None
-) -> Iterator[Watched]:
-    controller = forked(campaign.cell, played, page)
-    supervisor = _forked_supervisor(campaign.folder.root, said, planted)
-    watched = Watched(page, supervisor, controller, loops=played.loops)
-    try:
-        yield watched
-    finally:
-        watched.close()
-        for pid in marked(MARK, str(campaign.folder.root)):
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
 
 
 def run(
@@ -377,89 +398,24 @@ def run(
     how: Strike = "SIGKILL",
 ) -> Seen:
     """Run a campaign with a controller of its own, and strike those `victims` when it is time."""
-    page = Page()
-    with _started(campaign, played, page, said, planted) as watched:
-        deaths: list[Death] = []
-        entered = _struck(watched, campaign, played, page, victims, how, deaths)
+    with Watched(campaign, played, said, planted) as watched:
+        deaths, entered = watched.struck(victims, how)
         watched.wait("supervisor", "exchange", "archive")
-        rows = _until_the_arm_rests(watched, page)
-        memory = watched.memory
+        rows, memory = watched.rest(), watched.memory
         records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
-        page.given_up = 1
+        watched.page.given_up = 1
         watched.wait("controller")
-        supervisor = watched.pids["supervisor"]
+        killed = "supervisor" in {one.victim for one in deaths}
         return Seen(
             deaths,
-            None if "supervisor" in {one.victim for one in deaths} else watched.status[supervisor],
+            None if killed else watched.status["supervisor"],
             json.loads(said.read_text()) if said.exists() else {},
             rows,
             records,
-            campaign.folder.manifest() if entered is None else entered,
-            left=_left(campaign),
+            entered,
+            left=watched.left(),
             port_taken=_port_taken(campaign.cell.controller.port or 0),
         )
-
-
-def _struck(
-    watched: Watched,
-    campaign: Campaign,
-    played: Round,
-    page: Page,
-    victims: tuple[Victim, ...],
-    how: Strike,
-    deaths: list[Death],
-) -> list[Entry] | None:
-    """Wait for the moment and strike; the manifest as it was before, None if it never came."""
-    due = _Due(played.trigger, campaign, page)
-    deadline = time.monotonic() + PATIENCE
-    while not (watched.over("supervisor") or (victims and due.now(watched.memory))):
-        watched.look()
-        if time.monotonic() > deadline:
-            raise NeverHappenedError("the campaign came neither to its end nor to the kill")
-        time.sleep(LOOK)
-    if watched.over("supervisor"):
-        return None
-    entered = campaign.folder.manifest()
-    until = time.monotonic() + played.trigger.delay
-    while (left := until - time.monotonic()) > 0.0:
-        watched.look()
-        time.sleep(min(left, LOOK))
-    for place, victim in enumerate(victims):
-        if place:
-            time.sleep(played.apart)
-        while victim not in watched.pids and not watched.over("supervisor"):
-            watched.look()
-            time.sleep(LOOK)
-        if victim in watched.pids and not watched.over(victim):
-            death = watched.strike(victim, how, campaign.folder.archives)
-            if how not in ("SIGINT", "SIGHUP"):  # which nobody dies of
-                deaths.append(death)
-    return entered
-
-
-def _until_the_arm_rests(watched: Watched, page: Page) -> Rows:
-    """Nobody answers any more: the account until the controller alone has its arm at rest.
-
-    And no longer: some open their axes again and again, whoever listens.
-    """
-    deadline = time.monotonic() + PATIENCE  # after which the laws will say so
-    while True:
-        # A controller that nobody ever answered has not begun; one that ended its session is done.
-        done = watched.over("controller") or time.monotonic() > deadline
-        rows = page.rows()
-        if done or not len(rows) or at_rest(rows):
-            return rows
-        time.sleep(5 * LOOK)
-
-
-def _left(campaign: Campaign) -> list[int]:
-    """Processes that should have ended; a child that plans a motion may take a moment."""
-    deadline = time.monotonic() + 10.0
-    while left := marked(MARK, str(campaign.folder.root)):
-        if time.monotonic() > deadline:
-            break
-        time.sleep(20 * LOOK)
-    return left
 
 
 def _port_taken(port: int) -> bool:
