@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 from typing import Any, Final, Literal, Self
@@ -248,9 +249,7 @@ class Watched:
     def wait(self, *victims: Victim) -> None:
         """Until they have ended."""
         for victim in victims:
-            self.until(
-                lambda victim=victim: self.over(victim), f"the end of the {victim}", 5 * LOOK
-            )  # type: ignore[misc]
+            self.until(partial(self.over, victim), f"the end of the {victim}", 5 * LOOK)
 
     def struck(self, victims: tuple[Victim, ...], how: Strike) -> tuple[list[Death], list[Entry]]:
         """Wait for the moment and strike; who died, and the manifest as it was before."""
