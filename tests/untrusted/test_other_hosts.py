@@ -16,9 +16,10 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias
 
@@ -128,7 +129,7 @@ def net() -> Iterator[Wire]:
 
 
 @dataclass(frozen=True)
-class Told:
+class Outcome:
     """What the three hosts say afterwards."""
 
     move: dict[str, Any]
@@ -199,7 +200,7 @@ class Hosts:
         """Whether the arm is about to move, or does."""
         return bool(list(self.archive.parent.glob("moved.mcap*")))
 
-    def tell(self, stranger: Process) -> None:
+    def start_attack(self, stranger: Process) -> None:
         """Let him begin, under the controller's port if he was asked for that."""
         port = 0
         if "--port" in self._attack:
@@ -224,7 +225,7 @@ def moved(
     *,
     session: Path | None = None,
     begins: Literal["listening", "moving", "first"] = "listening",
-) -> Told:
+) -> Outcome:
     """Move the arm under an attack, which begins before there is a controller, or later."""
     with Hosts(net, folder, attack, session) as hosts:
         stranger = hosts.stranger()
@@ -233,7 +234,7 @@ def moved(
         assert net.await_port("pc", PORT, PATIENCE), move.communicate()
         while begins == "moving" and not hosts.moves() and move.poll() is None:
             time.sleep(0.02)
-        hosts.tell(stranger)
+        hosts.start_attack(stranger)
         simulated = simulated or hosts.controller()
         move_said = said(move)
         if begins == "first":  # it would go on asking
@@ -242,7 +243,7 @@ def moved(
         stranger.send_signal(signal.SIGTERM)
         stranger_said = said(stranger)
     archive = open_archive(hosts.archive) if hosts.archive.exists() else None
-    return Told(move_said, move.returncode, simulated_said, stranger_said, archive)
+    return Outcome(move_said, move.returncode, simulated_said, stranger_said, archive)
 
 
 @pytest.fixture(scope="module")
@@ -250,21 +251,30 @@ def session(net: Wire, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session as it went over the wire: sync, init, cyclic packets, motion and end."""
     folder = tmp_path_factory.mktemp("recorded")
     path = folder / "session.bin"
-    told = moved(net, folder, ("record",), session=path)
-    assert told.code == 0
-    assert told.stranger["recorded"] == pytest.approx(told.controller["cycles"], abs=50)
+    found = moved(net, folder, ("record",), session=path)
+    assert found.code == 0
+    assert found.stranger["recorded"] == pytest.approx(found.controller["cycles"], abs=50)
     return path
 
 
-def went_on(told: Told) -> None:
+def went_on(found: Outcome) -> None:
     """The controller got each answer once, and the arm went where it was to go."""
-    assert told.code == 0, told.move
-    assert told.controller["replies"] == told.controller["cycles"]
-    assert told.controller["missed"] == told.controller["surplus"] == 0
-    assert told.archive is not None
-    assert told.archive.complete
-    assert told.archive.outcome is not None
-    assert told.archive.outcome.entries["lost_packets"] == "0"
+    assert found.code == 0, found.move
+    assert found.controller["replies"] == found.controller["cycles"]
+    assert found.controller["missed"] == found.controller["surplus"] == 0
+    assert found.archive is not None
+    assert found.archive.complete
+    assert found.archive.outcome is not None
+    assert found.archive.outcome.entries["lost_packets"] == "0"
+
+
+Attack = Callable[..., Outcome]
+
+
+@pytest.fixture
+def attacked(net: Wire, session: Path, tmp_path: Path) -> Attack:
+    """Moves the arm under an attack with the recorded session."""
+    return partial(moved, net, tmp_path, session=session)
 
 
 OWN = {
@@ -275,118 +285,101 @@ OWN = {
     "packets from the address of all": ("init", "--rate", "200", "--as", f"{BROADCAST}:5555"),
     "lengths that no packet has, and fragments": ("odd", "--rate", "500"),
 }
+UNDER_ANOTHER_PORT = ("--as", f"{CONTROLLER}:5555")
 
 
 @pytest.mark.parametrize("what", OWN)
-def test_another_host_is_counted_and_gets_no_answer(
-    what: str, net: Wire, session: Path, tmp_path: Path
-) -> None:
-    told = moved(net, tmp_path, OWN[what], session=session)
-    went_on(told)
-    assert told.rejected["foreign"] > 500
-    assert told.stranger["sent"] > 500
-    assert told.stranger["answered"] == 0
+def test_another_host_is_ignored_and_gets_no_reply(what: str, attacked: Attack) -> None:
+    found = attacked(OWN[what])
+    went_on(found)
+    assert found.rejected["foreign"] > 500
+    assert found.stranger["sent"] > 500
+    assert found.stranger["answered"] == 0
 
 
-def test_what_goes_to_everybody_does_not_arrive(net: Wire, session: Path, tmp_path: Path) -> None:
-    attack = ("init", "--rate", "200", "--to", f"{BROADCAST}:{PORT}")
-    told = moved(net, tmp_path, attack, session=session)
-    went_on(told)
-    assert told.stranger["sent"] > 500
-    assert not told.rejected
-    assert told.stranger["answered"] == 0
+def test_what_goes_to_everybody_does_not_arrive(attacked: Attack) -> None:
+    found = attacked(("init", "--rate", "200", "--to", f"{BROADCAST}:{PORT}"))
+    went_on(found)
+    assert found.stranger["sent"] > 500
+    assert not found.rejected
+    assert found.stranger["answered"] == 0
 
 
 @pytest.mark.parametrize("what", ["init", "replay"])
-def test_another_port_of_the_controllers_address_is_a_stranger_too(
-    what: str, net: Wire, session: Path, tmp_path: Path
+def test_another_port_of_the_controllers_address_is_foreign_too(
+    what: str, attacked: Attack
 ) -> None:
-    """A second controller that starts, or a stranger who writes the controller's address."""
-    under = ("--as", f"{CONTROLLER}:5555")
-    told = moved(net, tmp_path, (what, "--rate", "200", *under), session=session, begins="moving")
-    went_on(told)
-    assert told.rejected["foreign"] > 500
+    """A second controller that starts, or somebody who writes the controller's address."""
+    found = attacked((what, "--rate", "200", *UNDER_ANOTHER_PORT), begins="moving")
+    went_on(found)
+    assert found.rejected["foreign"] > 500
 
 
-def kept_its_limits(archive: Archive, cell: Cell) -> None:
-    """Nothing was sent that a stop may not do; an arm that is not stopped does less."""
-    limits = cell.guard_limits
-    sent = archive.cycles()["commanded_position"]
-    assert np.nanmin(sent - limits.lower) >= 0.0
-    assert np.nanmax(sent - limits.upper) <= 0.0
-    widest = (
-        limits.velocity,
-        limits.acceleration * limits.stop_acceleration,
-        limits.jerk * limits.stop_jerk,
-    )
-    for order, bound in enumerate(widest, 1):
-        assert np.nanmax(np.abs(np.diff(sent, order, axis=0)) / PERIOD**order / bound) <= 1.0
-
-
-def ended(told: Told) -> None:
+def ended(found: Outcome) -> None:
     """The command ends with exit status 4 and one sentence that says why."""
-    assert told.code == 4, told.move
-    assert told.move["error"]
-    assert "\n" not in told.move["error"]
+    assert found.code == 4, found.move
+    assert found.move["error"]
+    assert "\n" not in found.move["error"]
 
 
-def as_controller(net: Wire, session: Path, folder: Path, what: str) -> Told:
-    """Under the controller's own address and port, while the arm moves: the limits are kept."""
-    under = ("--as", f"{CONTROLLER}:1", "--port")
-    told = moved(net, folder, (what, "--rate", "100", *under), session=session, begins="moving")
-    assert told.archive is not None, told.move
-    assert told.archive.complete
-    assert told.stranger["sent"] > 20
-    kept_its_limits(told.archive, Cell.load(folder / "cell.toml"))
-    return told
+class TestAsController:
+    """Under its own address and port, while the arm moves; nothing in the protocol shows that."""
+
+    @pytest.fixture
+    def as_controller(self, attacked: Attack, tmp_path: Path) -> Callable[[str], Outcome]:
+        """Nothing is sent that a stop may not do; an arm that is not stopped does less."""
+
+        def attack(what: str) -> Outcome:
+            under = ("--as", f"{CONTROLLER}:1", "--port")
+            found = attacked((what, "--rate", "100", *under), begins="moving")
+            assert found.archive is not None, found.move
+            assert found.archive.complete
+            assert found.stranger["sent"] > 20
+            limits = Cell.load(tmp_path / "cell.toml").guard_limits
+            sent = found.archive.cycles()["commanded_position"]
+            assert np.nanmin(sent - limits.lower) >= 0.0
+            assert np.nanmax(sent - limits.upper) <= 0.0
+            acceleration = limits.acceleration * limits.stop_acceleration
+            widest = (limits.velocity, acceleration, limits.jerk * limits.stop_jerk)
+            for order, bound in enumerate(widest, 1):
+                rates = np.abs(np.diff(sent, order, axis=0)) / PERIOD**order
+                assert np.nanmax(rates / bound) <= 1.0
+            return found
+
+        return attack
+
+    @pytest.mark.parametrize("what", ["init", "replay"])
+    def test_a_start_ends_the_run(self, what: str, as_controller: Attack) -> None:
+        found = as_controller(what)
+        ended(found)
+        assert "the controller started over" in found.move["error"]
+
+    def test_an_arm_elsewhere_ends_the_run(self, as_controller: Attack) -> None:
+        """Numbers that the controller has not come to yet, of when the arm had arrived."""
+        found = as_controller("later")
+        ended(found)  # by the guard, by packets missed, or by a controller that had no reply
+        assert found.move["outcome"] in ("refused", "stopped", "lost")
+
+    def test_what_is_no_packet_does_not_end_the_run(self, as_controller: Attack) -> None:
+        found = as_controller("odd")
+        went_on(found)
+        assert found.rejected["malformed"] > 100
+
+    def test_numbers_of_long_ago_get_no_reply(self, as_controller: Attack) -> None:
+        """The controller's own packets among them do, or too many missed stop the arm."""
+        found = as_controller("cyclic")
+        assert found.rejected["stale"] > 20
+        if found.code == 0:
+            went_on(found)
+        else:
+            ended(found)
+            assert found.move["outcome"] in ("stopped", "lost")
 
 
-@pytest.mark.parametrize("what", ["init", "replay"])
-def test_a_start_under_the_controllers_own_address_and_port_ends_the_run(
-    what: str, net: Wire, session: Path, tmp_path: Path
-) -> None:
-    """Nothing in the protocol tells such a stranger from the controller."""
-    told = as_controller(net, session, tmp_path, what)
-    ended(told)
-    assert "the controller started over" in told.move["error"]
-
-
-def test_an_arm_elsewhere_under_the_controllers_own_address_and_port_ends_the_run(
-    net: Wire, session: Path, tmp_path: Path
-) -> None:
-    """Numbers that the controller has not come to yet, of when the arm had arrived."""
-    told = as_controller(net, session, tmp_path, "later")
-    ended(told)  # by the guard, by packets missed, or by a controller that had no answer
-    assert told.move["outcome"] in ("refused", "stopped", "lost")
-
-
-def test_what_is_no_packet_does_not_end_the_run(net: Wire, session: Path, tmp_path: Path) -> None:
-    told = as_controller(net, session, tmp_path, "odd")
-    went_on(told)
-    assert told.rejected["malformed"] > 100
-
-
-def test_numbers_that_were_answered_long_ago_are_counted_and_get_no_answer(
-    net: Wire, session: Path, tmp_path: Path
-) -> None:
-    """The controller's own packets among them are answered, or too many missed stop the arm."""
-    told = as_controller(net, session, tmp_path, "cyclic")
-    assert told.rejected["stale"] > 20
-    if told.code == 0:
-        went_on(told)
-    else:
-        ended(told)
-        assert told.move["outcome"] in ("stopped", "lost")
-
-
-def test_whoever_begins_first_under_the_controllers_address_keeps_it_out(
-    net: Wire, session: Path, tmp_path: Path
-) -> None:
-    under = ("--as", f"{CONTROLLER}:5555")
-    attack = ("init", "--rate", "200", *under)
-    told = moved(net, tmp_path, attack, session=session, begins="first")
-    assert told.stranger["sent"] > 500
-    ended(told)
-    assert "the controller did not reach drive-on within" in told.move["error"]
-    assert told.archive is None
-    assert told.controller["replies"] == told.controller["intervals"] == 0
+def test_whoever_begins_first_under_the_controllers_address_excludes_it(attacked: Attack) -> None:
+    found = attacked(("init", "--rate", "200", *UNDER_ANOTHER_PORT), begins="first")
+    assert found.stranger["sent"] > 500
+    ended(found)
+    assert "the controller did not reach drive-on within" in found.move["error"]
+    assert found.archive is None
+    assert found.controller["replies"] == found.controller["intervals"] == 0
