@@ -36,7 +36,7 @@ from tests.hil.fast_cell import URDF as CELLS_URDF
 JOINTS = ("shoulder", "elbow")
 
 
-def archive(path: Path, samples: Samples | None = None, **attachments: bytes) -> Path:
+def archive(path: Path, samples: Samples | None = None, /, **attachments: bytes) -> Path:
     """Three samples of two joints, with attachments (`_` stands for the dot of their names)."""
     still = Samples(np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2)))
     files = {".".join(name.rsplit("_", 1)): data for name, data in attachments.items()}
@@ -170,44 +170,29 @@ NESTED = "a = " + "[" * 9999
 NO_NUMBER = r"position of joint ankle is \S+ in sample 2"
 REFUSED: list[tuple[str, Callable[[Path], object], type[Exception], str]] = [
     ("map.toml", of_text(ColumnMap.load, NESTED), SourceError, r"map\.toml: cannot be read"),
-    (
-        *("map.toml", of_text(ColumnMap.load, f"sample_rate = {'9' * 5000}")),
-        *(SourceError, r"map\.toml: cannot be read"),
-    ),
-    (
-        *("log", lambda path: log(path, np.zeros((3, 2)), np.array([0.0, 1.0, 1e308]))),
-        *(SourceError, r"spans 1.00e\+308 s; give the unit"),
-    ),
-    *(
-        ("log", partial(log_with, value=value), SourceError, NO_NUMBER)
-        for value in (2.2e203, -1e13, np.inf, np.nan)
-    ),
+    ("map.toml", of_text(ColumnMap.load, f"sample_rate = {'9' * 5000}"), SourceError,
+     r"map\.toml: cannot be read"),
+    ("log", lambda path: log(path, np.zeros((3, 2)), np.array([0.0, 1.0, 1e308])), SourceError,
+     r"spans 1.00e\+308 s; give the unit"),
+    *(("log", partial(log_with, value=value), SourceError, NO_NUMBER)
+      for value in (2.2e203, -1e13, np.inf, np.nan)),
     ("log", log_with_signalling_nan, SourceError, "is nan in sample 1"),
     ("bag.db3", bag_whose_names_are_no_text, SourceError, r"bag\.db3: is not a rosbag2"),
-    (
-        *("excitation.toml", design_without_a_digest, InputError),
-        r"is not a designed excitation \('motion_sha256'\)",
-    ),
+    ("excitation.toml", design_without_a_digest, InputError,
+     r"is not a designed excitation \('motion_sha256'\)"),
     ("excitation.toml", of_text(DesignResult.load, NESTED), InputError, "nested too deep"),
     ("plan.toml", lambda _: from_text("a=1e9999999999999999999"), ValueError, "beyond all bounds"),
-    (
-        "rehearsal.json",
-        of_text(lambda path: Rehearsal.load(CampaignFolder(path.parent)), b'{"a": 1}\xff'),
-        *(InputError, r"rehearsal\.json cannot be read"),
-    ),
-    (
-        *("robot", of_robot('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>')),
-        *(ModelError, "without a direction"),
-    ),
+    ("rehearsal.json",
+     of_text(lambda path: Rehearsal.load(CampaignFolder(path.parent)), b'{"a": 1}\xff'),
+     InputError, r"rehearsal\.json cannot be read"),
+    ("robot", of_robot('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'), ModelError,
+     "without a direction"),
     ("robot", of_robot("<inertial>", '<inertial :="">'), ModelError, "is no XML"),
-    *(
-        ("cell.toml", of_text(Cell.load, deep), InputError, r"cell\.toml.*nested too deep")
-        for deep in (".".join("a" * 400) + " = 1", "a = " + "{b = [" * 60 + "1" + "]}" * 60)
-    ),
-    ("payload", lambda _: Payload(1e200, (0.0, 0.0, 0.0)), ModelError, "the payload"),
-    ("payload", lambda _: Payload(1.0, (0.0, 1e200, 0.0)), ModelError, "the payload"),
-    ("payload", lambda _: Payload(1.0, (0.0, 0.0, np.nan)), ModelError, "the payload"),
-]
+    *(("cell.toml", of_text(Cell.load, deep), InputError, r"cell\.toml.*nested too deep")
+      for deep in (".".join("a" * 400) + " = 1", "a = " + "{b = [" * 60 + "1" + "]}" * 60)),
+    *(("payload", lambda _, figures=figures: Payload(*figures), ModelError, "the payload")
+      for figures in ((1e200, (0.0,) * 3), (1.0, (0.0, 1e200, 0.0)), (1.0, (0.0, 0.0, np.nan)))),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "read", "error", "why"), REFUSED)

@@ -148,14 +148,11 @@ lets_feedback_pass = replaced(Guard, "check_feedback", lambda *_: None)
 DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",), "replies"),
     "a motion catches up, unguarded": (
-        *(catches_up_unguarded, ("lose@{moving}x2", "kill@9999"), "guard"),
-    ),
+        catches_up_unguarded, ("lose@{moving}x2", "kill@9999"), "guard"),
     "the guard lets set-points pass": (
-        *(lets_set_points_pass, ("lurch@{moving}x3:0.0001",), "guard"),
-    ),
+        lets_set_points_pass, ("lurch@{moving}x3:0.0001",), "guard"),
     "an arm that does not follow is moved": (
-        *(lets_feedback_pass, ("following-error@{moving}x60:axis=1:slip",), "guard"),
-    ),
+        lets_feedback_pass, ("following-error@{moving}x60:axis=1:slip",), "guard"),
     "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",), "gaps"),
     "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",), "piles"),
     "records are lost unsaid": (loses_a_record, (), "archives"),
@@ -163,7 +160,7 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "whole motions are done again": (does_whole_motions_again, ("stop@{late}",), "folder"),
     "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",), "folder"),
     "archives are smoothed": (smooths_what_it_archives, (), "archives"),
-}
+}  # fmt: skip
 """What is planted, the script that brings it out, and the law that finds it."""
 
 
