@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.typed import ROOT
+from tests.docs.typed import PAGES, ROOT
 from tests.house import PACKAGES
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
 TEMPLATES = sorted((ROOT / "hil" / "report" / "templates").glob("*.j2"))
 IDIOMS = re.compile(

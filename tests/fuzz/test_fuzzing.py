@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Guard, Session
-from drivers.transports.can import codecs as answers
 from drivers.transports.can import ends
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import ArchiveHeader, open_archive
@@ -46,72 +46,67 @@ class TestDraw:
         assert not draw.chance(255)
 
 
-class TestBrokenLawsAreFound:
-    """With a defect planted, some input of the corpus or a change of it shows it."""
+def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None]:
+    def emptied(*given: object) -> bytes | None:
+        packet = whole(*given)
+        return packet and packet[:12] + bytes(len(packet) - 12)
 
-    def broken(self, name: str, changes: int = 150) -> set[str]:
-        target, kept, causes = targets.load(name), inputs(name), set()
-        for seed in range(-len(kept), changes):
-            data = kept[seed % len(kept)]
-            try:
-                target.run(data if seed < 0 else target.mutate(data, target.most, seed))
-            except Exception as error:
-                causes.add(lives.signature(error))
-        return causes
+    return emptied
 
-    def in_the_codec(self) -> bool:
-        """Whether a law of the codec is broken by what it has in the corpus."""
-        law = "AssertionError-tests.fuzz.targets.codec"
-        return any(cause.startswith(law) for cause in self.broken("codec", 0))
 
-    def test_a_guard_that_lets_everything_pass(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(Guard, "check_set_point", lambda *_: None)
-        assert any("judge" in cause for cause in self.broken("session", 0))
+encode, write_reply = CyclicPacket.encode, ends.write_reply
+IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
+PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
+    "a guard that lets everything pass": (
+        *("session", Guard, "check_set_point", lambda *_: None),
+        "AssertionError-tests.drivers.judge",
+    ),
+    "an exception in the session": (
+        "session",
+        Session,
+        "_cyclic",
+        lambda *_: 1 // 0,
+        "ZeroDivision",
+    ),
+    "a codec that changes a byte": (
+        *("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
+    ),
+    "replies by CAN to another packet": (
+        *("codec", ends, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
+    ),
+    "a PC that hears nothing by CAN": ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
+    "a controller that hears nothing": (
+        *("codec", ControllerEnd, "receive", lambda *_: None, IN_THE_CODEC),
+    ),
+    "a controller that sends nothing": (
+        *("codec", ControllerEnd, "packet", lambda *_: int("none"), "ValueError"),
+    ),
+    "a PC that loses axes": ("codec", PcEnd, "_packet", loses_axes(PcEnd._packet), IN_THE_CODEC),
+    "a controller that loses axes": (
+        *("codec", ControllerEnd, "_packet", loses_axes(ControllerEnd._packet), IN_THE_CODEC),
+    ),
+    "a header whose errors are not named": (
+        *("archive", ArchiveHeader, "of"),
+        lambda entries: ArchiveHeader.model_validate({**entries, "entries": entries}),
+        "ValidationError",
+    ),
+}
+"""Target, what is replaced by what, and the beginning of the cause that shows it."""
 
-    def test_an_exception_in_the_session(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(Session, "_cyclic", lambda *_: 1 // 0)
-        assert any(cause.startswith("ZeroDivision") for cause in self.broken("session", 0))
 
-    def test_a_codec_that_changes_a_byte(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        whole = CyclicPacket.encode
-        monkeypatch.setattr(CyclicPacket, "encode", lambda self: whole(self)[:-1] + b"\7")
-        assert self.in_the_codec()
-
-    def test_answers_by_can_to_another_packet(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        answer = answers.write_reply
-        monkeypatch.setattr(ends, "write_reply", lambda *a: b"\1\1" + answer(*a)[2:])
-        assert self.in_the_codec()
-
-    @pytest.mark.parametrize("end", [PcEnd, ControllerEnd])
-    def test_an_end_of_a_can_link_that_hears_nothing(
-        self, monkeypatch: pytest.MonkeyPatch, end: type
-    ) -> None:
-        monkeypatch.setattr(end, "receive", lambda *_: None)
-        assert self.in_the_codec()
-
-    def test_a_controller_that_sends_nothing_by_can(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(ControllerEnd, "packet", lambda *_: int("none"))
-        assert any(cause.startswith("ValueError") for cause in self.broken("codec", 0))
-
-    @pytest.mark.parametrize("end", [PcEnd, ControllerEnd])
-    def test_a_can_link_that_loses_the_axes(
-        self, monkeypatch: pytest.MonkeyPatch, end: Any
-    ) -> None:
-        whole = end._packet
-
-        def emptied(*given: object) -> bytes | None:
-            packet: bytes | None = whole(*given)
-            return packet and packet[:12] + bytes(len(packet) - 12)
-
-        monkeypatch.setattr(end, "_packet", emptied)
-        assert self.in_the_codec()
-
-    def test_a_header_whose_errors_are_not_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def unnamed(entries: dict[str, str]) -> ArchiveHeader:
-            return ArchiveHeader.model_validate({**entries, "entries": entries})
-
-        monkeypatch.setattr(ArchiveHeader, "of", unnamed)
-        assert any(cause.startswith("ValidationError") for cause in self.broken("archive", 60))
+@pytest.mark.parametrize("what", PLANTED)
+def test_a_planted_defect_is_found(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By an input of the corpus, or of archives by a change of one."""
+    name, owner, attribute, value, wanted = PLANTED[what]
+    monkeypatch.setattr(owner, attribute, value)
+    target, corpus, causes = targets.load(name), inputs(name), set()
+    for seed in range(-len(corpus), 60 if name == "archive" else 0):
+        data = corpus[seed % len(corpus)]
+        try:
+            target.run(data if seed < 0 else target.mutate(data, target.most, seed))
+        except Exception as error:
+            causes.add(lives.signature(error))
+    assert any(cause.startswith(wanted) for cause in causes), causes
 
 
 class TestMcap:

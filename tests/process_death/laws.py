@@ -59,12 +59,15 @@ def broken_by(
     """What was broken, and figures; `earlier` are archives of before the run that was seen."""
     figures: dict[str, int] = {}
     problems = [
-        *_ends(seen),
         *_told(seen),
         *_arm(seen),
         *_link(seen),
         *_entered(seen.entered, campaign),
     ]
+    if seen.left:
+        problems.append(f"processes are left over: {seen.left}")
+    if seen.port_taken:
+        problems.append("the port is still taken")
     kept: list[Kept] = []
     for path in sorted(campaign.folder.archives.iterdir()):
         if path.name in earlier:
@@ -90,13 +93,6 @@ def broken_by(
     return problems, figures
 
 
-def _ends(seen: Seen) -> Iterator[str]:
-    if seen.left:
-        yield f"processes are left over: {seen.left}"
-    if seen.port_taken:
-        yield "the port is still taken"
-
-
 def _told(seen: Seen) -> Iterator[str]:
     """A supervisor that lives says who died; whatever it says, it says in one of its own errors."""
     if seen.status is None:
@@ -117,7 +113,8 @@ def _arm(seen: Seen) -> Iterator[str]:
         return
     if rows["rejected"][-1]:
         yield f"the controller rejected {rows['rejected'][-1]} answers"
-    if "controller" not in seen.killed and not _stands(rows):
+    stands = at_rest(rows) or (len(rows) < REST and np.abs(rows["velocity"]).max() <= 0.01)
+    if "controller" not in seen.killed and not stands:
         yield (
             f"the arm did not come to rest with axes closed: {Phase(rows['phase'][-1]).name}, "
             f"{np.abs(rows['velocity'][-1]).max():.3g} rad/s"
@@ -144,10 +141,6 @@ def _seen_last(rows: Records) -> Phase:
     """
     last = int(np.flatnonzero(rows["replied"])[-1]) if rows["replied"].any() else 0
     return Phase(rows["phase"][last - 1]) if last else Phase.START
-
-
-def _stands(rows: Records) -> bool:
-    return at_rest(rows) or (len(rows) < REST and not np.abs(rows["velocity"]).max() > 0.01)
 
 
 def _link(seen: Seen) -> Iterator[str]:

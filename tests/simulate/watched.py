@@ -116,17 +116,8 @@ class Clock:
 class WatchedTransport(SimulatedTransport):
     """The PC's end of the link, with its stalls, its clock, and all packets written down.
 
-    Packets go through another transport in virtual time, which it holds.
-
-    Args:
-        peer: the controller.
-        script: what goes wrong on the link, and when the PC stalls.
-        clock: of the PC.
-        look: asked before each packet is waited for, with the present cycle; may raise.
-
-    Attributes:
-        seen: packets as they were received: time, cycle, bytes and answers.
-        answering: which of them the session has in hand.
+    Packets go through another transport in virtual time, which it holds. Before each packet is
+    waited for, `look` gets the present cycle; it may raise.
     """
 
     def __init__(
@@ -142,8 +133,8 @@ class WatchedTransport(SimulatedTransport):
         self._held: deque[tuple[float, bytes]] = deque()
         self._arrival = -math.inf
         self.struck: list[str] = []
-        self.answering = -1
-        self.seen: list[tuple[float, int, bytes, list[bytes]]] = []
+        self.answering = -1  # which of the packets seen the session has in hand
+        self.seen: list[tuple[float, int, bytes, list[bytes]]] = []  # time, cycle, packet, replies
 
     @property
     def now(self) -> float:

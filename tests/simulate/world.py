@@ -60,15 +60,7 @@ class Killed(BaseException):
 
 
 class Disk:
-    """Stands between what writes archives and manifests, and the files.
-
-    Attributes:
-        struck: lines that came to pass.
-        failures: kinds of the failures since the last `begin`.
-        torn: bytes that are missing at the end of an archive since its process died.
-        refused: archives that a write to failed.
-        dead: whether the process was killed.
-    """
+    """Stands between what writes archives and manifests, and the files."""
 
     def __init__(self, script: Script) -> None:
         self._mishaps = {
@@ -79,10 +71,10 @@ class Disk:
         self._paths: dict[int, Path] = {}
         self._last: list[Path] = []
         self.struck: list[str] = []
-        self.failures: list[str] = []
-        self.torn: dict[str, int] = {}
-        self.refused: set[str] = set()
-        self.dead = False
+        self.failures: list[str] = []  # kinds of those since the last `begin`
+        self.torn: dict[str, int] = {}  # bytes that an archive lacks since its process died
+        self.refused: set[str] = set()  # archives that a write to failed
+        self.dead = False  # whether the process was killed
 
     @property
     def most(self) -> int:

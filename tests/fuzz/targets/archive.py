@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -142,32 +143,25 @@ def seeds() -> list[bytes]:
         "drive_train.json": b'{"current_limit": [20.0, 12.0], "following_error": [1.0, 1.0]}',
         "init_packet.bin": InitPacket.build(2, 2, {"gear_ratio": [100.0, -80.0]}).encode(),
     }  # fmt: skip
-    path = folder() / "excitation_000_a1.mcap"
+    place = folder() / "seeds"
+    place.mkdir(exist_ok=True)
+    names = ("excitation_000_a1", "imported", "torn", "mended")
+    whole, bare, torn, mended = (place / f"{name}.mcap" for name in names)
     with ArchiveWriter(
-        path, joint_names=JOINTS, period=0.01, metadata={"campaign": "c", "simulated": "yes"},
+        whole, joint_names=JOINTS, period=0.01, metadata={"campaign": "c", "simulated": "yes"},
         attachments=attachments, durable=False,
     ) as archive:  # fmt: skip
         archive.event(5000, "Refused", "a text", data={"joint": 1})
         archive.write(rows, rows["target_current"])
         archive.close("completed")
-    whole = path.read_bytes()
-    path.unlink()
-    bare = folder() / "imported.mcap"
-    stamps = np.arange(CYCLES) * 2_000_000
-    write_samples(
-        bare, Samples(stamps, position=rows["position"], torque=rows["position"]),
-        joint_names=JOINTS, attachments={"robot.urdf": URDF.encode()}, metadata={},
-    )  # fmt: skip
-    imported = bare.read_bytes()
-    bare.unlink()
-    torn = folder() / "torn.mcap"
-    torn.write_bytes(whole[: len(whole) * 3 // 4])
-    mended = folder() / "mended.mcap"
+    samples = Samples(cycle * 2_000_000, position=rows["position"], torque=rows["position"])
+    urdf = {"robot.urdf": URDF.encode()}
+    write_samples(bare, samples, joint_names=JOINTS, attachments=urdf, metadata={})
+    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size * 3 // 4])
     repair(torn, mended)
-    repaired = mended.read_bytes()
-    torn.unlink()
-    mended.unlink()
-    return [whole, imported, whole[: len(whole) * 3 // 4], repaired]
+    made = [path.read_bytes() for path in (whole, bare, torn, mended)]
+    shutil.rmtree(place)
+    return made
 
 
 TARGET = Target(run, seeds, mutate_mcap, most=24_000, replayed=50)
