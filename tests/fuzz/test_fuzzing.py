@@ -19,6 +19,7 @@ import pytest
 
 from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import ends
+from drivers.transports.can.codecs import write_reply
 from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
@@ -54,7 +55,7 @@ def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None
     return emptied
 
 
-encode, write_reply = CyclicPacket.encode, ends.write_reply
+encode = CyclicPacket.encode
 IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
 PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a guard that lets everything pass": (
