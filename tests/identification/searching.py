@@ -18,6 +18,17 @@ URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 VELOCITY = np.array([3.0, 4.0])
 LIMITS = JointLimits([-2.0, -2.5], [2.0, 2.5], VELOCITY, VELOCITY / 0.3, VELOCITY / 0.03)
 
+DEG = np.pi / 180.0
+NS16_HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
+NS16_VELOCITY = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
+NS16_LIMITS = JointLimits(
+    DEG * np.array([-180.0, -140.0, -20.0, -360.0, -120.0, -360.0]),
+    DEG * np.array([180.0, 5.0, 260.0, 360.0, 120.0, 360.0]),
+    NS16_VELOCITY,
+    NS16_VELOCITY / 0.3,
+    NS16_VELOCITY / 0.03,
+)
+
 
 def problem(genome: Any = None, **constraints: Any) -> Problem:
     """Three via points of a two-joint arm, 13 parameters."""

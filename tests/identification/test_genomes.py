@@ -31,23 +31,9 @@ from planner import (
     plan_moves,
 )
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.searching import NS16_HOME as HOME
+from tests.identification.searching import NS16_LIMITS as LIMITS
 
-DEG = np.pi / 180.0
-HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
-
-
-def ns16_limits() -> JointLimits:
-    velocity = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
-    return JointLimits(
-        lower=DEG * np.array([-180.0, -140.0, -20.0, -360.0, -120.0, -360.0]),
-        upper=DEG * np.array([180.0, 5.0, 260.0, 360.0, 120.0, 360.0]),
-        velocity=velocity,
-        acceleration=velocity / 0.3,
-        jerk=velocity / 0.03,
-    )
-
-
-LIMITS = ns16_limits()
 OPEN = ViaPointGenome(LIMITS, n_via=6, slowest=0.3)
 CLOSED = ViaPointGenome(LIMITS, n_via=4, fly=0.7, slowest=0.2, range_share=0.9, home=HOME)
 BARE = SineGenome(LIMITS, length=20.0)

@@ -26,6 +26,7 @@ from identification.excitation.criteria import fitness_eq7
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from planner.worker import load, pack
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.searching import NS16_VELOCITY
 
 LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 URDF = (Path(__file__).parent / "two_link.urdf").read_text(encoding="utf-8")
@@ -365,7 +366,7 @@ def model() -> RobotModel:
 @pytest.fixture(scope="module", params=range(3))
 def motion(request: pytest.FixtureRequest) -> PiecewiseCubic:
     """A motion of six joints through eight points, as the interpolator runs it."""
-    velocity = np.radians([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
+    velocity = NS16_VELOCITY
     limits = JointLimits([-2.8] * 6, [2.8] * 6, velocity, velocity / 0.3, velocity / 0.3 / 0.1)
     via = np.random.default_rng(request.param).uniform(-2.7, 2.7, (8, 6))
     return plan(via, limits, speed=0.5, fly=0.5)

@@ -17,23 +17,15 @@ from identification.excitation import (
     random_validation_motions,
 )
 from identification.excitation.collision.hulls import joint_poses
-from planner import JointLimits, PlannerCrashed, plan, plan_moves
+from planner import PlannerCrashed, plan, plan_moves
 from sim_fixtures.ns16 import load_truth, urdf_text
-
-DEG = np.pi / 180.0
-HOME = DEG * np.array([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
+from tests.identification.searching import NS16_HOME as HOME
+from tests.identification.searching import NS16_LIMITS
 
 
 @pytest.fixture(scope="module")
 def limits():
-    velocity = DEG * np.array([155.0, 155.0, 170.0, 360.0, 350.0, 550.0])
-    return JointLimits(
-        lower=DEG * np.array([-180.0, -140.0, -20.0, -360.0, -120.0, -360.0]),
-        upper=DEG * np.array([180.0, 5.0, 260.0, 360.0, 120.0, 360.0]),
-        velocity=velocity,
-        acceleration=velocity / 0.3,
-        jerk=velocity / 0.03,
-    )
+    return NS16_LIMITS
 
 
 @pytest.fixture(scope="module")
