@@ -173,10 +173,7 @@ def identify_payload(
 ) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
 
-    Args:
-        model: the arm without payload.
-        runs: bare and loaded.
-        box: edges of the reference body [m], uniform, along the axes of the frame; None: a point.
+    `box`: edges of the reference body [m], uniform, along the axes of the frame; None: a point.
 
     Raises:
         PayloadError: there is no bare or no loaded recording, the motion does not determine the

@@ -132,19 +132,11 @@ class Regressor(NamedTuple):
 class RegressorPlan:
     """Which columns of the regressor to make for a chain, and where they stand.
 
-    Args:
-        chain: the robot.
-        gravity: acceleration of gravity in base axes [m/s²], shape (3,).
-        links: per joint the used :data:`LINK_SYMBOLS` (0..9), rising.
-        rotors: joints whose rotor inertia has a column of its own.
-        friction: of joints and coupled motors, None for none.
-        couplings: pairs of joints whose coupling inertia has a column.
-        elements: springs and balancers, None for none.
-
-    Attributes:
-        columns: per joint j the parameter index of each column in its row, shape (c_j,).
-            Parameters are numbered link by link (inertial, then rotor), then coupling inertias,
-            then friction, then springs and balancers.
+    Per joint `links` are the used :data:`LINK_SYMBOLS` (0..9), rising, `rotors` whether its rotor
+    inertia has a column; `couplings` are pairs of joints whose coupling inertia has one. Gravity is
+    an acceleration in base axes (3,) [m/s²]. `columns` has per joint j the parameter index of each
+    column in its row (c_j,): parameters are numbered link by link (inertial, then rotor), then
+    coupling inertias, then friction, then springs and balancers.
     """
 
     def __init__(
@@ -535,12 +527,9 @@ class LinkMotion:
               a_i = X a_p + s_i \ddot q_i + v_i \times s_i \dot q_i
 
     with the twist s_i of joint i per unit speed, and a_i the *spatial* acceleration, which
-    starts from minus gravity at the base.
-
-    Attributes:
-        motion: velocity and acceleration of the links, shape (n, 2, 2, 3, size).
-        twists: per link the twists of the a joints that move it, base first, (a, 2, 3, size).
-        velocity, acceleration: qd and qdd of the joints, shape (n, size).
+    starts from minus gravity at the base. `motion` is velocity and acceleration of the links
+    (n, 2, 2, 3, size), `twists` per link those of the a joints that move it, base first
+    (a, 2, 3, size), `velocity` and `acceleration` qd and qdd of the joints (n, size).
     """
 
     def __init__(self, chain: Chain, gravity: Array, size: int) -> None:

@@ -44,21 +44,16 @@ _MOST_BLOCKS: Final = 150
 
 @dataclass(frozen=True)
 class CutRule:
-    """When to stop taking parameters out.
+    """When to stop taking parameters out."""
 
-    Attributes:
-        spread: largest over smallest relative standard deviation of those left; below it the
-            data know all of them comparably well (Pham and Gautier 1991: 10 to 30).
-        overall: rise of the relative torque error on held-out motion, over all joints, that is
-            given away for a smaller model: 0.001 is 0.1 points of per cent.
-        axis: the same for one joint, as a share of that joint's torque.
-        noticeable: share of these two that a rise which is more than chance must reach to count.
-    """
-
+    # largest over smallest relative standard deviation of those left; below it the data know all
+    # of them comparably well (Pham and Gautier 1991: 10 to 30)
     spread: float = 30.0
+    # rise of the relative torque error on held-out motion, over all joints, that is given away for
+    # a smaller model: 0.001 is 0.1 points of per cent
     overall: float = 0.001
-    axis: float = 0.005
-    noticeable: float = 0.1
+    axis: float = 0.005  # the same for one joint, as a share of that joint's torque
+    noticeable: float = 0.1  # share of both that a rise beyond chance must reach to count
 
 
 # A rule that no held-out error can stop: the cut is that of Pham and Gautier alone.
@@ -114,18 +109,12 @@ class BlindChoice(NamedTuple):
 
 
 class EssentialChoice(NamedTuple):
-    """Which parameters a robot needs, and how far that can be relied on.
+    """Which parameters a robot needs, and how far that can be relied on."""
 
-    Attributes:
-        elimination: all steps and the cut, chosen on all held-out motion.
-        by_spread: the last step by the rule of relative standard deviations alone (Pham and
-            Gautier 1991), for comparison.
-        blind: what a choice without a look at the held-out motion is worth; None where the fitted
-            motion is too short for one.
-    """
-
-    elimination: Elimination
+    elimination: Elimination  # all steps and the cut, chosen on all held-out motion
+    # last step by relative standard deviations alone (Pham and Gautier 1991), for comparison
     by_spread: EliminationStep
+    # a choice without a look at the held-out motion; None where the fitted motion is too short
     blind: BlindChoice | None
 
 

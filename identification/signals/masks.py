@@ -100,19 +100,13 @@ def mask_rows(
     delay: float = 0.0,
     left_out: LeftOut = "slow",
 ) -> RowMask:
-    """Reasons against each row of a recording.
+    """Reasons against each row of a checked recording, with its smoothed motion in the same rows.
 
-    Args:
-        recording: checked.
-        model: says below which speed a joint stands.
-        motion: smoothed, in the rows of the recording.
-        bandwidth: of that smoothing per joint (n,) [Hz].
-        current_limit: largest current a motor is given (n,) [A].
-        torque_bandwidth: of a low-pass that torque and regressor go through (n,) [Hz].
-        delay: the motion was read this much earlier than the recording's rows [s].
-        left_out: "rests": rows of a joint that is slower than standstill for longer than
-            `LONGEST_HALT`; "slow": all rows slower than that, and those near a velocity reversal;
-            "none": neither.
+    Of that smoothing `bandwidth` (n,) [Hz]; `torque_bandwidth` (n,) [Hz] is of a low-pass that
+    torque and regressor go through, `current_limit` (n,) [A] of the motors; the motion was read
+    `delay` [s] earlier than the rows. Of slow rows are left out: "rests": those of a joint that is
+    slower than standstill for longer than `LONGEST_HALT`; "slow": all, and those near a velocity
+    reversal; "none": neither.
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)

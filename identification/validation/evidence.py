@@ -231,31 +231,18 @@ def find_load(
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What is known of the cell beside its model; None throughout where nothing is.
+    """What is known of the cell beside its model; None throughout where nothing is."""
 
-    Attributes:
-        torque_limit: largest torque of each joint (n,) [N·m or N], NaN where unknown.
-        saturated: share of each joint's samples at the limit of torque or current (n,).
-        motor_from_joint: motor angle per joint angle (n, n).
-        controller: error of the controller's own dynamic model on the unseen motion.
-        delays: of the torque behind the position, as the recordings have them.
-        assumed_delay: what the fit took that delay to be, of all axes or of each (n,) [s].
-        nominal_scale: measured torque over that of the nominal inertias, axis by axis.
-        jumps: steps of the measured positions that no arm makes.
-        controller_inertia: the controller's own diagonal inertia over the model's.
-        mended: what was wrong with the recordings and is made good in what was fitted.
-    """
-
-    torque_limit: Array | None = None
-    saturated: Array | None = None
-    motor_from_joint: Array | None = None
-    controller: PredictionError | None = None
-    delays: DelayEstimate | None = None
-    assumed_delay: float | Array = 0.0
-    nominal_scale: NominalScale | None = None
-    jumps: tuple[PositionJump, ...] = ()
-    controller_inertia: InertiaRatio | None = None
-    mended: tuple[Finding, ...] = ()
+    torque_limit: Array | None = None  # of each joint (n,) [N·m or N], NaN where unknown
+    saturated: Array | None = None  # share of samples at the limit of torque or current (n,)
+    motor_from_joint: Array | None = None  # motor angle per joint angle (n, n)
+    controller: PredictionError | None = None  # of its own dynamic model on the unseen motion
+    delays: DelayEstimate | None = None  # of the torque behind the position, as recorded
+    assumed_delay: float | Array = 0.0  # that the fit assumed, of all axes or of each (n,) [s]
+    nominal_scale: NominalScale | None = None  # measured torque over that of nominal inertias
+    jumps: tuple[PositionJump, ...] = ()  # steps of the measured positions that no arm makes
+    controller_inertia: InertiaRatio | None = None  # its own diagonal inertia over the model's
+    mended: tuple[Finding, ...] = ()  # what was wrong with recordings and is made good in the fit
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,15 +75,11 @@ class Path(NamedTuple):
 class Scene:
     """The bodies of an arm and of its workspace, in pairs that are to be clear of each other.
 
-    Attributes:
-        workspace: obstacles and margin.
-        margin: least distance [m] of each pair.
-        arm_length: way along the arm from the base to its last joint [m]; 1 where there is none.
-        separation: of the p pairs.
-        carrier: (p,) the last joint that moves both bodies of a pair, -1 for the base.
-        from_base, from_carrier: how far pairs leave straight lines, seen from there.
-        built_in: shapes that are no pair, because they are always too close.
-        narrowed: links and planes that keep less than the margin, because they never can.
+    Margins are in m; `separation` is of the p pairs, `carrier` (p,) the last joint that moves both
+    bodies of each (-1: the base), from which and from the base `from_carrier` and `from_base` say
+    how far pairs leave straight lines. `built_in` are shapes too close in every posture, `narrowed`
+    links and planes that keep less than the margin for that reason. `arm_length` is the way along
+    the arm from the base to its last joint [m]; 1 where there is none.
 
     Raises:
         CollisionModelError: the description has no collision shapes, or a mesh is missing.

@@ -112,19 +112,12 @@ def polish(
 ) -> tuple[Array, Scores]:
     """Return the best motion found near a start, its genes (n_genes,) and scores (m = 1).
 
-    Those of the start, bit for bit, where nothing better was found. "Better" is: nearer to keeping
-    the constraints by their summed excess, then the fitness. The same seed gives the same motion
-    to the last bit, whatever else draws random numbers meanwhile.
-
-    Args:
-        score: gives the scores of a whole generation of genes (m, n_genes) at once.
-        genes: (n_genes,) of the start, two or more, within [0, 1].
-        scores: of the start, m = 1. It is not scored again: were that to fail for a reason that is
-            not its own, anything would be better than the start.
-        fitness: (m,) of scores, the larger the better; -inf is the worst there is.
-        evaluations: how many motions may be scored.
-        seed: of the random numbers.
-        stop: asked before each generation; true ends the polish with the best so far.
+    Those of the start, two genes or more within [0, 1], bit for bit, where nothing better was
+    found. "Better" is: nearer to keeping the constraints by their summed excess, then the fitness,
+    of which -inf is the worst. The same seed gives the same motion to the last bit, whatever else
+    draws random numbers meanwhile. A whole generation (m, n_genes) is scored at once, `evaluations`
+    motions at most; `stop`, asked before each, ends the polish with the best so far. The start is
+    not scored again: were that to fail for a reason that is not its own, anything would be better.
     """
     best = genes.copy(), scores
     least, most = (float(each[0]) for each in _merits(scores, fitness))
