@@ -1,15 +1,13 @@
 """What a recording looks like, so that a slip in its units is seen before anything is fitted.
 
-Where two readings of a recording are possible (another unit, another order of joints), both are
-given with their errors: how far a velocity misses the slope of its position, and in how many rows
-a position is outside the limits of the URDF.
+Where another order of the joints is possible, both are given with their errors: how far a velocity
+misses the slope of its position, and in how many rows a position is outside the limits of the URDF.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import permutations
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +18,6 @@ from scipy.optimize import linear_sum_assignment
 from hil.archive import Findings, Samples
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.errors import SourceError
-from hil.importers.column_map import ANGLES, RATES
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 
@@ -37,7 +34,6 @@ _ALIKE: Final = 0.1
 _FOLLOWS: Final = 0.7  # correlation
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
 _NO_LIMIT: Final = 1e4  # what some URDFs write for "none"
-_LENGTHS: Final = frozenset(("m", "mm", "m/s", "mm/s"))
 
 
 def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
@@ -108,7 +104,7 @@ def examine(
         warnings.append(text)
     warnings += _positions(time, position, joint_names, limits, turning)
     if samples.velocity is not None:
-        warnings += _velocities(time, base.rate, position, samples.velocity, joint_names, limits)
+        warnings += _velocities(time, position, samples.velocity, joint_names)
     warnings += _torques(samples, joint_names, limits.effort)
     return Findings(lines=tuple(lines), warnings=tuple(warnings))
 
@@ -199,12 +195,7 @@ def _positions(
 
 
 def _velocities(
-    time: Array,
-    rate: float,
-    position: Array,
-    velocity: Array,
-    names: Sequence[str],
-    limits: UrdfLimits,
+    time: Array, position: Array, velocity: Array, names: Sequence[str]
 ) -> Iterator[str]:
     """Whether the velocities are the slopes of the positions: in this order, in these units."""
     moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _HARDLY]
@@ -224,8 +215,7 @@ def _velocities(
             f"{_missed(best):.0f} %: name the columns of both in the same order"
         )
         return
-    off: dict[object, list[int]] = {}
-    readings = [tuple(_readings(one)) for one in factor]
+    off = []
     for k, joint in enumerate(moving):
         if itself[k] < _FOLLOWS:
             yield (
@@ -233,38 +223,12 @@ def _velocities(
                 f"{itself[k]:.2f}): are the joints in the same order?"
             )
         elif abs(factor[k] - 1.0) > _ALIKE:
-            off.setdefault(readings[k] or k, []).append(k)
-    for group in off.values():
-        joints = [moving[k] for k in group]
-        everyone = joints == moving
-        subject = "every joint" if everyone else ", ".join(names[j] for j in joints)
-        shown = []
-        for words, scale in readings[group[0]]:
-            changed = position.copy()
-            changed[:, joints] *= scale if "positions" in words else 1.0
-            if "time" not in words:
-                error = f"{_outside(changed, limits)} of the rows outside the limits of the URDF"
-                shown.append(f"{words} (with {error})")
-            elif everyone:
-                shown.append(f"{words} (with {scale * rate:.3g} samples a second)")
+            off.append(f"{factor[k]:.4g} for {names[joint]}")
+    if off:
         yield (
-            f"the velocity of {subject} is {float(np.median(factor[group])):.4g} times the slope "
-            "of the position: " + (f"{', or '.join(shown)}?" if shown else "check units and gears")
+            f"the velocity is the slope of the position times {', '.join(off)}: check units, signs "
+            "and gears of both, and the unit of the time"
         )
-
-
-def _readings(factor: float) -> Iterator[tuple[str, float]]:
-    """What makes velocities about a factor too large, and the factor that it makes exactly."""
-    slips = {f"the sign of the {what}": -1.0 for what in ("velocities", "positions")}
-    slips |= {"a time in ms read as s": 1e3, "a time in s read as ms": 1e-3}
-    for what, units, power in (("velocities", RATES, 1), ("positions", ANGLES, -1)):
-        for unit, read in permutations(units, 2):
-            if (unit in _LENGTHS) == (read in _LENGTHS):
-                slips[f"{what} in {unit} read as {read}"] = (units[read] / units[unit]) ** power
-    nearest = min(slips.values(), key=lambda exact: abs(factor / exact - 1.0))
-    for words, exact in slips.items():
-        if abs(factor / nearest - 1.0) < _ALIKE and math.isclose(exact, nearest):
-            yield words, exact
 
 
 def _missed(correlation: Array) -> float:
