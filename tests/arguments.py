@@ -1,9 +1,19 @@
-"""Numbers that the long commands take: one that makes no sense is refused before anything runs."""
+"""Options of the long commands: a number that makes no sense is refused before anything runs."""
 
 from __future__ import annotations
 
 import argparse
 import math
+
+
+def parser_of(package: str, description: str | None, epilog: str = "") -> argparse.ArgumentParser:
+    """The parser of `python -m` this package, whose texts stay as they are."""
+    return argparse.ArgumentParser(
+        prog=f"python -m {package}",
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def whole_number(text: str) -> int:

@@ -26,7 +26,7 @@ from hil.archive import container
 from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
-from tests.arguments import whole_number
+from tests.arguments import parser_of, whole_number
 from tests.disk.laws import Undamaged, broken, undamaged
 from tests.hil.fast_cell import fast_campaign, fast_cell
 from tests.hil.mcap_bytes import chunks
@@ -242,11 +242,7 @@ def run(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.disk.damage",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("tests.disk.damage", __doc__)
     option = parser.add_argument
     option("--rounds", type=whole_number, default=100)
     option("--start", type=whole_number, default=0, help="number of the first round: its seed")

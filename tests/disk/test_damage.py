@@ -144,10 +144,8 @@ def test_an_error_has_to_blame_what_was_damaged(
     def refused(*_: object, **__: object) -> None:
         raise ArchiveError(None, text.format(root=truth.root))
 
-    monkeypatch.setattr("tests.disk.laws.open_archive", refused)
-    monkeypatch.setattr("tests.disk.laws.check_archive", refused)
-    monkeypatch.setattr("tests.disk.laws.view_of", refused)
-    monkeypatch.setattr("tests.disk.laws.identify_archives", refused)
+    for reader in ("open_archive", "check_archive", "view_of", "identify_archives"):
+        monkeypatch.setattr(f"tests.disk.laws.{reader}", refused)
     laws = list(broken(truth, [truth.root / HARMED], 0))
     assert all("names nothing that was damaged" in law for law in laws)
     assert bool(laws) is not passes

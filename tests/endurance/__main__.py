@@ -35,7 +35,7 @@ from pathlib import Path
 
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
-from tests.arguments import time_above_0
+from tests.arguments import parser_of, time_above_0
 from tests.endurance.piece import run_piece
 from tests.endurance.verdict import Piece, Verdict, judge, read_journal
 from tests.journal import COMPRESSED, JournalError
@@ -45,11 +45,7 @@ LONGEST = 90.0  # min of a piece
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a piece, or only merge; print the verdict over all pieces."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.endurance",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("tests.endurance", __doc__)
     option = parser.add_argument
     option("--journal", type=Path, required=True, nargs="+", help="JSON lines; appended to")
     option("--minutes", type=time_above_0, help="how long this piece takes, 90 at most")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import platform
 import shutil
 import signal
 import sys
@@ -65,11 +64,7 @@ def run_piece(
         Journal(journal_path, sync_every=60.0) as journal,
         reporter.task("enduring (s)", seconds) as task,
     ):
-        machine = f"{os.cpu_count()} cores, {platform.system()} {platform.release()}"
-        journal.add(
-            kind="begin", at=datetime.now(UTC).isoformat(timespec="seconds"), rate=rate,
-            seconds=seconds, folder=str(work), machine=machine,
-        )  # fmt: skip
+        journal.add(kind="begin", rate=rate, folder=str(work))
         (work / "cell.toml").write_text(cell.text)
         simulator = SimulatorProcess.start(work / "cell.toml", *options)
         spec, reason = UdpSpec(LOOPBACK, cell.controller.port or 0, LOOPBACK), ""
@@ -78,8 +73,7 @@ def run_piece(
                 watched(work),
                 LiveLink.open(cell, transport=spec, finish=simulator.finish) as link,
             ):
-                scheduling, notes = link.exchange.realtime.scheduling, link.notes()
-                journal.add(kind="link", scheduling=scheduling, notes=notes, t=0.0)
+                journal.add(kind="link", scheduling=link.exchange.realtime.scheduling)
                 piece = _Piece(work, journal, task, seconds, stop, link, simulator)
                 with piece.sampled():
                     piece.run(cell, plan)
@@ -87,7 +81,8 @@ def run_piece(
         except HilError as error:
             reason = f"{type(error).__name__}: {error}"
         finally:
-            journal.add(kind="end", reason=reason, controller=simulator.end())
+            simulator.end()
+            journal.add(kind="end", reason=reason)
 
 
 @dataclass(eq=False)
@@ -141,8 +136,7 @@ class _Piece:
         used = {}
         for name, pid in self.pids.items():
             with suppress(OSError):
-                threads = count(f"/proc/{pid}/task")
-                used[name] = {"own": own_memory(pid), "threads": threads}
+                used[name] = {"own": own_memory(pid), "threads": count(f"/proc/{pid}/task")}
         self.journal.add(
             kind="sample",
             t=self.at,

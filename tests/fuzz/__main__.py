@@ -17,7 +17,6 @@ Examples:
 
 from __future__ import annotations
 
-import argparse
 import json
 import signal
 import sys
@@ -27,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.progress import Reporter, Task, reporter
-from tests.arguments import at_least_one, time_above_0
+from tests.arguments import at_least_one, parser_of, time_above_0
 from tests.fuzz import lives, targets
 from tests.journal import JournalError
 
@@ -37,11 +36,7 @@ LEAST = 5.0  # s that are worth a start
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit status is 1 if anything was found, or died, 2 without a journal."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.fuzz",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("tests.fuzz", __doc__)
     option = parser.add_argument
     option("target", choices=(*targets.NAMES, "all"))
     option("--minutes", type=time_above_0, default=1.0, help="of each target, in all pieces")

@@ -15,7 +15,6 @@ the journal is none of these.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
@@ -34,7 +33,7 @@ from typing import Any
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-from tests.arguments import at_least_one, whole_number  # noqa: E402
+from tests.arguments import at_least_one, parser_of, whole_number  # noqa: E402
 from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
@@ -46,11 +45,7 @@ _stage: Stage | None = None  # What rounds share; their processes are forked fro
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run rounds, or what is missing of them."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.process_death",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("tests.process_death", __doc__)
     option = parser.add_argument
     option("--rounds", type=whole_number, default=50, help="how many (50)")
     option("--start", type=whole_number, default=0, help="number of the first (0)")

@@ -11,7 +11,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 from hil.progress import reporter
-from tests.arguments import at_least_one, whole_number
+from tests.arguments import at_least_one, parser_of, whole_number
 from tests.simulate.many import Known, played, stage_folder
 from tests.simulate.script import GRAMMAR
 from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
@@ -31,12 +31,7 @@ The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s f
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.simulate",
-        description=__doc__,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = parser_of("tests.simulate", __doc__, EPILOG)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "--seed", type=whole_number, metavar="S", help="play this one and tell all of it"

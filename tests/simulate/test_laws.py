@@ -401,33 +401,58 @@ def copied(observed: Observed, tmp_path: Path) -> Observed:
     return replace(observed, folder=tmp_path / "folder")
 
 
-# Archives -----------------------------------------------------------------------------------
-
-
 def whole(observed: Observed) -> Path:
     """An archive of a repetition."""
     return sorted((observed.folder / "archives").glob("excitation_*.mcap"))[-1]
 
 
-def spoilt(path: Path, at: int, length: int = 1) -> None:
+def flipped(path: Path) -> None:
     data = bytearray(path.read_bytes())
-    data[at : at + length] = bytes(byte ^ 0x5A for byte in data[at : at + length])
+    data[sum(chunks(bytes(data))[1]) // 2] ^= 0x5A
     path.write_bytes(data)
 
 
-def test_a_byte_flipped_in_a_chunk_is_found(copied: Observed) -> None:
-    path = whole(copied)
-    begin, end = chunks(path.read_bytes())[1]
-    spoilt(path, (begin + end) // 2)
-    assert f"{path.name}: is not whole" in found(copied, "archives")
-    assert f"{path.name} is not what was entered" in found(copied, "folder")
-    assert f"{path.name} was pooled" in found(copied, "estimate")
+def entered(path: Path, edit: Callable[[dict[str, str]], list[dict[str, str]]]) -> None:
+    """Its entry in the manifest replaced by others."""
+    manifest = path.parents[1] / "manifest.json"
+    content = json.loads(manifest.read_text())
+    old = content["archives"]
+    content["archives"] = [new for o in old for new in (edit(o) if o["name"] == path.name else [o])]
+    manifest.write_text(json.dumps(content))
 
 
-def test_a_tail_that_is_missing_is_found(copied: Observed) -> None:
+def cell_edited(path: Path) -> None:
+    with (path.parents[1] / "cell.toml").open("a") as file:
+        file.write("# edited\n")
+
+
+SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
+    "a byte": (flipped,
+     {"archives": "{name}: is not whole", "folder": "{name} is not what was entered",
+      "estimate": "{name} was pooled"}),
+    "the tail": (lambda path: path.write_bytes(path.read_bytes()[:-300]),
+     {"archives": "though nobody tore it"}),
+    "an archive": (Path.unlink,
+     {"archives": "cycles are in 0 archives",
+      "folder": "{name} is in the manifest and not in the folder"}),
+    "a digest": (lambda path: entered(path, lambda one: [one | {"sha256": "0" * 64}]),
+     {"folder": "is not what was entered"}),
+    "an entry twice": (lambda path: entered(path, lambda one: [one, one]),
+     {"folder": "an archive is entered twice"}),
+    "no entry": (lambda path: entered(path, lambda one: []), {"resume": "are missing"}),
+    "a rejection": (lambda path: entered(path, lambda one: [one | {"outcome": "rejected"}]),
+     {"estimate": "{name} was pooled, though"}),
+    "the cell": (cell_edited, {"folder": "cell.toml is not the one in the manifest"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_what_was_spoilt_in_the_folder_is_found(copied: Observed, what: str) -> None:
+    spoil, texts = SPOILT[what]
     path = whole(copied)
-    path.write_bytes(path.read_bytes()[:-300])
-    assert "though nobody tore it" in found(copied, "archives")
+    spoil(path)
+    for law, text in texts.items():
+        assert text.format(name=path.name) in found(copied, law)
 
 
 @pytest.mark.parametrize("name", ["position", "target_current", "commanded_position", "mode"])
@@ -477,43 +502,6 @@ def test_an_outcome_that_is_not_the_motions_own_is_found(
     assert "says 'stopped', and is entered as 'completed'" in found(replace(observed), "folder")
 
 
-def test_an_interval_without_an_archive_is_found(copied: Observed) -> None:
-    path = whole(copied)
-    path.unlink()
-    assert "cycles are in 0 archives" in found(copied, "archives")
-    assert f"{path.name} is in the manifest and not in the folder" in found(copied, "folder")
-
-
-# The folder ---------------------------------------------------------------------------------
-
-
-def edited(observed: Observed, edit: Callable[[list[dict[str, str]]], None]) -> Observed:
-    path = observed.folder / "manifest.json"
-    content = json.loads(path.read_text())
-    edit(content["archives"])
-    path.write_text(json.dumps(content))
-    return observed
-
-
-def test_a_manifest_that_says_otherwise_is_found(copied: Observed) -> None:
-    name = whole(copied).name
-
-    def worse(entries: list[dict[str, str]]) -> None:
-        entries[-1]["sha256"] = "0" * 64
-
-    def twice(entries: list[dict[str, str]]) -> None:
-        entries.append(next(one for one in entries if one["name"] == name))
-
-    assert "is not what was entered" in found(edited(copied, worse), "folder")
-    assert "an archive is entered twice" in found(edited(copied, twice), "folder")
-
-
-def test_inputs_that_changed_are_found(copied: Observed) -> None:
-    with (copied.folder / "cell.toml").open("a") as file:
-        file.write("# edited\n")
-    assert "cell.toml is not the one in the manifest" in found(copied, "folder")
-
-
 def test_what_was_whole_is_neither_changed_nor_removed_nor_done_again(observed: Observed) -> None:
     life = observed.runs[1]
     kept = next(name for name in life.before if name.startswith("standstill"))
@@ -541,18 +529,6 @@ def test_what_does_not_count_is_named_to_whoever_asks(
 def test_a_motion_that_failed_is_no_strange_end(observed: Observed) -> None:
     failed = MotionFailedError("repetition 1", "lost", "silence")
     assert found(with_life(observed, 0, error=failed), "resume") == ""
-
-
-def test_complete_means_that_everything_is_there(copied: Observed) -> None:
-    name = whole(copied).name
-
-    def without(entries: list[dict[str, str]]) -> None:
-        entries[:] = [one for one in entries if one["name"] != name]
-
-    assert "are missing" in found(edited(copied, without), "resume")
-
-
-# The estimate -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, 10.0])
@@ -586,16 +562,10 @@ def test_a_model_that_predicts_other_torques_of_the_same_motion_is_found(
         assert ("predicted torques differ" in found(calm, "estimate")) is seen
 
 
-def test_what_does_not_count_must_not_be_pooled(copied: Observed) -> None:
-    name = whole(copied).name
-
-    def reject(entries: list[dict[str, str]]) -> None:
-        next(one for one in entries if one["name"] == name)["outcome"] = "rejected"
-
-    assert copied.found is not None
-    less = replace(copied, found=copied.found._replace(pooled=copied.pooled[1:]))
+def test_what_counts_must_be_pooled(observed: Observed) -> None:
+    assert observed.found is not None
+    less = replace(observed, found=observed.found._replace(pooled=observed.pooled[1:]))
     assert "count and were not pooled" in found(less, "estimate")
-    assert f"{name} was pooled, though" in found(edited(copied, reject), "estimate")
 
 
 def test_the_bound_on_estimates_is_the_quantile_that_it_says() -> None:
