@@ -72,7 +72,7 @@ LONG: Final = (
     "identification/test_gains.py",
     "identification/test_instrumental.py",
     "identification/test_low_passes.py",
-    "identification/test_payload_estimate.py",
+    "identification/test_payload.py",
     "identification/test_population.py",
     "identification/test_search.py",
     "identification/test_verdict.py",
