@@ -1,7 +1,7 @@
 """Choosing motions that excite the parameters: criteria, constraints, searches."""
 
 # ruff: noqa: F401
-from types import ModuleType
+import types
 
 from identification.excitation.collision.bodies import Box, Wall, Workspace
 from identification.excitation.collision.checker import CollisionChecker, Contact
@@ -57,5 +57,5 @@ from identification.excitation.violation import KINDS, NoFeasibleMotionError, Vi
 __all__ = [
     name
     for name, one in globals().items()
-    if not (name.startswith("_") or isinstance(one, ModuleType))
+    if not (name.startswith("_") or isinstance(one, types.ModuleType))
 ]
