@@ -11,8 +11,7 @@ from pathlib import Path
 from hil import Campaign, Cell
 from hil.campaign import design, stop_on_interrupt
 from hil.plots import save
-from hil.plots.archive_picture import draw_archive
-from hil.plots.archive_view import view_of
+from hil.plots.archive_view import draw_archive, view_of
 from hil.progress import reporter as progress
 from hil.screen import Screen
 

@@ -14,8 +14,7 @@ from hil.campaign import stop_on_interrupt
 from hil.cell_link import cell_link
 from hil.move import send, straight_way
 from hil.plots import save
-from hil.plots.archive_picture import draw_archive
-from hil.plots.archive_view import view_of
+from hil.plots.archive_view import draw_archive, view_of
 
 PICTURE = Path("runs/examples/02_first_motion.png")
 

@@ -16,8 +16,7 @@ from hil import Cell
 from hil.campaign import Link, stop_on_interrupt
 from hil.move import send, straight_way
 from hil.plots import save
-from hil.plots.archive_picture import draw_archive
-from hil.plots.archive_view import view_of
+from hil.plots.archive_view import draw_archive, view_of
 from hil.simulation import simulated_controller
 
 CELL = "sim_fixtures/ns16/cell.toml"

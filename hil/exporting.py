@@ -44,15 +44,10 @@ _SPREAD_ROWS: Final = 200
 
 
 class Spread(NamedTuple):
-    """Standard deviation of torque per joint (n,) [N·m or N] over the recorded motion.
+    """Standard deviation of torque per joint (n,) [N·m or N] over the recorded motion."""
 
-    Attributes:
-        variants: of the variants.
-        covariance: as the covariance of the parameters predicts it.
-    """
-
-    variants: Array
-    covariance: Array
+    variants: Array  #: of the variants
+    covariance: Array  #: as the covariance of the parameters predicts it
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +63,9 @@ class Exported:
 
     def lines(self) -> list[str]:
         """What a person reads."""
+        unit = " or ".join(sorted(set(self.units)))
 
         def row(torque: Array) -> str:
-            unit = " or ".join(sorted(set(self.units)))
             return f"{', '.join(f'{one:.3g}' for one in torque)} {unit}"
 
         lines = [f"written: {self.path}"]

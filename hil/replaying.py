@@ -21,8 +21,7 @@ from identification.validation.replay import FEEDBACK, Simulated, replay, slow_r
 
 Array = NDArray[np.float64]
 
-ENSEMBLE: Final = 10
-"""Variants: a standard deviation from ten is known to 24 %."""
+ENSEMBLE: Final = 10  #: Variants: a standard deviation from ten is known to 24 %
 SEED: Final = 0
 DRIFT: Final = 3.0
 """Times the spread of the ensemble; below it a drift is what the uncertainty allows."""
@@ -30,24 +29,19 @@ DRIFT: Final = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """Position errors of models, simulated less recorded.
+    """Position errors of models, simulated less recorded."""
 
-    Attributes:
-        joint_names, units: (n,), degrees or mm.
-        time: since the beginning of the first motion, one after the other (m,) [s].
-        errors: of each model by name (m, n), in `units`; NaN in gaps.
-        spread: standard deviation of the positions of variants of the identified arm (m, n), in
-            `units`; None without variants.
-        reasons: why the identified model drifts by more than its uncertainty, in sentences.
-        tested_on, verdict: which motions, and what is said of the identified model, in words.
-    """
-
+    #: (n,), degrees or mm
     joint_names: tuple[str, ...]
     units: tuple[str, ...]
-    time: Array
-    errors: dict[str, Array]
+    time: Array  #: since the beginning of the first motion, one after the other (m,) [s]
+    errors: dict[str, Array]  #: of each model by name (m, n), in `units`; NaN in gaps
+    #: standard deviation of the positions of variants of the identified arm (m, n), in `units`;
+    #: None without variants
     spread: Array | None
+    #: why the identified model drifts by more than its uncertainty, in sentences
     reasons: tuple[str, ...]
+    #: which motions, and what is said of the identified model, in words
     tested_on: str
     verdict: str
 

@@ -64,8 +64,7 @@ class StepResult(Frozen):
 
     step: str
     done: bool
-    words: str
-    """What is known of it."""
+    words: str  #: What is known of it
     details: list[str]
 
 
@@ -74,30 +73,23 @@ class RecordedResult(Frozen):
 
     archive: str
     kind: str
-    when: str | None
-    """Begin, ISO 8601 (UTC); null in virtual time."""
+    when: str | None  #: Begin, ISO 8601 (UTC); null in virtual time
     seconds: float
     cycles: int
-    missed: int
-    """Packets that never arrived."""
-    late: int
-    """Answers that were late."""
+    missed: int  #: Packets that never arrived
+    late: int  #: Answers that were late
     not_accepted: int = Field(validation_alias=AliasChoices("not_accepted", "not_taken"))
     """Answers that the controller did not take."""
-    lost: int
-    """Cycles that were exchanged and not archived."""
+    lost: int  #: Cycles that were exchanged and not archived
     outcome: str
-    why: str
-    """Why it ended so."""
+    why: str  #: Why it ended so
 
 
 class WarmUpResult(Frozen):
     """Friction while the arm warmed up, motion by motion."""
 
-    verdict: str
-    """One of `warm`, `not warm`, `going on`."""
-    threshold: float
-    """Change per motion that counts as warm, as a share."""
+    verdict: str  #: One of `warm`, `not warm`, `going on`
+    threshold: float  #: Change per motion that counts as warm, as a share
     friction: list[list[float | None]]
     """Of each motion and joint, N·m or N; null for a joint that hardly moves."""
     change: list[float | None]
@@ -119,8 +111,7 @@ class FindingResult(Frozen):
     check: str
     level: Literal["good", "information", "doubtful", "wrong"]
     words: str
-    next_step: str
-    """What to do about it; empty where nothing needs doing."""
+    next_step: str  #: What to do about it; empty where nothing needs doing
 
 
 class JointJudgement(Frozen):
@@ -128,29 +119,22 @@ class JointJudgement(Frozen):
 
     joint: str
     unit: Literal["N·m", "N"]
-    rms: float
-    """Root mean square of the torque error, in `unit`."""
-    relative: Known
-    """||e|| / ||tau||."""
-    fitted_relative: Known = None
-    """The same on the motion that was fitted."""
+    rms: float  #: Root mean square of the torque error, in `unit`
+    relative: Known  #: ||e|| / ||tau||
+    fitted_relative: Known = None  #: The same on the motion that was fitted
     explained: Known
     """Share of the torque's variance that is explained (R²): zero is no better than a constant."""
     limit: Known
     """Largest torque of the joint, in `unit`; of the drive, or the URDF's effort limit."""
-    share_of_limit: Known
-    """RMS error over `limit`."""
-    nominal_relative: Known
-    """||e|| / ||tau|| of the nominal (CAD) model on the same motion."""
-    controller_relative: Known
-    """The same of the controller's own dynamic model."""
+    share_of_limit: Known  #: RMS error over `limit`
+    nominal_relative: Known  #: ||e|| / ||tau|| of the nominal (CAD) model on the same motion
+    controller_relative: Known  #: The same of the controller's own dynamic model
     nominal_scale: Known = None
     """Measured torque over what the nominal inertias ask for, friction set aside."""
     controller_inertia: Known = None
     """The controller's own diagonal inertia (joint side, rotor included) over the identified one:
     median over the recorded postures."""
-    controller_inertia_spread: Known = None
-    """Standard deviation of that ratio over the postures."""
+    controller_inertia_spread: Known = None  #: Standard deviation of that ratio over the postures
 
 
 class ProfileResult(Frozen):
@@ -158,8 +142,7 @@ class ProfileResult(Frozen):
 
     centre: list[float]
     mean: list[Known]
-    std: list[Known]
-    """Standard error that allows for the residual's correlation in time."""
+    std: list[Known]  #: Standard error that allows for the residual's correlation in time
 
 
 class JudgementResult(Frozen):
@@ -167,21 +150,15 @@ class JudgementResult(Frozen):
 
     in_sample: bool = False
     """Whether nothing was held out: all figures are of the fitted motion then."""
-    nominal: str | None = None
-    """What `JointJudgement.nominal_relative` is of, in words."""
+    nominal: str | None = None  #: What `JointJudgement.nominal_relative` is of, in words
     findings: list[FindingResult]
     next_steps: list[str]
     joints: list[JointJudgement]
-    speed: list[ProfileResult]
-    """Over rad/s or m/s."""
-    position: list[ProfileResult]
-    """Over rad or m."""
-    lag: list[float]
-    """Of `autocorrelation`, s."""
-    autocorrelation: list[list[Known]]
-    """Of each joint's residual."""
-    effective_rows: list[float]
-    """Independent samples that each joint's rows are worth."""
+    speed: list[ProfileResult]  #: Over rad/s or m/s
+    position: list[ProfileResult]  #: Over rad or m
+    lag: list[float]  #: Of `autocorrelation`, s
+    autocorrelation: list[list[Known]]  #: Of each joint's residual
+    effective_rows: list[float]  #: Independent samples that each joint's rows are worth
     friction_over_time: list[list[Known]] | None
     """Per joint: share by which friction was higher than estimated, in the order of recording."""
 
@@ -199,17 +176,12 @@ class JudgementResult(Frozen):
 class EliminationStepResult(Frozen):
     """The model after one more parameter was removed."""
 
-    removed: str | None
-    """None for the model it all begins with."""
+    removed: str | None  #: None for the model it all begins with
     left: int
-    spread: float
-    """Largest over smallest relative standard deviation of those left."""
-    in_sample: float
-    """Relative torque error on the fitted motion."""
-    held_out: float
-    """Relative torque error on the held-out motion."""
-    largest_relative_std: float
-    """Of those left."""
+    spread: float  #: Largest over smallest relative standard deviation of those left
+    in_sample: float  #: Relative torque error on the fitted motion
+    held_out: float  #: Relative torque error on the held-out motion
+    largest_relative_std: float  #: Of those left
 
 
 class EssentialParameter(Frozen):
@@ -229,30 +201,24 @@ class EssentialParameter(Frozen):
 class BlindResult(Frozen):
     """Parameters chosen inside the fitted motion alone, tried on the held-out motion."""
 
-    left: int
-    """How many were chosen."""
+    left: int  #: How many were chosen
     essential: float
     """Relative torque error of these on the held-out motion, which had no say in the choice."""
-    full: float
-    """That of all parameters."""
+    full: float  #: That of all parameters
 
 
 class EssentialResult(Frozen):
     """Which parameters the motion needs."""
 
-    reason: str
-    """Why the cut is where it is."""
-    cut: int
-    """Index of the step chosen."""
-    steps: list[EliminationStepResult]
-    """The whole path, down to one parameter."""
+    reason: str  #: Why the cut is where it is
+    cut: int  #: Index of the step chosen
+    steps: list[EliminationStepResult]  #: The whole path, down to one parameter
     refused: list[str]
     """Less well known than the rule of thumb allows, but needed by the held-out motion."""
     parameters: list[EssentialParameter]
     by_spread_left: int
     """Number of parameters that relative standard deviations alone leave (Pham and Gautier)."""
-    by_spread_held_out: float
-    """Held-out error of those."""
+    by_spread_held_out: float  #: Held-out error of those
     blind: BlindResult | None
 
 
@@ -261,13 +227,11 @@ class LinkResult(Frozen):
 
     joint: str
     mass: float
-    centre: list[float]
-    """Centre of mass in the joint's frame, m."""
+    centre: list[float]  #: Centre of mass in the joint's frame, m
     rotor_inertia: float | None
     room: float
     """Smallest second moment over the nominal body's: 1 as there, 0 at the edge of possible."""
-    reference: str
-    """What stood for its nominal body."""
+    reference: str  #: What stood for its nominal body
 
 
 class ConsistencyResult(Frozen):
@@ -276,15 +240,12 @@ class ConsistencyResult(Frozen):
     sentence: str
     impossible: bool
     costly: bool
-    held_out: float
-    """Relative torque error of the consistent model on held-out motion."""
+    held_out: float  #: Relative torque error of the consistent model on held-out motion
     unconstrained_held_out: float
     in_sample: float
     unconstrained_in_sample: float
-    moved: list[str]
-    """Parameters moved by more than three standard deviations."""
-    shift: list[float]
-    """How far each parameter was moved, in its standard deviations."""
+    moved: list[str]  #: Parameters moved by more than three standard deviations
+    shift: list[float]  #: How far each parameter was moved, in its standard deviations
     bounds: list[str]
     links: list[LinkResult]
     status: str
@@ -294,8 +255,7 @@ class ExportResult(Frozen):
     """Files for other tools, in the folder of `results.json`."""
 
     written: list[str]
-    withheld: dict[str, str]
-    """File name and why it was not written."""
+    withheld: dict[str, str]  #: File name and why it was not written
 
 
 SCHEMA_VERSION: Final = 2
@@ -316,13 +276,11 @@ class CriteriaResult(Frozen):
 class ExcitationResult(Frozen):
     """The excitation: as planned, and as it was really executed (from the archives)."""
 
-    method: str | None = None
-    """Name of the search that found it."""
+    method: str | None = None  #: Name of the search that found it
     duration: float
     n_via: int | None
     fly: float | None
-    n_sines: int | None = None
-    """Sines per joint, where the motion is a sum of sines."""
+    n_sines: int | None = None  #: Sines per joint, where the motion is a sum of sines
     planned: CriteriaResult | None
     executed: CriteriaResult
 
@@ -346,8 +304,7 @@ class ParameterResult(Frozen):
     repetition_mean: float
     repetition_std: float | None
     """Standard deviation over the repetitions (of one repetition, not of their mean)."""
-    truth: Known
-    """Planted value; only a simulated cell has one."""
+    truth: Known  #: Planted value; only a simulated cell has one
     undetermined: bool = False
     """Whether the motion says nothing about it, alone or as part of a combination."""
     of_this_run: bool = False
@@ -407,8 +364,7 @@ class ValidationResult(Frozen):
     rms_error: list[float]
     mean_error: list[float]
     relative_error: list[float]
-    overall_relative_error: float
-    """||e|| / ||tau|| over all joints, rows in which the joint moves."""
+    overall_relative_error: float  #: ||e|| / ||tau|| over all joints, rows in which the joint moves
     all_rows_relative_error: float
     """The same over every row, standstill and the first and last rows included."""
     all_rows_joint_errors: list[float] = Field(default_factory=list)
@@ -446,18 +402,12 @@ class FittedResult(Frozen):
 class CalibrationResult(Frozen):
     """Held-out means of torque and their 95 % intervals; lists are per joint."""
 
-    block: float = Field(gt=0.0)
-    """Time that a mean covers, s."""
-    means: int = Field(gt=0)
-    """How many were compared with their interval, all joints."""
-    inside: float
-    """Share of them inside: 0.95 if the intervals are honest."""
-    white_inside: float
-    """Share inside the intervals that white residuals would have."""
-    joint_inside: list[Known]
-    """Null for a joint whose intervals are not known."""
-    half_width: list[Known]
-    """Median of half the interval, N·m or N."""
+    block: float = Field(gt=0.0)  #: Time that a mean covers, s
+    means: int = Field(gt=0)  #: How many were compared with their interval, all joints
+    inside: float  #: Share of them inside: 0.95 if the intervals are honest
+    white_inside: float  #: Share inside the intervals that white residuals would have
+    joint_inside: list[Known]  #: Null for a joint whose intervals are not known
+    half_width: list[Known]  #: Median of half the interval, N·m or N
 
     def words(self, joint_names: Sequence[str]) -> str:
         """The figures, in a sentence without its full stop."""
@@ -475,12 +425,9 @@ class CalibrationResult(Frozen):
 class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
-    found: list[Known]
-    """Null where the recordings do not determine it."""
-    interval: list[Known]
-    """Half a 95 % interval of it."""
-    applied: list[float]
-    """What the fit took it to be."""
+    found: list[Known]  #: Null where the recordings do not determine it
+    interval: list[Known]  #: Half a 95 % interval of it
+    applied: list[float]  #: What the fit took it to be
 
 
 class ChoiceResult(Frozen):
@@ -490,8 +437,7 @@ class ChoiceResult(Frozen):
     candidates: list[str]
     errors: list[float | None]
     """||e|| / ||tau|| of the predictions, all joints and rows; null where there was none."""
-    chosen: int
-    """Index of the candidate that was used."""
+    chosen: int  #: Index of the candidate that was used
 
 
 class CoverageResult(Frozen):
@@ -507,8 +453,7 @@ class VerdictResult(Frozen):
 
     good: bool
     line: str
-    reasons: list[str]
-    """What is wrong; empty if good."""
+    reasons: list[str]  #: What is wrong; empty if good
     warnings: list[str] = Field(validation_alias=AliasChoices("warnings", "doubts"))
     """What is not as it should be, but too small or too uncertain to say no."""
 
@@ -516,15 +461,12 @@ class VerdictResult(Frozen):
 class EstimatorResult(Frozen):
     """How the parameters were estimated."""
 
-    name: str
-    """As `hil identify --estimator` has it."""
+    name: str  #: As `hil identify --estimator` has it
     words: str
     prior: str | None
     """What the prior of `ParameterResult.prior_std` is, in words; or why there is none."""
-    condition: float
-    """Of the weighted regressor with columns of unit length."""
-    grouping: str
-    """Why there are as many base parameters, in words."""
+    condition: float  #: Of the weighted regressor with columns of unit length
+    grouping: str  #: Why there are as many base parameters, in words
 
 
 class EndogeneityResult(Frozen):
@@ -539,8 +481,7 @@ class EndogeneityResult(Frozen):
     """What the instruments do not explain of the regressor, as a share of each joint's torque."""
     shifted: list[str]
     """Parameters in which least squares and instrumental variables differ by more than chance."""
-    shift: list[float]
-    """Least squares less instrumental variables, per parameter."""
+    shift: list[float]  #: Least squares less instrumental variables, per parameter
 
 
 class UncertaintyResult(Frozen):
@@ -554,10 +495,8 @@ class UncertaintyResult(Frozen):
         "posterior",
     ]
     """The route that `ParameterResult.std` was read from."""
-    method: str
-    """How estimate and reported standard deviation were made, in words."""
-    interval_factor: float
-    """Standard deviations in half a 95 % interval."""
+    method: str  #: How estimate and reported standard deviation were made, in words
+    interval_factor: float  #: Standard deviations in half a 95 % interval
     least_squares: list[float]
     independent_repetitions: list[float] | None
     phase_clustered: list[float] | None
@@ -580,42 +519,31 @@ class Results(Frozen):
     excitation: ExcitationResult
     estimator: EstimatorResult
     endogeneity: EndogeneityResult | None
-    endogeneity_untested: str | None
-    """Why there was no such test."""
-    notes: list[str]
-    """What was found and done when the recordings were prepared."""
+    endogeneity_untested: str | None  #: Why there was no such test
+    notes: list[str]  #: What was found and done when the recordings were prepared
     parameters: list[ParameterResult]
     n_base: int
     uncertainty: UncertaintyResult
-    repetitions: list[str]
-    """Archive file names."""
+    repetitions: list[str]  #: Archive file names
     repetition_values: list[list[float]]
-    noise_std: list[float]
-    """Torque residual standard deviation per joint, N·m."""
+    noise_std: list[float]  #: Torque residual standard deviation per joint, N·m
     correlation: list[list[float]]
     """Normalised Ψ of eq. 5 (signed), friction included, from the executed motion."""
-    validation: list[ValidationResult]
-    """Empty where nothing was held out."""
-    fitted: FittedResult | None = None
-    """In-sample errors, to stand beside those on unseen motion."""
+    validation: list[ValidationResult]  #: Empty where nothing was held out
+    fitted: FittedResult | None = None  #: In-sample errors, to stand beside those on unseen motion
     calibration: CalibrationResult | None = None
     """Null where nothing was held out, or too little was fitted to predict parts of it."""
-    delays: DelaysResult | None = None
-    """Null where they could not be looked for."""
+    delays: DelaysResult | None = None  #: Null where they could not be looked for
     choices: list[ChoiceResult] = Field(default_factory=list)
     """Settings that were chosen automatically, in order."""
     coverage: CoverageResult | None
     verdict: VerdictResult
-    essential: EssentialResult | None = None
-    """Which parameters the motion needs."""
-    consistency: ConsistencyResult | None = None
-    """The nearest parameters that a machine can have."""
-    exports: ExportResult | None = None
-    """Files for other tools beside this one."""
+    essential: EssentialResult | None = None  #: Which parameters the motion needs
+    consistency: ConsistencyResult | None = None  #: The nearest parameters that a machine can have
+    exports: ExportResult | None = None  #: Files for other tools beside this one
     judgement: JudgementResult | None = None
     """Every check behind the verdict, and the figures it rests on."""
-    conduct: ConductResult | None = None
-    """How the campaign was run; null of loose archives."""
+    conduct: ConductResult | None = None  #: How the campaign was run; null of loose archives
 
     @property
     def not_significant(self) -> list[str]:

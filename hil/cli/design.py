@@ -24,7 +24,7 @@ from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, criteria_text, margins, weakest
 from hil.design.earlier import known_from
-from hil.design.result import References, references
+from hil.design.result import references
 from hil.design.run import Designed, DesignFolder, require_same, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
@@ -83,7 +83,12 @@ def _lines(done: Designed) -> Iterator[str]:
 
 
 def _draw(
-    folder: DesignFolder, done: Designed, cell: Cell, beside: References, *, together: bool
+    folder: DesignFolder,
+    done: Designed,
+    cell: Cell,
+    beside: dict[str, tuple[float, ...]],
+    *,
+    together: bool,
 ) -> None:
     """Draw the picture; without it the design is as good."""
     from hil.plots.design_picture import draw_design  # loads the arm's shapes
@@ -96,8 +101,7 @@ def _draw(
         front=design.front,
         chosen=design.chosen,
         knee=None if design.chosen is not None else tuple(grown),
-        references=beside.measures,
-        kinematic=beside.kinematic,
+        references=beside,
         unchecked=done.result.settings.unchecked,
         complete=design.complete,
         together=together,
@@ -135,7 +139,6 @@ def design(
     compare: list[Path] | None = None,
     resume: bool = False,
     force: bool = False,
-    view: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -189,7 +192,6 @@ def design(
             robot, judged by the same parameters, without --earlier.
         resume: Go on with the search in OUTPUT that was stopped.
         force: Replace an earlier design in OUTPUT.
-        view: Then show the motion in the browser, in 3D.
     """
     if show_settings is not None:
         typer.echo(preset_text(show_settings), nl=False)
@@ -198,10 +200,6 @@ def design(
         raise InputError(None, "for which cell?", remedy="name a cell file: hil design CELL")
     at_most_one(method=method, settings=settings, quick=quick)
     at_most_one(resume=resume, force=force)
-    if view:
-        from hil.view import require_viewer, show  # loads the arm's shapes
-
-        require_viewer()
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
     require_replaceable(output)
@@ -281,10 +279,6 @@ def design(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "
             "go on with --resume"
         )
-    if view:
-        with show(done.result.excitation, loaded) as opened:
-            typer.echo(f"3D view: {opened.address} (Ctrl-C ends it)", err=True)
-            opened.run()
 
 
 def _campaign(

@@ -172,7 +172,6 @@ def plan(
     csv: Path | None = None,
     rate: float | None = None,
     picture: Path | None = None,
-    corner: Annotated[int | None, typer.Option(min=1)] = None,
     json: JsonOption = False,
 ) -> None:
     """Plan a motion through via points and say how each of them is passed. Nothing moves.
@@ -198,7 +197,6 @@ def plan(
         csv: Write a table of time, position, velocity, acceleration.
         rate: Rows a second of that table; those of the cell's cycle if left out.
         picture: Draw the plan (*.png, *.svg, *.pdf).
-        corner: Target to draw the corner of; else where the path turns most.
     """
     if output is not None and output.suffix.lower() not in PLAN_FILES:
         raise InputError(
@@ -230,13 +228,6 @@ def plan(
             for point in points[1:]
         ]
         planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
-    if corner is not None and corner >= len(planned.moves):
-        raise InputError(
-            None,
-            f"target {corner} is no corner",
-            field="--corner",
-            remedy=f"there are {len(planned.moves)} targets, the last one is a stop",
-        )
     names = loaded.joint_names
     if rate is None:
         rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
@@ -259,8 +250,7 @@ def plan(
     if csv is not None:
         _write(csv, to_csv(planned.trajectory, rate, names))
     if picture is not None:
-        target = None if corner is None else corner - 1
-        save(draw_plan(planned, names, frame, title=loaded.name, corner=target), picture)
+        save(draw_plan(planned, names, frame, title=loaded.name), picture)
 
 
 def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:

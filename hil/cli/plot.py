@@ -11,8 +11,7 @@ from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.files import make_folder, write_atomically, writing_to
 from hil.plots import save
-from hil.plots.archive_picture import PAGE_BINS, archive_page, draw_archive
-from hil.plots.archive_view import BINS, view_of
+from hil.plots.archive_view import archive_page, draw_archive, view_of
 from hil.plots.plan_picture import FORMATS
 from hil.terminal_text import printable
 
@@ -55,8 +54,7 @@ def plot(
         raise InputError(
             target, f"{target.suffix!r} is no format for pictures", remedy=f"use {known}"
         )
-    bins = PAGE_BINS if kind == PAGE else BINS
-    view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()), bins=bins)
+    view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
     make_folder(target.parent)
     if kind == PAGE:
         with writing_to(target):

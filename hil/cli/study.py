@@ -15,9 +15,9 @@ import typer
 
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
-from hil.errors import InputError, OperatorStopError
+from hil.errors import OperatorStopError
 from hil.progress import reporter as make_reporter
-from hil.study import run_study, study_campaigns, study_settings
+from hil.study import run_study, study_settings
 from hil.study.results import summary_of
 
 _DEFAULT: Final = signal.SIG_DFL
@@ -26,7 +26,6 @@ _DEFAULT: Final = signal.SIG_DFL
 def study(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/study"),
     quick: bool = False,
-    campaign: Annotated[list[Path] | None, typer.Option(metavar="FOLDER")] = None,
     cell: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     repetitions: Annotated[int | None, typer.Option(min=2)] = None,
     motions: Annotated[int | None, typer.Option(min=5)] = None,
@@ -46,13 +45,10 @@ def study(
 
     - `hil study --quick --output runs/quick`: the whole way in minutes
     - `hil study --output runs/study`: as the paper's, some 40 minutes on two free processors
-    - `hil study --campaign runs/a --campaign runs/b`: two recorded campaigns
 
     Options:
         output: Folder for the whole study.
         quick: Short searches, few repetitions and motions: minutes.
-        campaign: Study these recorded campaigns, of one arm, instead of the simulated NS 16. May be
-            repeated: the first two are compared as A and B are.
         cell: Cell file of another simulated arm than the paper's NS 16.
         repetitions: Executions of each excitation; 30 if left out, 4 with --quick.
         motions: Held-out motions of each class; 30 if left out, 10 with --quick.
@@ -65,30 +61,11 @@ def study(
     count = workers or len(os.sched_getaffinity(0))
     try:
         with _ended_like_ctrl_c():
-            if campaign:
-                if quick or any(given is not None for given in (cell, repetitions, motions, seed)):
-                    raise InputError(
-                        campaign[0],
-                        "is recorded already: nothing is searched or run for it",
-                        field="--campaign",
-                        remedy="leave out --quick, --cell, --repetitions, --motions and --seed",
-                    )
-                found = study_campaigns(output, campaign, reporter, workers=count)
-            else:
-                settings = study_settings(
-                    quick=quick,
-                    repetitions=repetitions,
-                    motions=motions,
-                    seed=seed,
-                    effects=effects,
-                )
-                found = run_study(
-                    output,
-                    settings,
-                    reporter,
-                    workers=count,
-                    cell=None if cell is None else Cell.load(cell),
-                )
+            settings = study_settings(
+                quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
+            )
+            arm = None if cell is None else Cell.load(cell)
+            found = run_study(output, settings, reporter, workers=count, cell=arm)
     except KeyboardInterrupt:
         raise OperatorStopError(
             f"stopped; what is complete stays in {output}: the same command resumes there"

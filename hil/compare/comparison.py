@@ -1,4 +1,12 @@
-"""Campaigns of one arm, from their archives, and what changed from one to another."""
+"""Campaigns of one arm, from their archives, and what changed from one to another.
+
+A campaign knows a figure twice: by the covariance of its estimate, which sees the noise of the
+torques, and by how its repetitions scatter. The larger variance counts. Repetitions that follow one
+another are not independent while friction drifts: n of them, correlated by ρ from one to the next,
+are worth n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946), ρ being corrected for the bias of its
+estimate (Marriott and Pope 1954). Differences are tested by Welch's t, all together by Holm's
+procedure.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +14,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student
 
 from hil.batch import run
 from hil.batch.estimates import errors, relative_error
@@ -23,7 +32,6 @@ from hil.progress import Reporter
 from identification import RobotModel
 
 from .payload import Finding, Level, PayloadTrend, freedom_of, payload_findings, payload_trend
-from .spread import Tested, against_first, known
 from .trend import (
     FALSE_ALARMS,
     LEAST_FRICTION,
@@ -37,6 +45,11 @@ from .trend import (
 
 Array = NDArray[np.float64]
 
+FEWEST: Final = 15
+"""Repetitions without which their correlation cannot be estimated. A campaign of fewer is assumed
+to be known no better than one of them is: they may all have been made while the arm warmed up."""
+CONFIDENCE: Final = 0.95  #: Of intervals, each by itself
+_HIGHEST: Final = 0.95
 _TWO: Final = "name two campaigns or more of one arm"
 _OTHER_SPEED: Final = 1.2
 """Ratio of typical speeds from which two campaigns count as having moved differently."""
@@ -49,17 +62,41 @@ _CAVEAT: Final = (
 )
 
 
+class Known(NamedTuple):
+    """A figure of one campaign: value, its variance, and degrees of freedom of the variance."""
+
+    value: float
+    variance: float
+    freedom: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """Figures (k) of c campaigns, all others tested against the first; NaN where not known."""
+
+    value: Array  #: (k, c)
+    std: Array  #: (k, c)
+    change: Array  #: against the first campaign (k, c); NaN of the first itself, as the next ones
+    half: Array  #: of the 95 % interval of the change (k, c)
+    p_value: Array  #: of no change (k, c), adjusted for all figures and campaigns
+    limit: Array  #: smallest change that would count (k, c)
+    #: whether the change is more than chance and large enough to count (k, c)
+    changed: NDArray[np.bool_]
+    slight: NDArray[np.bool_]  #: whether it is more than chance and not large enough (k, c)
+
+    @property
+    def shares(self) -> Array:
+        """Change and the ends of its interval as shares of the first campaign's value (k, c, 3)."""
+        ends = np.stack([self.change, self.change - self.half, self.change + self.half], axis=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(ends / np.abs(self.value[:, :1, None]))
+
+
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Campaigns of one arm.
+    """Campaigns of one arm, in order of time; in the order given where not all have one (`dated`).
 
-    Attributes:
-        arm: whose they are.
-        campaigns: in order of time; in the order given where not all have one.
-        repetitions: of each campaign, in order.
-        dated: whether the order is that of time.
-        broken: what could not be used.
-        simulated: whether no robot moved.
+    `repetitions` are those of each campaign in order, `broken` what could not be used.
     """
 
     arm: Arm
@@ -72,45 +109,27 @@ class Gathered:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What changed over the c campaigns of one arm, the first being what others are compared with.
+    """What changed over the c campaigns of one arm, compared with the first of them."""
 
-    Attributes:
-        arm: its name.
-        simulated: whether no robot moved.
-        dated: whether campaigns are in order of time.
-        changed: whether friction, payload or inertial parameters have.
-        verdict: one line.
-        findings: everything in sentences, what changed first; never empty.
-        warnings: what a reader must know of the archives.
-        campaigns: in order.
-        names: of the campaigns, with their days if known.
-        axes: of the arm.
-        friction: of the axes, mean of both directions.
-        repetitions: friction by each single repetition, campaign by campaign (m, n).
-        payload: of the last link.
-        parameters: names of the parameters, base parameters first.
-        units: of the parameters.
-        values: of the parameters, tested.
-        prediction: ||e|| / ||tau|| of the model by row on the validation motions by column (c, c),
-            NaN without one.
-    """
-
-    arm: str
-    simulated: bool
-    dated: bool
-    changed: bool
-    verdict: str
-    findings: tuple[Finding, ...]
-    warnings: tuple[str, ...]
-    campaigns: tuple[LevelEstimate, ...]
-    names: tuple[str, ...]
-    axes: tuple[Axis, ...]
-    friction: Tested
+    arm: str  #: its name
+    simulated: bool  #: whether no robot moved
+    dated: bool  #: whether campaigns are in order of time
+    changed: bool  #: whether friction, payload or inertial parameters have
+    verdict: str  #: one line
+    findings: tuple[Finding, ...]  #: everything in sentences, what changed first; never empty
+    warnings: tuple[str, ...]  #: what a reader must know of the archives
+    campaigns: tuple[LevelEstimate, ...]  #: in order
+    names: tuple[str, ...]  #: of the campaigns, with their days if known
+    axes: tuple[Axis, ...]  #: of the arm
+    friction: Tested  #: of the axes, mean of both directions
+    #: friction by each single repetition, campaign by campaign (m, n)
     repetitions: tuple[Array, ...]
-    payload: PayloadTrend
-    parameters: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Tested
+    payload: PayloadTrend  #: of the last link
+    parameters: tuple[str, ...]  #: names of the parameters, base parameters first
+    units: tuple[str, ...]  #: of the parameters
+    values: Tested  #: of the parameters, tested
+    #: ||e|| / ||tau|| of the model by row on the validation motions by column (c, c), NaN without
+    #: one
     prediction: Array
 
     @property
@@ -150,7 +169,12 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
     Raises:
         InputError: there is one campaign only, or campaigns are of different arms.
     """
-    roots = [str(Path(p).parent) if _is_results(p) else p for p in places]
+    roots = [
+        str(Path(place).parent)
+        if "://" not in place and Path(place).name == "results.json"
+        else place
+        for place in places
+    ]
     refs: list[ArchiveRef] = []
 
     def check(found: Sequence[ArchiveRef]) -> None:
@@ -163,18 +187,16 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
         why = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
         only = campaigns[0].campaign if campaigns else None
         raise InputError(only, f"is the only campaign that can be estimated{why}", remedy=_TWO)
-    absolute = [_absolute(root) for root in roots]
+    absolute = [f"{_absolute(root)}/" for root in roots]
 
     def named(one: LevelEstimate) -> tuple[int, str]:
         """Sorts campaigns as their places were named."""
-        own = _absolute(one.campaign)
-        found = [k for k, root in enumerate(absolute) if f"{own}/".startswith(f"{root}/")]
-        return (found[0] if found else len(absolute), own)
+        own = f"{_absolute(one.campaign)}/"
+        found = [k for k, root in enumerate(absolute) if own.startswith(root)]
+        return found[0] if found else len(absolute), own
 
     dated = all(one.when for one in campaigns)
-    campaigns.sort(key=named)
-    if dated:
-        campaigns.sort(key=lambda one: one.when)
+    campaigns.sort(key=lambda one: (one.when if dated else "", *named(one)))
     own = {(one.campaign, one.setup): list[LevelEstimate]() for one in campaigns}
     for rep in result.repetitions:
         own.get((rep.campaign, rep.setup), []).append(rep)
@@ -186,10 +208,6 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
         broken=result.broken,
         simulated=refs[0].simulated,  # as all of one arm
     )
-
-
-def _is_results(place: str) -> bool:
-    return "://" not in place and Path(place).name == "results.json"
 
 
 def _absolute(place: str) -> str:
@@ -405,3 +423,85 @@ def _axis_finding(axis: Axis, friction: Tested, j: int, k: int, names: list[str]
     colder = "Check this axis' gear, brake and lubrication; was it colder?"
     warmer = "Was it warmer, or has gear or lubricant been changed?"
     return Finding("changed", f"{words}.", colder if change > 0.0 else warmer)
+
+
+# Statistics
+
+
+def known(value: float, variance: float, freedom: float, repetitions: Array) -> Known:
+    """A figure from its estimate and from the estimates of single repetitions.
+
+    Args:
+        value: of the pooled estimate.
+        variance: by its covariance; infinite if undetermined.
+        freedom: of that covariance.
+        repetitions: of each repetition, in order (m,); NaN where one does not determine it.
+    """
+    if not np.isfinite(variance):
+        return Known(float("nan"), float("nan"), 1.0)
+    own = repetitions[np.isfinite(repetitions)]
+    if len(own) < 2:
+        return Known(value, variance, freedom)
+    worth = effective_count(own)
+    scatter = float(np.var(own, ddof=1)) / worth
+    if scatter <= variance:
+        return Known(value, variance, freedom)
+    return Known(value, scatter, len(own) - 1.0 if len(own) < FEWEST else max(1.0, worth - 1.0))
+
+
+def effective_count(repetitions: Array) -> float:
+    """How many independent repetitions these (m,) are worth, between 1 and m."""
+    m = len(repetitions)
+    if m < FEWEST:
+        return 1.0
+    centred = repetitions - repetitions.mean()
+    size = float(centred @ centred)
+    if size == 0.0:
+        return float(m)
+    raw = float(centred[:-1] @ centred[1:]) / size
+    rho = min(max(raw + (1.0 + 4.0 * raw) / (m - 1), 0.0), _HIGHEST)
+    return max(1.0, m * (1.0 - rho) / (1.0 + rho))
+
+
+def against_first(figures: ArrayLike, share: float, least: ArrayLike = 0.0) -> Tested:
+    """Test all campaigns but the first against it.
+
+    Args:
+        figures: a :class:`Known` for each figure and campaign (k, c, 3).
+        share: of cases in which any of the tests finds a change where there is none.
+        least: smallest change of each figure that counts (k,).
+    """
+    value, variance, freedom = np.moveaxis(np.asarray(figures, dtype=np.float64), 2, 0)
+    change, total = value - value[:, :1], variance + variance[:, :1]
+    change[:, 0] = np.nan
+    change[~(total > 0.0)] = np.nan
+    squares = variance**2 / freedom
+    least = np.reshape(least, (-1, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = np.where(np.isfinite(change), total**2 / (squares + squares[:, :1]), np.nan)
+        std = np.where(np.isfinite(change), np.sqrt(total), np.nan)
+        p_value = holm(2.0 * student.sf(np.abs(change) / std, both))
+    tests = max(1, int(np.isfinite(p_value).sum()))
+    sure, large = p_value < share, np.abs(change) >= least
+    return Tested(
+        value=value,
+        std=np.sqrt(variance),
+        change=change,
+        half=student.isf(0.5 - 0.5 * CONFIDENCE, both) * std,
+        p_value=p_value,
+        # What Holm's procedure asks of the first of all tests.
+        limit=np.maximum(student.isf(share / tests / 2.0, both) * std, least),
+        changed=sure & large,
+        slight=sure & ~large,
+    )
+
+
+def holm(p_values: Array) -> Array:
+    """P values adjusted for all of them being looked at (Holm 1979); NaN stays NaN, any shape."""
+    flat = np.asarray(p_values, dtype=np.float64).ravel()
+    adjusted = np.full(flat.shape, np.nan)
+    places = np.flatnonzero(np.isfinite(flat))
+    order = places[np.argsort(flat[places], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(factors * flat[order]))
+    return adjusted.reshape(np.shape(p_values))

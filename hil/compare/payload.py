@@ -63,38 +63,26 @@ _CERTAIN: Final = 2.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know about an arm.
+    """One thing to know about an arm."""
 
-    Attributes:
-        level: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing; in a
-            comparison "changed", or "same" for what did not, or by little, or is not known.
-        words: a sentence.
-        next_step: what to do about it; "" for nothing.
-    """
-
+    #: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing; in a comparison
+    #: "changed", or "same" for what did not, or by little, or is not known
     level: Level
-    words: str
-    next_step: str = ""
+    words: str  #: a sentence
+    next_step: str = ""  #: what to do about it; "" for nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """From parameters to what a body at the last link would have.
+    """From parameters to what a body at the last link would have."""
 
-    Attributes:
-        places: inertial parameters that all campaigns determine (d,).
-        metric: M (d, d).
-        directions: K in an orthonormal basis of metric M (d, r).
-        body: ten inertial parameters of the body from the coordinates (10, r), as `LINK_SYMBOLS`;
-            rows of NaN for those that cannot be seen.
-        rows: samples of all joints that M is made of.
-    """
-
-    places: NDArray[np.intp]
-    metric: Array
-    directions: Array
+    places: NDArray[np.intp]  #: inertial parameters that all campaigns determine (d,)
+    metric: Array  #: M (d, d)
+    directions: Array  #: K in an orthonormal basis of metric M (d, r)
+    #: ten inertial parameters of the body from the coordinates (10, r), as `LINK_SYMBOLS`; rows of
+    #: NaN for those that cannot be seen
     body: Array
-    rows: int
+    rows: int  #: samples of all joints that M is made of
 
     @property
     def rank(self) -> int:
@@ -108,43 +96,27 @@ class Projection:
 
 
 class State(NamedTuple):
-    """A campaign as the test sees it.
+    """A campaign as the test sees it."""
 
-    Attributes:
-        values: parameters at `Projection.places` (d,).
-        covariance: of its coordinates (r, r).
-        freedom: blocks that the covariance was estimated from, less one.
-    """
-
-    values: Array
-    covariance: Array
-    freedom: float
+    values: Array  #: parameters at `Projection.places` (d,)
+    covariance: Array  #: of its coordinates (r, r)
+    freedom: float  #: blocks that the covariance was estimated from, less one
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a campaign has beside those before it.
+    """What a campaign has beside those before it."""
 
-    Attributes:
-        statistic: T² over its degrees of freedom, F distributed if campaigns differed by no more
-            than their covariance says.
-        p_value: of nothing having changed.
-        share: of the change of all inertial parameters that a payload explains.
-        effect: RMS torque of the change, in standard deviations of the torque residual.
-        mass: of what was put on [kg], negative if subtracted; NaN where it cannot be seen.
-        mass_std: its standard deviation [kg].
-        moment: mass times centre in the last joint's frame (3,) [kg m].
-        moment_std: (3,).
-    """
-
+    #: T² over its degrees of freedom, F distributed if campaigns differed by no more than their
+    #: covariance says
     statistic: float
-    p_value: float
-    share: float
-    effect: float
-    mass: float
-    mass_std: float
-    moment: Array
-    moment_std: Array
+    p_value: float  #: of nothing having changed
+    share: float  #: of the change of all inertial parameters that a payload explains
+    effect: float  #: RMS torque of the change, in standard deviations of the torque residual
+    mass: float  #: of what was put on [kg], negative if subtracted; NaN where it cannot be seen
+    mass_std: float  #: its standard deviation [kg]
+    moment: Array  #: mass times centre in the last joint's frame (3,) [kg m]
+    moment_std: Array  #: (3,)
 
 
 def projection(
@@ -152,11 +124,8 @@ def projection(
 ) -> Projection | None:
     """The projection, None where a body at the last link would change nothing that is known.
 
-    Args:
-        model: the robot.
-        known: parameters that every campaign determines (p,).
-        information: weighted Gram matrix (p, p), a sum over all campaigns.
-        rows: samples in that sum, of all joints.
+    Every campaign determines the `known` parameters (p,); `information` is the weighted Gram matrix
+    (p, p), a sum over all campaigns, and `rows` the samples of all joints in that sum.
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]
@@ -254,37 +223,29 @@ class Statement:
 
 @dataclass(frozen=True, eq=False)
 class PayloadTrend:
-    """What the last link carries beside what it carried in the first of c campaigns.
+    """What the last link carries beside what it carried in the first of c campaigns."""
 
-    Attributes:
-        changes: of the parameters of each campaign against those before it since the last change;
-            None of the first.
-        changed: which campaigns differ in what the last link carries, beside what is stated.
-        other: which differ in their inertial parameters, but not as a payload would.
-        statements: of the campaigns that state another payload than the one before.
-        mass: on top of the first campaign's, stated or not [kg] (c,); NaN where it cannot be seen.
-        mass_std: (c,).
-        untested: why there is no test; "" if there is.
-    """
-
+    #: of the parameters of each campaign against those before it since the last change; None of the
+    #: first
     changes: tuple[Change | None, ...]
+    #: which campaigns differ in what the last link carries, beside what is stated
     changed: tuple[bool, ...]
+    #: which differ in their inertial parameters, but not as a payload would
     other: tuple[bool, ...]
+    #: of the campaigns that state another payload than the one before
     statements: tuple[Statement | None, ...]
+    #: on top of the first campaign's, stated or not [kg] (c,); NaN where it cannot be seen
     mass: Array
-    mass_std: Array
-    untested: str = ""
+    mass_std: Array  #: (c,)
+    untested: str = ""  #: why there is no test; "" if there is
 
 
 def payload_trend(
     model: RobotModel, campaigns: Sequence[LevelEstimate], share: float
 ) -> PayloadTrend:
-    """Find what changed in what the arm carries.
+    """Find what changed in what the arm carries, from campaigns in order of time.
 
-    Args:
-        model: the robot.
-        campaigns: in order of time.
-        share: of campaigns said to differ if nothing has changed.
+    `share` is that of campaigns said to differ if nothing has changed.
     """
     onto = _projection(model, campaigns)
     if isinstance(onto, str):

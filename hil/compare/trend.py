@@ -39,8 +39,7 @@ of an axis, torque error of an axis, payload. Each has a third, shared equally a
 The test for drift, which is made once for the whole history, has as much, shared likewise."""
 LEAST_FRICTION: Final = 0.05
 """A change of friction by less than this share is not reported, however certain."""
-LEAST_ERROR: Final = 0.10
-"""The same of the torque error."""
+LEAST_ERROR: Final = 0.10  #: The same of the torque error
 
 _RULES: Final = 3
 _DAY: Final = 86400.0
@@ -51,34 +50,17 @@ _SHIFTS: Final = 2  # of a figure that are described, the last ones
 _NAMED: Final = 5
 
 
-class Limits(NamedTuple):
-    """Where a value would be, judged by those before it; NaN before there are enough of them."""
-
-    centre: float
-    low: float
-    high: float
-
-
-_UNKNOWN: Final = Limits(math.nan, math.nan, math.nan)
-
-
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """One figure over c campaigns, judged campaign by campaign.
+    """One figure over c campaigns, judged campaign by campaign."""
 
-    Attributes:
-        values: (c,); NaN where there is none.
-        stds: (c,); zero where only the scatter of the history is known.
-        limits: centre, low, high by the level that it belongs to, or was expected at (c, 3).
-        departs: which values belong to no level that was known then, by enough to matter.
-        levels: number of the level that a value belongs to, from 0; -1 for one that is not known,
-            or departed and made no new level.
-    """
-
-    values: Array
-    stds: Array
-    limits: Array
+    values: Array  #: (c,); NaN where there is none
+    stds: Array  #: (c,); zero where only the scatter of the history is known
+    limits: Array  #: centre, low, high by the level that it belongs to, or was expected at (c, 3)
+    #: which values belong to no level that was known then, by enough to matter
     departs: tuple[bool, ...]
+    #: number of the level that a value belongs to, from 0; -1 for one that is not known, or
+    #: departed and made no new level
     levels: tuple[int, ...]
 
     @property
@@ -89,18 +71,13 @@ class Watched:
 
 
 class Drift(NamedTuple):
-    """A slope per unit of time, and the ends of its 95 % interval.
-
-    Attributes:
-        p_value: of no drift, two-sided.
-        span: time from the first value to the last.
-    """
+    """A slope per unit of time, and the ends of its 95 % interval."""
 
     slope: float
     low: float
     high: float
-    p_value: float
-    span: float
+    p_value: float  #: of no drift, two-sided
+    span: float  #: time from the first value to the last
 
 
 @dataclass(frozen=True)
@@ -120,58 +97,43 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class AxisTrend(Axis):
-    """An axis over the campaigns.
+    """An axis over the campaigns."""
 
-    Attributes:
-        friction: mean of both directions.
-        error: standard deviation of what the model leaves of the torque.
-        drift: of the friction at the level reached last [unit per day, or per campaign]; None if
-            there are too few campaigns.
-        drifts: whether that is more than chance, and enough to matter.
-    """
-
-    friction: Watched
-    error: Watched
+    friction: Watched  #: mean of both directions
+    error: Watched  #: standard deviation of what the model leaves of the torque
+    #: of the friction at the level reached last [unit per day, or per campaign]; None if there are
+    #: too few campaigns
     drift: Drift | None
-    drifts: bool
-
-    @property
-    def size(self) -> float:
-        """Median friction; NaN where none is known."""
-        known = self.friction.values[np.isfinite(self.friction.values)]
-        return abs(float(np.median(known))) or math.nan if known.size else math.nan
+    drifts: bool  #: whether that is more than chance, and enough to matter
 
     @property
     def relative_drift(self) -> Array:
         """Slope and the ends of its interval over the whole time, shares of the friction (3,)."""
         if self.drift is None:
             return np.full(3, np.nan)
-        return np.array(self.drift[:3]) * self.drift.span / self.size
+        return np.array(self.drift[:3]) * self.drift.span / (_size(self.friction.values) or np.nan)
+
+
+def _size(values: Array) -> float:
+    """Median of what is known of values (c,), without its sign; 0 where nothing is."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(np.median(known)) if known.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class ArmTrend:
-    """An arm over c campaigns.
+    """An arm over c campaigns."""
 
-    Attributes:
-        name: of the arm.
-        campaigns: in order of time.
-        time: (c,) [days since the first]; number of the campaign where no time is known.
-        dated: whether times are known. If not, campaigns are in the order of their names.
-        names: of the campaigns, with their days if known.
-        undated: folders of further campaigns, without a time, that are no part of the history.
-        warnings: what a reader must know of the archives.
-    """
-
-    name: str
-    campaigns: tuple[LevelEstimate, ...]
-    time: Array
-    dated: bool
+    name: str  #: of the arm
+    campaigns: tuple[LevelEstimate, ...]  #: in order of time
+    time: Array  #: (c,) [days since the first]; number of the campaign where no time is known
+    dated: bool  #: whether times are known. If not, campaigns are in the order of their names.
     axes: tuple[AxisTrend, ...]
     payload: PayloadTrend
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: of the campaigns, with their days if known
+    #: folders of further campaigns, without a time, that are no part of the history
     undated: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  #: what a reader must know of the archives
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,8 +275,7 @@ def _axes(
     share = FALSE_ALARMS / _RULES / model.n_joints
     found = []
     for j, axis in enumerate(axes):
-        known = np.abs(friction[np.isfinite(friction[:, j]), j])
-        least = LEAST_FRICTION * (float(np.median(known)) if len(known) else 0.0)
+        least = LEAST_FRICTION * _size(friction[:, j])
         watched = chart(friction[:, j], stds[:, j], share, least=least)
         # At one level: a step is no drift.
         slope = drift(time, np.where(watched.at_last_level, watched.values, np.nan))
@@ -362,27 +323,35 @@ def chart(
         least: smallest departure from the centre that matters.
         rise_only: whether only values above the history count.
     """
-    known = Levels(values, stds, 2.0 * share if rise_only else share, [[]])
-    now, away = 0, list[int]()
+    share = 2.0 * share if rise_only else share
+    members, now, away = [list[int]()], 0, list[int]()
     found = np.full((len(values), 3), np.nan)
     departs, levels = [False] * len(values), [-1] * len(values)
     for k, value in enumerate(values):
-        expected = found[k] = known.limits(now, float(stds[k]))
+        bands = [limits(values, stds, share, members, one, stds[k]) for one in range(len(members))]
+        expected, home = bands[now], None
+        found[k] = expected
         if not math.isfinite(value):
             continue
-        home = known.home(k, now, least, rise_only=rise_only)
+        for level in (now, *reversed(range(len(members)))):
+            centre, low, high = bands[level]
+            outside = value < low or value > high  # and of unknown limits never
+            if not outside or abs(value - centre) < least:
+                home = level
+                break
+        if home is None and rise_only and value < np.median(values[members[now]]):
+            home = now
         if home is not None:
-            now, levels[k], away = home, home, []
-            found[k] = known.limits(home, float(stds[k]))
-            known.members[home].append(k)
+            now, levels[k], away, found[k] = home, home, [], bands[home]
+            members[home].append(k)
             continue
         departs[k] = True
-        if away and (value > expected.centre) != (values[away[-1]] > expected.centre):
+        if away and (value > expected[0]) != (values[away[-1]] > expected[0]):
             away = []
         away.append(k)
         if len(away) == FEWEST:
-            now = len(known.members)
-            known.members.append(away)
+            now = len(members)
+            members.append(away)
             for one in away:
                 levels[one] = now
             away = []
@@ -391,53 +360,30 @@ def chart(
     return Watched(values, stds, found, tuple(departs), tuple(levels))
 
 
-class Levels(NamedTuple):
-    """Levels of a history, which scatter alike.
+def limits(
+    values: Array, stds: Array, share: float, members: list[list[int]], level: int, std: float
+) -> tuple[float, float, float]:
+    """Centre, low and high of a value of this standard deviation if it belonged to a level.
 
-    Attributes:
-        values: (n,).
-        stds: standard deviations that they came with (n,); zero where unknown.
-        share: of values beyond the limits if nothing has changed.
-        members: places of the values of each level.
+    NaN with fewer than `FEWEST` values there. `values` (n,) have standard deviations `stds` (n,),
+    zero where unknown, and scatter alike on all levels; `members` are the places of those of each.
     """
-
-    values: Array
-    stds: Array
-    share: float
-    members: list[list[int]]
-
-    def limits(self, level: int, std: float) -> Limits:
-        """Where a value with a standard deviation would be if it belonged to a level."""
-        own = self.members[level]
-        if len(own) < FEWEST:
-            return _UNKNOWN
-        centre = float(np.median(self.values[own]))
-        every = np.concatenate(self.members)
-        residuals = np.concatenate(
-            [self.values[one] - np.median(self.values[one]) for one in self.members]
-        )
-        # Each level has subtracted its own median from its residuals.
-        spare = len(every) - len(self.members)
-        scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
-        typical = float(np.median(self.stds[every]))
-        # Few values may lie close together by chance, but not closer than each is known.
-        scale = max(scatter, typical)
-        # A campaign of fewer repetitions than usual is known less well than the history scatters.
-        one = scale**2 + max(0.0, std**2 - typical**2)
-        spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
-        reach = float(student.isf(self.share / 2.0, 0.6 * spare - 0.5)) * spread
-        return Limits(centre, centre - reach, centre + reach)
-
-    def home(self, k: int, now: int, least: float, *, rise_only: bool) -> int | None:
-        """The level that a value belongs to: the present one rather than those before it."""
-        value, std = float(self.values[k]), float(self.stds[k])
-        for level in (now, *(one for one in reversed(range(len(self.members))) if one != now)):
-            band = self.limits(level, std)
-            outside = value < band.low or value > band.high  # and of unknown limits never
-            if not outside or abs(value - band.centre) < least:
-                return level
-        below = value < float(np.median(self.values[self.members[now]]))
-        return now if rise_only and below else None
+    own, every = members[level], np.concatenate(members).astype(np.intp)
+    if len(own) < FEWEST:
+        return math.nan, math.nan, math.nan
+    centre = float(np.median(values[own]))
+    residuals = np.concatenate([values[one] - np.median(values[one]) for one in members])
+    # Each level has subtracted its own median from its residuals.
+    spare = len(every) - len(members)
+    scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
+    typical = float(np.median(stds[every]))
+    # Few values may lie close together by chance, but not closer than each is known.
+    scale = max(scatter, typical)
+    # A campaign of fewer repetitions than usual is known less well than the history scatters.
+    one = scale**2 + max(0.0, std**2 - typical**2)
+    spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
+    reach = float(student.isf(share / 2.0, 0.6 * spare - 0.5)) * spread
+    return centre, centre - reach, centre + reach
 
 
 def qn_scale(values: Array) -> float:
@@ -506,45 +452,40 @@ def summary(arm: ArmTrend) -> str:
 
 
 class Shift(NamedTuple):
-    """Campaigns in a row that are elsewhere than those before them.
+    """Campaigns in a row, from number `first` to `last`, that are elsewhere than those before."""
 
-    Attributes:
-        returns: whether at a level that was left before.
-        first: number of the first of these campaigns.
-        last: of the last.
-        before: median of those before.
-        value: median of these.
-        is_level: whether they made a level by which later ones are judged.
-        lasts: whether no later campaign is elsewhere.
-    """
-
-    returns: bool
+    returns: bool  #: whether at a level that was left before
     first: int
     last: int
+    #: medians of those before, and of these
     before: float
     value: float
-    is_level: bool
-    lasts: bool
+    lasts: bool  #: whether no later campaign is elsewhere
+    #: whether that is a thing to look into: what has risen, however long ago, stays one until it
+    #: returns; what has fallen, until that is a level
+    alarming: bool
 
 
 def shifts(watched: Watched) -> list[Shift]:
     """All shifts of a figure, in order of time."""
+    values, centres = watched.values, watched.limits[:, 0]
 
     def place(k: int) -> tuple[int, bool]:
         """The level of a campaign, and if it has none its side of the history."""
         level = watched.levels[k]
-        return level, level < 0 and bool(watched.values[k] > watched.limits[k, 0])
+        return level, level < 0 and bool(values[k] > centres[k])
 
-    known = [k for k, value in enumerate(watched.values) if np.isfinite(value)]
+    known = np.flatnonzero(np.isfinite(values)).tolist()
     runs = [(level, list(own)) for (level, _), own in groupby(known, place)]
     found = []
     for number, (level, own) in enumerate(runs[1:], start=1):
-        fresh = level < 0 or level not in {earlier for earlier, _ in runs[:number]}
-        centre, value = watched.limits[own[0], 0], float(np.median(watched.values[own]))
-        left = float(np.median(watched.values[runs[number - 1][1]]))
-        before = float(centre) if fresh and np.isfinite(centre) else left
+        returns = level >= 0 and level in {earlier for earlier, _ in runs[:number]}
+        before, value = centres[own[0]], float(np.median(values[own]))
+        if returns or not np.isfinite(before):
+            before = np.median(values[runs[number - 1][1]])
         lasts = number == len(runs) - 1
-        found.append(Shift(not fresh, own[0], own[-1], before, value, level >= 0, lasts))
+        alarming = lasts and not returns and (value > before or level < 0)
+        found.append(Shift(returns, own[0], own[-1], float(before), value, lasts, alarming))
     return found
 
 
@@ -562,19 +503,16 @@ def _shift(arm: ArmTrend, axis: AxisTrend, what: str, shift: Shift) -> Finding:
     first, last = arm.names[shift.first], arm.names[shift.last]
     when = f"since {first}" if shift.lasts else f"from {first} to {last}"
     when = f"in {first}" if shift.first == shift.last else when
-    rise = shift.value > shift.before
     change = abs(shift.value - shift.before) / (abs(shift.before) or math.inf)
-    side = "above" if rise else "below"
+    side = "above" if shift.value > shift.before else "below"
     how = "has returned to an earlier level" if shift.returns else "departs from its history"
     words = (
         f"{axis.joint} {how}: {what}{axis.at if what == 'friction' else ''} is"
         f" {100.0 * change:.0f} % {side} what it was, {shift.value:.3g} against"
         f" {shift.before:.3g} {axis.unit}, {when}."
     )
-    # What has risen stays a thing to look into until it returns, however long ago it was.
-    alarming = shift.lasts and not shift.returns and (rise or not shift.is_level)
     step = _STEPS.get((what, "returned" if shift.returns else side), "")
-    return Finding("alarm" if alarming else "past", words, step)
+    return Finding("alarm" if shift.alarming else "past", words, step)
 
 
 def _nothing(arm: ArmTrend) -> str:

@@ -16,14 +16,12 @@ from hil.motion_checks import always_so, violation_text
 from identification.excitation import (
     CRITERIA,
     CollisionChecker,
-    CurrentModel,
     NoFeasibleMotionError,
     Objective,
     Problem,
     midpoints,
     sampled,
 )
-from identification.model.motion import Motion
 from planner import Trajectory
 
 from .settings import DesignSettings
@@ -46,11 +44,31 @@ def criteria_text(measures: Iterable[float], digits: int = 2) -> str:
 
 
 def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
-    """Return how near a motion comes to limits that its search looked at, "" if to none."""
-    constraints, motion = problem.constraints, sampled(trajectory)
-    parts = [] if constraints.currents is None else [_largest_current(constraints.currents, motion)]
+    """How near a motion comes to limits that its search looked at, "" if to none.
+
+    Nothing is said of shapes that the arm's construction keeps close to each other.
+    """
+    constraints, motion, parts = problem.constraints, sampled(trajectory), list[str]()
+    if (currents := constraints.currents) is not None:
+        share = np.abs(currents.current(currents.torque(motion))) / currents.current_limit
+        largest = share.max(axis=0)
+        motor = int(np.argmax(largest))
+        parts.append(
+            f"current at most {100.0 * largest[motor]:.0f} % of its limit "
+            f"(motor of {currents.model.joint_names[motor]})"
+        )
     if constraints.checker is not None:
-        parts.append(_nearest(cell, motion))
+        margin = max(_WIDEST, cell.workspace.margin)
+        workspace = replace(cell.workspace, margin=margin)
+        folders = cell.mesh_folders
+        wide = CollisionChecker(
+            cell.urdf, workspace, limits=cell.joint_limits, mesh_folders=folders
+        )
+        near = wide.deepest_contact(motion.position)
+        pair = (
+            "" if near is None else f"nearest {near.distance:.2f} m ({near.first}, {near.second})"
+        )
+        parts.append(pair or f"nothing nearer than {margin:g} m")
     return "; ".join(parts)
 
 
@@ -71,31 +89,6 @@ def weakest(objective: Objective, trajectory: Trajectory) -> tuple[str, ...]:
     size: Array = np.abs(directions[:, 0])
     order = np.argsort(-size, kind="stable")[:_MOST_NAMES]
     return tuple(judged[k] for k in order if size[k] >= _CONCERNED * size.max())
-
-
-def _largest_current(currents: CurrentModel, motion: Motion) -> str:
-    share = np.abs(currents.current(currents.torque(motion))) / currents.current_limit
-    largest = share.max(axis=0)
-    motor = int(np.argmax(largest))
-    return (
-        f"current at most {100.0 * largest[motor]:.0f} % of its limit "
-        f"(motor of {currents.model.joint_names[motor]})"
-    )
-
-
-def _nearest(cell: Cell, motion: Motion) -> str:
-    """Return what comes nearest to what; not of shapes that the arm's construction keeps close."""
-    margin = max(_WIDEST, cell.workspace.margin)
-    wide = CollisionChecker(
-        cell.urdf,
-        replace(cell.workspace, margin=margin),
-        limits=cell.joint_limits,
-        mesh_folders=cell.mesh_folders,
-    )
-    contact = wide.deepest_contact(motion.position)
-    if contact is None:
-        return f"nothing nearer than {margin:g} m"
-    return f"nearest {contact.distance:.2f} m ({contact.first}, {contact.second})"
 
 
 _POSTURE: Final = "let the joints swing about another posture ([sines] offset)"

@@ -96,21 +96,18 @@ def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tupl
 
 
 def _archives(paths: Sequence[Path]) -> list[Path]:
-    """Return the archives of a folder, or those named."""
+    """The archives of a folder, or those named."""
     if len(paths) == 1 and paths[0].is_dir():
         folder = CampaignFolder(paths[0])
         found = [path for kind in _KINDS for path in folder.completed(kind)]
-        found = found or sorted(paths[0].glob("*.mcap"))
-        if not found:
-            raise InputError(
-                paths[0], "holds no whole archive", remedy="name a campaign folder, or archives"
-            )
-        return found
+        if found := found or sorted(paths[0].glob("*.mcap")):
+            return found
+        remedy = "name a campaign folder, or archives"
+        raise InputError(paths[0], "holds no whole archive", remedy=remedy)
     for path in paths:
         if path.is_dir():
-            raise InputError(
-                path, "is a folder among archives", remedy="name one campaign folder, or files"
-            )
+            remedy = "name one campaign folder, or files"
+            raise InputError(path, "is a folder among archives", remedy=remedy)
     return list(paths)
 
 
@@ -120,40 +117,29 @@ def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:
     theirs, ours = fingerprint(recorded), fingerprint(cell)
     for part in ("urdf", "robot"):
         if theirs[part] != ours[part]:
-            raise InputError(
-                archives[0],
-                f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}",
-                field="--earlier",
-                remedy="name archives of this robot, in the same description",
-            )
+            problem = f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}"
+            remedy = "name archives of this robot, in the same description"
+            raise InputError(archives[0], problem, field="--earlier", remedy=remedy)
 
 
 def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
-    """Return 1 / variance of each joint's torque residual (n,).
+    """1 / variance of each joint's torque residual (n,).
 
-    Of a joint that stood in all archives no residual tells. It is assumed to be as noisy as the
-    others: by the median, as a share of the torque that its motors can give.
+    A joint that stood in all archives is assumed to be as noisy as the others: by the median, as a
+    share of the torque that its motors can give; where the cell does not say that, by the median.
     """
     noise = noise_std.copy()
     known = np.isfinite(noise) & (noise > 0.0)
     if not known.all():
-        strength = _strength(cell)
+        strength = np.ones(len(noise))
+        if cell.file.drive_train is not None:
+            drives = cell.drive_train
+            motors = drives.torque_constant * drives.current_limit
+            strength = np.abs(drives.motor_from_joint.T) @ motors
         noise[~known] = strength[~known] * np.median(noise[known] / strength[known])
-        names = [
-            name for name, is_known in zip(cell.joint_names, known, strict=True) if not is_known
-        ]
+        names = ", ".join(cell.joint_names[j] for j in np.flatnonzero(~known))
         reporter.say(
-            f"warning: {', '.join(names)} never moved in the earlier archives: its torque noise is "
+            f"warning: {names} never moved in the earlier archives: its torque noise is "
             "assumed to be that of the others, in proportion to what its motors can give"
         )
     return np.asarray(noise**-2.0)
-
-
-def _strength(cell: Cell) -> Array:
-    """Return what each joint's motors can give (n,) [N·m]; ones where the cell does not say."""
-    if cell.file.drive_train is None:
-        return np.ones(len(cell.joint_names))
-    drives = cell.drive_train
-    return np.asarray(
-        np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import scipy
@@ -25,7 +25,7 @@ from identification.excitation.constraints import clearance
 from identification.model.motion import Motion
 
 from .advice import NoExcitationError
-from .settings import DesignSettings, SettingsError, SineTable
+from .settings import DesignSettings, SettingsError
 
 Array = NDArray[np.float64]
 
@@ -38,27 +38,18 @@ _INDEPENDENT: Final = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """An earlier estimate, and the information that it came from.
+    """An earlier estimate, and the information that it came from."""
 
-    Attributes:
-        names: of the model's parameters (p,).
-        values: their estimates (p,).
-        std: their standard deviations (p,), infinite for one that was not determined.
-        joint_weights: 1 / variance of each joint's torque residual (n,).
-        gram: information (p, p) of all that was moved, held out or not, weighted by these, as if
-            sampled every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are.
-        samples: time samples in it, of equal weight.
-        repetitions: how often the new motion is going to be run.
-        archives: name and SHA-256 of each file whose motion is in it.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    std: Array
-    joint_weights: Array
+    names: tuple[str, ...]  #: of the model's parameters (p,)
+    values: Array  #: their estimates (p,)
+    std: Array  #: their standard deviations (p,), infinite for one that was not determined
+    joint_weights: Array  #: 1 / variance of each joint's torque residual (n,)
+    #: information (p, p) of all that was moved, held out or not, weighted by these, as if sampled
+    #: every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are
     gram: Array
-    samples: int
-    repetitions: int
+    samples: int  #: time samples in it, of equal weight
+    repetitions: int  #: how often the new motion is going to be run
+    #: name and SHA-256 of each file whose motion is in it
     archives: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -70,12 +61,9 @@ class Knowledge:
 
 
 def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = None) -> Problem:
-    """Return which motions are searched, what they must keep, and what they are to be good at.
+    """Which motions are searched, what they must keep, and what they are to be good at.
 
-    Args:
-        cell: the robot, its limits and surroundings.
-        settings: of the design.
-        known: an earlier estimate, to which the motion is to add.
+    The motion is to add to what is `known` from an earlier estimate.
 
     Raises:
         SettingsError: settings that do not fit the cell.
@@ -116,18 +104,19 @@ def _require_beginning(
         where, posture, elsewhere = "at home", genome.home, "home_deg in [campaign]"
     else:
         return
-    still, reason = np.zeros_like(posture[None]), ""
+    still, frame = np.zeros_like(posture[None]), AngleFrame.of(cell)
     contact = None if checker is None else clearance(checker, posture[None])
     too_much = currents.check(Motion(np.zeros(1), posture[None], still, still)) if currents else []
     if checker is not None and contact is not None:
-        reason = violation_text(contact, AngleFrame.of(cell))
+        reason = violation_text(contact, frame)
         remedy = always_so(contact, checker) or f"correct [workspace] or {elsewhere}"
     elif too_much:
         worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
-        reason = f"at rest there, {violation_text(worst, AngleFrame.of(cell))}"
+        reason = f"at rest there, {violation_text(worst, frame)}"
         remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
-    if reason:
-        raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
+    else:
+        return
+    raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
 
 
 def search_settings(settings: DesignSettings) -> SearchSettings:
@@ -152,26 +141,37 @@ def _genome(
         )
     sines = settings.sines
     assert sines is not None  # the settings hold one of the two
+
+    def per_joint(name: str, values: list[float]) -> Array:
+        """One value for each joint (n,); one alone is for all."""
+        joints = cell.joint_names
+        if len(values) not in (1, len(joints)):
+            raise SettingsError(
+                None,
+                f"has {len(values)} entries, the arm {len(joints)} joints",
+                field=f"sines.{name} = {values}",
+                remedy=f"give one for each of {', '.join(joints)}",
+            )
+        return np.broadcast_to(np.array(values, dtype=np.float64), len(joints)).copy()
+
+    offset = cell.home if sines.offset == "home" else None
+    if not isinstance(sines.offset, str):
+        offset = _inside(cell, sines.offset, per_joint("offset", sines.offset))
+    fastest = sines.fastest
     return SineGenome(
         cell.joint_limits,
         length=sines.length,
         harmonics=sines.harmonics,
         ramp=sines.ramp,
-        offset=_offset(cell, sines),
-        slowest=_per_joint(cell, "sines.slowest", sines.slowest),
-        fastest=None
-        if isinstance(sines.fastest, str)
-        else _per_joint(cell, "sines.fastest", sines.fastest),
+        offset=offset,
+        slowest=per_joint("slowest", sines.slowest),
+        fastest=None if isinstance(fastest, str) else per_joint("fastest", fastest),
     )
 
 
-def _offset(cell: Cell, sines: SineTable) -> Array | None:
-    if sines.offset == "middle":
-        return None
-    if sines.offset == "home":
-        return cell.home
+def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
+    """URDF angles (n,) of a posture inside the limits that is stated in their frame."""
     frame, limits = AngleFrame.of(cell), cell.joint_limits
-    shown = _angles_of(cell, "sines.offset", sines.offset)
     angles = frame.urdf(shown)
     for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
         ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
@@ -179,40 +179,26 @@ def _offset(cell: Cell, sines: SineTable) -> Array | None:
             None,
             f"{cell.joint_names[joint]} is not inside its limits, {ends[0]:g} to {ends[1]:g} deg, "
             f"at {shown[joint]:g} deg ({frame.whose})",
-            field=f"sines.offset = {sines.offset}",
+            field=f"sines.offset = {asked}",
             remedy="swing about a posture inside the limits",
         )
-    return angles
-
-
-def _per_joint(cell: Cell, field: str, values: list[float]) -> Array:
-    """Return one value for each joint (n,); one alone is for all."""
-    return _angles_of(cell, field, values * len(cell.joint_names) if len(values) == 1 else values)
-
-
-def _angles_of(cell: Cell, field: str, values: list[float] | str) -> Array:
-    if len(values) != len(cell.joint_names):
-        raise SettingsError(
-            None,
-            f"has {len(values)} entries, the arm {len(cell.joint_names)} joints",
-            field=f"{field} = {values}",
-            remedy=f"give one for each of {', '.join(cell.joint_names)}",
-        )
-    return np.array(values, dtype=np.float64)
+    return np.asarray(angles)
 
 
 def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) -> Objective:
     if settings.objective.parameters == "payload":
         return _payload_objective(cell, known)
-    earlier: dict[str, Any] = {}
-    if known is not None:
-        earlier = {
-            "joint_weights": known.joint_weights,
-            "earlier": known.gram,
-            "earlier_samples": known.samples,
-            "repetitions": known.repetitions,
-        }
-    return Objective(cell.model, parameters=_essential(cell, settings, known), **earlier)
+    chosen = _essential(cell, settings, known)
+    if known is None:
+        return Objective(cell.model, parameters=chosen)
+    return Objective(
+        cell.model,
+        parameters=chosen,
+        joint_weights=known.joint_weights,
+        earlier=known.gram,
+        earlier_samples=known.samples,
+        repetitions=known.repetitions,
+    )
 
 
 def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
@@ -239,11 +225,9 @@ def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
 def _essential(
     cell: Cell, settings: DesignSettings, known: Knowledge | None
 ) -> NDArray[np.intp] | None:
-    """Return which parameters count, None for all."""
+    """Which parameters count, None for all."""
     names, named = cell.model.parameter_names, settings.objective.named
     percent = settings.objective.max_relative_std
-    if percent is None and named is None:
-        return None
     if percent is not None:
         field = f"objective.max_relative_std = {percent:g}"
         if known is None:
@@ -251,20 +235,18 @@ def _essential(
             raise SettingsError(None, problem, field=field, remedy=remedy)
         chosen = np.flatnonzero(known.relative_std <= percent / 100.0)
         if len(chosen) < 2:
-            best = 100.0 * np.sort(known.relative_std)[1]
-            raise SettingsError(
-                None,
-                f"leaves {len(chosen)} parameters, and a design needs two",
-                field=field,
-                remedy=f"at {best:.3g} % two would be left",
-            )
+            problem = f"leaves {len(chosen)} parameters, and a design needs two"
+            remedy = f"at {100.0 * np.sort(known.relative_std)[1]:.3g} % two would be left"
+            raise SettingsError(None, problem, field=field, remedy=remedy)
         return np.asarray(chosen, dtype=np.intp)
-    for name in named or ():
-        if name not in names or (named or []).count(name) > 1:
+    if named is None:
+        return None
+    for name in named:
+        if name not in names or named.count(name) > 1:
             raise SettingsError(
                 None,
                 f"is {'named twice' if name in names else 'no parameter of this robot'}",
                 field=f"objective.parameters = {name!r}",
                 remedy=f"known are: {', '.join(names)}",
             )
-    return np.array(sorted(names.index(name) for name in named or ()), dtype=np.intp)
+    return np.array(sorted(names.index(name) for name in named), dtype=np.intp)

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,17 +92,11 @@ def fingerprint(cell: Cell) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """What `excitation.toml` says.
+    """What `excitation.toml` says."""
 
-    Attributes:
-        data: its tables, without the seal.
-        settings: of the design.
-        excitation: the motion and its criteria.
-    """
-
-    data: Mapping[str, Any]
-    settings: DesignSettings
-    excitation: Excitation
+    data: Mapping[str, Any]  #: its tables, without the seal
+    settings: DesignSettings  #: of the design
+    excitation: Excitation  #: the motion and its criteria
 
     @property
     def complete(self) -> bool:
@@ -188,9 +182,8 @@ class DesignResult:
             text = text_of(path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
-            raise InputError(
-                path, f"cannot be read ({why})", remedy="name a file that `hil design` wrote"
-            ) from error
+            remedy = "name a file that `hil design` wrote"
+            raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
         try:
             data = from_text(text)
             for key, known in (("format", RESULT_FORMAT), ("version", VERSION)):
@@ -198,19 +191,26 @@ class DesignResult:
                     raise ValueError(f"{key} is {data.get(key)!r:.60}, this reads {known!r}")
             seal = data.pop("seal")
             motion, positions = seal["motion_sha256"], numbers(seal["positions"], 2)
-            unchanged = seal["sha256"] == _seal(text)
-            result = cls._from_data(data, path) if unchanged else None
+            if seal["sha256"] != _seal(text):
+                raise InputError(
+                    path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
+                )
+            result = cls._from_data(data, path)
         except (PlannerError, *DAMAGED) as error:
             why = " ".join(str(error).split())
+            problem = f"is not a designed excitation ({why:.200})"
+            raise InputError(path, problem, remedy=_REMEDY) from error
+        again, now = _positions(result.excitation.trajectory), software()
+        alike = positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME)
+        if _motion_digest(result.excitation.trajectory) != motion and not alike:
+            then = data["software"].items()
+            other = [f"{k} {v} (here {now.get(k)})" for k, v in then if now.get(k) != v]
             raise InputError(
-                path, f"is not a designed excitation ({why:.200})", remedy=_REMEDY
-            ) from error
-        if result is None:
-            raise InputError(
-                path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
+                path,
+                "its moves do not plan to the motion that was designed",
+                remedy=f"{_REMEDY}, or use the software it was designed with"
+                + (f": {', '.join(other)}" if other else ""),
             )
-        if _motion_digest(result.excitation.trajectory) != motion:
-            result._require_alike(path, positions)
         return result
 
     def require_cell(self, cell: Cell, path: Path, parts: Sequence[str] = DECISIVE) -> None:
@@ -229,23 +229,6 @@ class DesignResult:
                 field="cell",
                 remedy=f"name its own cell, or {_REMEDY}",
             )
-
-    def _require_alike(self, path: Path, positions: Array) -> None:
-        """Refuse a motion that is another than the one that was written down."""
-        again, now = _positions(self.excitation.trajectory), software()
-        if positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME):
-            return
-        other = [
-            f"{k} {v} (here {now.get(k)})"
-            for k, v in self.data["software"].items()
-            if now.get(k) != v
-        ]
-        raise InputError(
-            path,
-            "its moves do not plan to the motion that was designed",
-            remedy=f"{_REMEDY}, or use the software it was designed with"
-            + (f": {', '.join(other)}" if other else ""),
-        )
 
     @classmethod
     def _from_data(cls, data: Mapping[str, Any], path: Path) -> Self:
@@ -266,7 +249,7 @@ class DesignResult:
 
 
 def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
-    """Return the table `plan` (as a plan file has it, without the motion) or `sines`."""
+    """The table `plan` (as a plan file has it, without the motion) or `sines`."""
     trajectory = excitation.trajectory
     if isinstance(trajectory, FourierSeries):
         data = {"joints": list(cell.joint_names)} | trajectory.to_dict()
@@ -281,12 +264,7 @@ def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
 
 
 def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
-    """Return the trajectory, and what it was planned from, as arguments of an `Excitation`.
-
-    Args:
-        data: the whole file, which holds one of the two tables.
-        fly: how far corners are rounded, as the settings say.
-    """
+    """The trajectory, and what it was planned from, as arguments of an `Excitation`."""
     if "sines" in data:
         sines = {name: value for name, value in data["sines"].items() if name != "joints"}
         return {"trajectory": FourierSeries.from_dict(sines)}
@@ -309,11 +287,7 @@ def _motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
 
 
 def load_design(path: Path, cell: Cell | None = None) -> Excitation:
-    """Read the motion of a design, from its file or folder, with its criteria.
-
-    Args:
-        path: `excitation.toml`, or the folder it lies in.
-        cell: for which it must have been designed; None for any.
+    """Read the motion of a design for a cell, or for any, from its file or folder.
 
     Raises:
         InputError: the file cannot be read, was changed, is for another cell, or its motion does
@@ -326,7 +300,7 @@ def load_design(path: Path, cell: Cell | None = None) -> Excitation:
 
 
 def _positions(trajectory: PiecewiseCubic | FourierSeries) -> Array:
-    """Return where the motion is at some instants from beginning to end (9, n) [rad]."""
+    """Where the motion is at some instants from beginning to end (9, n) [rad]."""
     return trajectory.sample(np.linspace(0.0, trajectory.duration, _INSTANTS))[0]
 
 
@@ -337,73 +311,50 @@ def _seal(text: str) -> str:
     return json_digest(data)
 
 
-class References(NamedTuple):
-    """Earlier designs to compare a new one with.
-
-    Attributes:
-        measures: `CRITERIA` of each, by name.
-        kinematic: names of those that were searched without looking at everything.
-    """
-
-    measures: dict[str, tuple[float, ...]]
-    kinematic: frozenset[str]
-
-
 def references(
     paths: Sequence[Path], cell: Cell, settings: DesignSettings, *, together: bool
-) -> References:
-    """Return earlier designs whose numbers mean what those of a new one are going to mean.
+) -> dict[str, tuple[float, ...]]:
+    """`CRITERIA` of earlier designs by name, whose numbers mean what those of a new one will mean.
 
-    Args:
-        paths: their files or folders.
-        cell: of the new design.
-        settings: of the new design.
-        together: whether it adds to earlier archives.
+    Those that were searched without looking at everything are marked as kinematic. The new design
+    is of `cell` and `settings`; `together` says whether it adds to earlier archives.
 
     Raises:
         InputError: a file cannot be read, or its numbers must not be compared.
     """
-    option = "--compare"
-    if paths and together:
-        raise InputError(
-            None,
-            "would be compared with what --earlier adds up, weighted, over all archives",
-            field=option,
-            remedy="leave out one of the two",
-        )
+
+    def refused(path: Path | None, problem: str, remedy: str) -> InputError:
+        return InputError(path, problem, field="--compare", remedy=remedy)
 
     def judged(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
         if asked.objective.parameters == "payload":
             return {"payload"}
         return set(named or cell.model.parameter_names)
 
-    measures: dict[str, tuple[float, ...]] = {}
-    kinematic = set()
+    if paths and together:
+        problem = "would be compared with what --earlier adds up, weighted, over all archives"
+        raise refused(None, problem, "leave out one of the two")
+    found: dict[str, tuple[float, ...]] = {}
     ours = judged(settings, settings.objective.named)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
         if "earlier" in result.data:
-            raise InputError(
-                path,
+            problem = (
                 "was designed with --earlier: its numbers are of all archives together, weighted, "
-                "not of its motion alone",
-                field=option,
-                remedy="name designs made without --earlier",
+                "not of its motion alone"
             )
+            raise refused(path, problem, "name designs made without --earlier")
         theirs = judged(result.settings, result.data["search"].get("parameters"))
         if ours != theirs:
-            raise InputError(
-                path,
+            problem = (
                 f"was judged by {len(theirs)} parameters, this design by {len(ours)}, of which "
-                f"{len(ours & theirs)} are the same",
-                field=option,
-                remedy="name designs with the same [objective]",
+                f"{len(ours & theirs)} are the same"
             )
+            raise refused(path, problem, "name designs with the same [objective]")
         method = result.excitation.method
         name = f"method {method.upper()}" if len(method) == 1 else method
-        name = f"{name} ({path})" if name in measures else name
-        measures[name] = result.excitation.criteria.measures
-        if result.settings.unchecked:
-            kinematic.add(name)
-    return References(measures, frozenset(kinematic))
+        name += " (kinematic)" if result.settings.unchecked else ""
+        name = f"{name} ({path})" if name in found else name
+        found[name] = result.excitation.criteria.measures
+    return found

@@ -42,13 +42,7 @@ _HEAD = "# The settings of the search in this folder; `hil design --resume` goes
 
 
 class DesignFolder:
-    """Paths of a design's files below one folder, and who may write them.
-
-    Attributes:
-        result, picture: the motion and all that it came from, and the same for the eye.
-        settings: what was asked for.
-        journal: what was scored so far.
-    """
+    """Paths of a design's files below one folder, and who may write them."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -70,17 +64,13 @@ class DesignFolder:
         if self._begun():
             ours.append(self.settings)
         elif self.settings.exists():
-            raise InputError(
-                self.settings,
-                "is in the way: the settings of the design are to be written there",
-                remedy="name another folder (-o), or move the file",
-            )
+            problem = "is in the way: the settings of the design are to be written there"
+            remedy = "name another folder (-o), or move the file"
+            raise InputError(self.settings, problem, remedy=remedy)
         if ours and not force:
-            raise InputError(
-                self.root,
-                f"holds a design already ({ours[0].name})",
-                remedy="go on with it (--resume), name another folder (-o), or add --force",
-            )
+            problem = f"holds a design already ({ours[0].name})"
+            remedy = "go on with it (--resume), name another folder (-o), or add --force"
+            raise InputError(self.root, problem, remedy=remedy)
         with self._written():
             for path in (self.result, self.picture, self.journal, self.settings):
                 path.unlink(missing_ok=True)
@@ -93,15 +83,12 @@ class DesignFolder:
             InputError: there is none.
         """
         if not self._begun():
-            raise InputError(
-                self.root,
-                "holds no design to go on with",
-                remedy="begin one without --resume, or name its folder (-o)",
-            )
+            remedy = "begin one without --resume, or name its folder (-o)"
+            raise InputError(self.root, "holds no design to go on with", remedy=remedy)
         return load_settings(self.settings)
 
     def _begun(self) -> bool:
-        """Return whether the settings in the folder are those of a design, not a person's own."""
+        """Whether the settings in the folder are those of a design, not a person's own."""
         try:
             with opened(self.settings) as file:
                 return file.read(len(_HEAD)) == _HEAD.encode()
@@ -128,11 +115,9 @@ class DesignFolder:
         try:
             yield
         except OSError as error:
-            raise InputError(
-                self.root,
-                f"cannot be written to ({error.strerror})",
-                remedy="make room, or name another folder (-o)",
-            ) from error
+            problem = f"cannot be written to ({error.strerror})"
+            remedy = "make room, or name another folder (-o)"
+            raise InputError(self.root, problem, remedy=remedy) from error
 
 
 def _flat(settings: DesignSettings) -> dict[str, Any]:
@@ -181,14 +166,10 @@ def run_search(
 ) -> Design:
     """Search a motion for a cell.
 
-    Args:
-        cell: the robot, its limits and surroundings.
-        settings: of the design.
-        reporter: shows how far the search is, and its best motion so far.
-        workers: processes that score motions; the result does not depend on how many.
-        known: an earlier estimate, to which the motion is to add.
-        stop: asked between generations; true ends the search with the best motion so far. A
-            motion that hangs holds a generation up for a minute or two.
+    The result does not depend on the number of `workers`, processes that score motions. The motion
+    is to add to what is `known` from an earlier estimate. `stop` is asked between generations; true
+    ends the search with the best motion so far. A motion that hangs holds a generation up for a
+    minute or two.
 
     Raises:
         NoExcitationError: no motion keeps every constraint: which forbids it, where, by how much.
@@ -232,19 +213,21 @@ def run_design(
             require_same(settings, folder.interrupted(), folder.settings)
         else:
             folder.begin(settings, force=force)
-        repetitions = {} if known is None else {"repetitions": known.repetitions}
-        search = {
-            "settings": _flat(settings),
-            "cell": fingerprint(cell),
-            "earlier": dict(archives) | repetitions,
-        }
+        earlier = {} if known is None else dict(archives) | {"repetitions": known.repetitions}
+        search = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": earlier}
         with folder.opened_journal() as file:
             journal = _journal(file, search, reporter)
             try:
                 design = _searched(problem, cell, settings, reporter, workers, stop, journal)
             finally:
                 journal.close()
-        _say_of_journal(journal, reporter)
+        if journal.recalled:
+            reporter.say(f"{journal.recalled} motions were known from the journal")
+        if journal.trouble is not None:
+            reporter.say(
+                f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
+                "resumed from it scores them anew"
+            )
         trajectory = design.excitation.trajectory  # as it is going to be run
         broken = problem.constraints.violations(trajectory, sampled(trajectory))
         if broken:
@@ -313,16 +296,6 @@ def _searched(
     return design
 
 
-def _say_of_journal(journal: Journal, reporter: Reporter) -> None:
-    if journal.recalled:
-        reporter.say(f"{journal.recalled} motions were known from the journal")
-    if journal.trouble is not None:
-        reporter.say(
-            f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
-            "resumed from it scores them anew"
-        )
-
-
 def _note(progress: Progress) -> str:
     where = {
         "sample": "looking at random motions",
@@ -338,17 +311,12 @@ def _journal(file: BinaryIO, search: Mapping[str, Any], reporter: Reporter) -> J
     try:
         journal = Journal(file, search)
     except JournalError as error:
-        raise InputError(
-            file.name,
-            str(error),
-            remedy="resume with the same cell, settings and archives, or begin anew (--force)",
-        ) from error
+        remedy = "resume with the same cell, settings and archives, or begin anew (--force)"
+        raise InputError(file.name, str(error), remedy=remedy) from error
     except OSError as error:
-        raise InputError(
-            file.name,
-            f"cannot be read or written ({error.strerror})",
-            remedy="make room or mend the disk, then try again (--resume)",
-        ) from error
+        problem = f"cannot be read or written ({error.strerror})"
+        remedy = "make room or mend the disk, then try again (--resume)"
+        raise InputError(file.name, problem, remedy=remedy) from error
     if journal.damaged:
         reporter.say(
             f"{journal.damaged} bytes of the journal are damaged; what they held is scored anew"

@@ -43,8 +43,7 @@ RESULT_FORMAT: Final = "designed excitation"
 """What the file that a design leaves calls itself; the settings are a table in it."""
 PAYLOAD_DURATION: Final = 10.0
 """s; a load is weighed by a short motion, since the arm carries it and people wait."""
-PAYLOAD_POINTS: Final = 5
-"""Via points that fit into it."""
+PAYLOAD_POINTS: Final = 5  #: Via points that fit into it
 SHORTEST_RAMP: Final = 0.05
 """s; sines that grow faster are a blow to any arm, and their contacts cannot be determined."""
 
@@ -242,15 +241,9 @@ class DesignSettings(_Table):
             raise ValueError(
                 f"{given} [via_points] and [sines]; a motion is one of the two, so give one of them"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _length_is_allowed(self) -> DesignSettings:
-        """Sines last as long as they are asked to: what is not allowed needs no search."""
-        if self.sines is None:
-            return self
-        length, asked = self.sines.length, self.constraints
-        if not asked.min_duration <= length <= asked.max_duration:
+        # Sines last as long as they are asked to: what is not allowed needs no search.
+        asked, length = self.constraints, None if self.sines is None else self.sines.length
+        if length is not None and not asked.min_duration <= length <= asked.max_duration:
             raise ValueError(
                 f"[sines] length = {length:g} s is not between [constraints] min_duration = "
                 f"{asked.min_duration:g} s and max_duration = {asked.max_duration:g} s; change one"
@@ -320,13 +313,11 @@ def load_settings(path: Path) -> DesignSettings:
     try:
         raw = toml_of(text_of(path))
     except OSError as error:
-        raise SettingsError(
-            path, f"cannot be read ({error.strerror})", remedy="name a TOML file"
-        ) from error
+        problem = f"cannot be read ({error.strerror})"
+        raise SettingsError(path, problem, remedy="name a TOML file") from error
     except ValueError as error:
-        raise SettingsError(
-            path, f"is not TOML ({error})", remedy="see `hil design --show-settings front`"
-        ) from error
+        remedy = "see `hil design --show-settings front`"
+        raise SettingsError(path, f"is not TOML ({error})", remedy=remedy) from error
     if raw.get("format") == RESULT_FORMAT and isinstance(raw.get("settings"), dict):
         raw = raw["settings"]
     return settings_of(raw, path)

@@ -1,11 +1,11 @@
-"""What is drawn of an archive: its quantities joint by joint, thinned without losing a peak.
+"""An archive joint by joint as a page or a picture, thinned without losing a peak.
 
 A long archive is read window by window, so that memory does not grow with its length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
@@ -21,7 +23,31 @@ from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
-from hil.report.drawing import thinned
+from hil.plots import style
+from hil.plots.plan_picture import broken
+from hil.report.drawing import (
+    FIRST,
+    INK,
+    MUTED,
+    OUTSIDE_3,
+    ROUTES,
+    SECOND,
+    Caption,
+    Panel,
+    Plot,
+    blank,
+    drawing,
+    footed,
+    headed,
+    label,
+    place,
+    ruled,
+    thinned,
+    to_panel,
+    traces_text,
+)
+from hil.report.drawing import Trace as Line
+from hil.report.rendering import environment, page_bytes
 from hil.terminal_text import plural
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
@@ -30,10 +56,11 @@ Array = NDArray[np.float64]
 
 _SAMPLES: Final = 30_000
 """Of an archive that are in memory at a time: a minute of an arm with cycles of 2 ms."""
-BINS: Final = 600
-"""Stretches of the whole time of which the lowest and the highest sample are drawn."""
-_LEAP: Final = 10.0
-"""Samples left out, by which a line is broken."""
+_BINS: Final = 4000
+"""Stretches of the time shown whose lowest and highest sample go into the page: every sample of
+16 s at 500 Hz."""
+_BINS_SHOWN: Final = 300
+_LEAP: Final = 10.0  # Samples left out, by which a line is broken
 _TITLES: Final = {
     "position": "position [deg]",
     "velocity": "speed [deg/s]",
@@ -45,36 +72,39 @@ _FIELDS: Final = (
     "position", "velocity", "torque", "target_current", "motor_current", "target_position",
     "state", "status", "gap",
 )  # fmt: skip
+_SECONDS: Final = "time since the first sample [s]"
+_COLOURS: Final = {
+    "position": (FIRST, style.POSITION),
+    "speed": (SECOND, style.VELOCITY),
+    "motor current": (ROUTES[3], style.ACCELERATION),
+    "torque at the joint": (INK, "#5b3a8c"),
+    "following error": (ROUTES[0], style.INK),
+}
+"""Of the lines on the page, and in the picture."""
+# px, of the page
+_WIDTH, _LEFT, _RIGHT, _TOP, _PLOT, _STEP, _BOTTOM = 440.0, 56.0, 10.0, 20.0, 66.0, 90.0, 22.0
+_MOST_GAPS: Final = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One quantity of one joint.
+    """One quantity of one joint."""
 
-    Attributes:
-        time: (k,) s since the archive's first sample; NaN where the line is broken.
-        value: (k,) in the unit that is shown.
-        low: lower limit, None where none is known.
-        high: upper limit, likewise.
-    """
-
-    time: Array
-    value: Array
-    low: float | None = None
-    high: float | None = None
+    time: Array  #: (k,) s since the archive's first sample; NaN where the line is broken
+    value: Array  #: (k,) in the unit that is shown
+    limits: tuple[float, ...] = ()  #: lower and upper; empty where none are known
 
     @property
     def peak_share(self) -> float | None:
         """Largest magnitude as a share of a limit that is the same both ways; None without one."""
-        if self.high is None or self.low is None or self.low != -self.high or not self.value.size:
+        if not self.limits or self.limits[0] != -self.limits[1] or not self.value.size:
             return None
-        peak = np.nanmax(np.abs(self.value), initial=0.0)
-        return float(peak / self.high)
+        return float(np.nanmax(np.abs(self.value), initial=0.0) / self.limits[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """One column of the picture: a quantity of every joint shown."""
+    """A quantity of every joint shown."""
 
     title: str
     traces: tuple[Trace, ...]
@@ -82,29 +112,19 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class ArchiveView:
-    """What the picture of an archive shows.
+    """What the page of an archive shows."""
 
-    Attributes:
-        facts: what `hil archive info` tells.
-        joint_names: those shown.
-        start: s since the first sample.
-        stop: s, likewise.
-        quantities: as far as the archive has them.
-        states: (from [s], to [s], name) of the session; none in an imported recording.
-        events: (s, name, text, whether it is a warning or worse) within the time shown.
-        gaps: s at which packets were missed.
-        frame: of positions, speeds and torques, in words.
-    """
-
-    facts: Overview
-    joint_names: tuple[str, ...]
-    start: float
-    stop: float
-    quantities: tuple[Quantity, ...]
+    facts: Overview  #: what `hil archive info` tells
+    joint_names: tuple[str, ...]  #: those shown
+    start: float  #: s since the first sample
+    stop: float  #: s, likewise
+    quantities: tuple[Quantity, ...]  #: as far as the archive has them
+    #: (from [s], to [s], name) of the session; none in an imported recording
     states: tuple[tuple[float, float, str], ...] = ()
+    #: (s, name, text, whether it is a warning or worse) within the time shown
     events: tuple[tuple[float, str, str, bool], ...] = ()
-    gaps: Array = field(default_factory=lambda: np.zeros(0))
-    frame: str = ""
+    gaps: Array = field(default_factory=lambda: np.zeros(0))  #: s at which packets were missed
+    frame: str = ""  #: of positions, speeds and torques, in words
 
     @property
     def missed(self) -> str:
@@ -120,7 +140,6 @@ def view_of(
     start: float | None = None,
     stop: float | None = None,
     joints: Sequence[str] = (),
-    bins: int = BINS,
 ) -> ArchiveView:
     """Read what is drawn of an archive.
 
@@ -129,7 +148,6 @@ def view_of(
         start: s since its first sample; its beginning if left out.
         stop: s since its first sample; its end if left out.
         joints: names or numbers from 1 of the joints wanted; all if empty.
-        bins: stretches of the time shown, of which the lowest and the highest sample are shown.
 
     Raises:
         ArchiveError: it cannot be read, or holds no sample in that time.
@@ -156,7 +174,7 @@ def view_of(
             continue
         columns, time = archive.columns, archive.columns["stamp"] * 1e-9 - origin
         share = (time[-1] - time[0]) / max(end - begin, 1e-9)
-        _collect(lines, scales, columns, time, shown, max(2, round(bins * share)))
+        _collect(lines, scales, columns, time, shown, max(2, round(_BINS * share)))
         if "state" in columns:
             _add_states(states, time, columns["state"])
             gaps += time[columns["gap"] > 0].tolist()
@@ -183,8 +201,7 @@ def _windows(path: Path, time: Array, begin: float, end: float) -> Iterator[Arch
 
 
 def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
-    numbers = {str(number): index for index, number in enumerate(range(1, len(names) + 1))}
-    known = numbers | {name: index for index, name in enumerate(names)}
+    known = {str(k + 1): k for k in range(len(names))} | {name: k for k, name in enumerate(names)}
     for joint in joints:
         if joint not in known:
             raise InputError(
@@ -324,8 +341,8 @@ def _quantities(
             limits, traces = scales.limits.get(name), []
             for line, joint in zip(found, joints, strict=True):
                 t, v = (np.concatenate(parts) for parts in zip(empty, *line, strict=True))
-                bounds = () if limits is None else map(float, limits[:, joint])
-                traces.append(Trace(t, v, *bounds))
+                bounds = () if limits is None else limits[:, joint].tolist()
+                traces.append(Trace(t, v, tuple(bounds)))
             yield Quantity(_TITLES[name].format(unit), tuple(traces))
 
 
@@ -358,3 +375,158 @@ def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]
     edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
+
+
+def _draw(
+    axes: Axes,
+    view: ArchiveView,
+    recorded: Trace,
+    lines: Iterable[tuple[Array, Array]],
+    colours: tuple[str, str, str],
+) -> None:
+    """A quantity with limits that are within its reach, events, and packets that were missed.
+
+    `colours` are of the lines, of limits and warnings, and of all else.
+    """
+    colour, limit, mark = colours
+    for time, value in lines:
+        axes.plot(time, value, color=colour, linewidth=1.0)
+    low, high = axes.get_ylim()
+    least = 1e-3 * max(abs(low), abs(high), 1e-6)
+    if high - low < least:  # noise at rest does not fill the page
+        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
+    for bound in recorded.limits:
+        if low <= bound <= high:
+            axes.axhline(bound, color=limit, linewidth=0.9, linestyle=(0, (5, 2)))
+    for at, _, _, warns in view.events:
+        axes.axvline(at, color=limit if warns else mark, linewidth=0.8, linestyle=(0, (1, 2)))
+    for gap in view.gaps[:_MOST_GAPS]:
+        axes.axvline(gap, color=mark, linewidth=0.6, alpha=0.7)
+    axes.set_ylim(low, high)
+    axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
+    axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def _share(recorded: Trace) -> str:
+    share = recorded.peak_share
+    return "" if share is None else "< 1" if share < 0.01 else f"{100.0 * share:.0f}"
+
+
+def even(recorded: Trace, grid: Array) -> Array:
+    """A line (k,) on an even grid of time (m,), m even; NaN where it is broken.
+
+    Of every two instants one has the lowest and one the highest sample between them, in the order
+    in which they came: no peak is lost, and none is moved by more than two steps.
+    """
+    found = np.full(grid.shape, np.nan)
+    step = (grid[-1] - grid[0]) / (len(grid) - 1)
+    for times, values in _stretches(recorded):
+        inside = (grid >= times[0] - 0.5 * step) & (grid <= times[-1] + 0.5 * step)
+        found[inside] = np.interp(grid[inside], times, values)
+        pair = np.clip(((times - grid[0]) / step + 0.5).astype(np.intp) // 2, 0, len(grid) // 2 - 1)
+        starts = np.flatnonzero(np.diff(pair, prepend=-1))
+        counts = np.diff(np.append(starts, len(pair)))
+        for start, count in zip(starts[counts > 1], counts[counts > 1], strict=True):
+            here = values[start : start + count]
+            low, high = int(here.argmin()), int(here.argmax())
+            first, last = sorted((low, high))
+            place_of = 2 * pair[start]
+            found[place_of : place_of + 2] = here[first], here[last]
+    return found
+
+
+def _stretches(recorded: Trace) -> list[tuple[Array, Array]]:
+    """The unbroken parts of a line, those of no length left out."""
+    broken = np.flatnonzero(np.isnan(recorded.time))
+    parts = zip(np.split(recorded.time, broken), np.split(recorded.value, broken), strict=True)
+    finite = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
+    return [(t, v) for t, v in finite if t.size]
+
+
+def _panel(view: ArchiveView, j: int) -> Panel:
+    length = max(view.stop - view.start, 1e-9)
+    most = max((q.traces[j].time.size for q in view.quantities), default=0)
+    grid = np.linspace(view.start, view.start + length, 2 * max(1, min(_BINS, most // 2)))
+    plots, shares = [], []
+    with drawing():
+        figure = blank(_WIDTH, _TOP + max(1, len(view.quantities)) * _STEP + _BOTTOM)
+        for k, quantity in enumerate(view.quantities):
+            recorded, name = quantity.traces[j], quantity.title.partition(" [")[0]
+            line = Line(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
+            box = (_LEFT, _TOP + k * _STEP, _WIDTH - _LEFT - _RIGHT, _PLOT)
+            plots.append(Plot(box, quantity.title, [line], recorded.limits))
+            shares += [f"{name} {share}"] if (share := _share(recorded)) else []
+            axes, last = place(figure, *box), k == len(view.quantities) - 1
+            shown = runs(grid, line.values, _BINS_SHOWN)
+            _draw(axes, view, recorded, shown, (line.colour, OUTSIDE_3, MUTED))
+            ruled(axes, "both", x_ticks=6, y_ticks=3)
+            headed(axes, quantity.title)
+            axes.tick_params(labelbottom=last)
+            if last:
+                footed(axes, _SECONDS)
+        note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
+        what = ", ".join(plot.heading for plot in plots)
+        caption = Caption(f"a{j}", label(view.joint_names[j]), note, what)
+        marks = [time for time, _, _, _ in view.events]
+        return to_panel(figure, caption, traces_text(grid, plots, points=grid.size, marks=marks))
+
+
+def archive_page(view: ArchiveView) -> bytes:
+    """The page; the same archive gives the same bytes."""
+    facts = view.facts
+    rows = [
+        ("shown", f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"),
+        ("frame", view.frame),
+        ("joints", ", ".join(facts.joint_names)),
+        ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
+        ("samples", str(facts.samples)),
+        ("packets", view.missed),
+        ("lost", facts.lost or "nothing"),
+        ("damage", facts.damage or "none"),
+        ("attachments", ", ".join(facts.attachments)),
+        *facts.metadata.items(),
+    ]
+    template = environment().get_template("archive.html.j2")
+    text = template.render(
+        facts=facts,
+        joints=[_panel(view, j) for j in range(len(view.joint_names))],
+        events=view.events,
+        states=view.states,
+        simulated=facts.metadata.get("simulated") == "yes",
+        rows=rows,
+    )
+    return page_bytes(text)
+
+
+def draw_archive(view: ArchiveView) -> Figure:
+    """A picture with one row per joint and one column per quantity."""
+    rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
+    width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
+    with style.page():
+        figure = Figure(figsize=(width, height))
+        grid = figure.add_gridspec(
+            rows, columns, left=0.95 / width, right=1.0 - 0.1 / width, top=1.0 - 1.1 / height,
+            bottom=0.5 / height, hspace=0.26, wspace=0.24,
+        )  # fmt: skip
+        for k, quantity in enumerate(view.quantities):
+            colour = _COLOURS[quantity.title.partition(" [")[0]][1]
+            for j, trace in enumerate(quantity.traces):
+                axes = figure.add_subplot(grid[j, k])
+                line = [(trace.time, trace.value)]
+                _draw(axes, view, trace, line, (colour, style.LIMIT, style.MUTED))
+                style.bare(axes)
+                axes.tick_params(labelbottom=j == rows - 1)
+                title = quantity.title if j == 0 else ""
+                share = f"{share} % of limit" if (share := _share(trace)) else ""
+                axes.set_title("\n".join(filter(None, (title, share))), loc="left")
+                axes.set_xlabel(_SECONDS if j == rows - 1 else "")
+                axes.set_ylabel("" if k else broken(label(view.joint_names[j])))
+        simulated = "SIMULATED" if facts.metadata.get("simulated") == "yes" else ""
+        packets = view.missed and f"packets: {view.missed}"
+        parts = (simulated, view.frame, packets, facts.lost, facts.damage, "red dashes: limits")
+        for text, size, at in (
+            (f"{facts.path.name} · {facts.title} · {facts.outcome}", style.TITLE, 0.3),
+            (" · ".join(filter(None, parts)), style.SMALL, 0.52),
+        ):
+            figure.text(0.95 / width, 1.0 - at / height, text, fontsize=size)
+    return figure

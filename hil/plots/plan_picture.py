@@ -1,9 +1,9 @@
-"""A plan on one page: every joint against its limits, and one corner at several percentages."""
+"""A motion or a plan on one page: every joint against its limits."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -18,218 +18,165 @@ from hil.cell import AngleFrame
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import style
-from hil.plots.joints import corner_times, draw_joints
-from planner.moves import FlyPercent, MotionPlan, TargetPassage, plan_moves
-from planner.worker import in_child
+from hil.report.drawing import thinned
+from planner import JointLimits, Trajectory
+from planner.moves import MotionPlan
 
 Array = NDArray[np.float64]
 
-PERCENTAGES = (0.0, 25.0, 50.0, 100.0)
-_SAMPLES = 600
-_MARGIN = 0.12
-_TICK = 0.02
-"""s between two dots on the path."""
-
-
-@dataclass(frozen=True, eq=False)
-class FlownCorner:
-    """The corner at one target of a plan, at one percentage of fly.
-
-    Attributes:
-        percent: What was asked.
-        plan: The whole plan with it.
-        passage: How the target is passed.
-        begin, end: From when to when the corner is rounded [s].
-    """
-
-    percent: float
-    plan: MotionPlan
-    passage: TargetPassage
-    begin: float
-    end: float
-
-
-def flown_corners(plan: MotionPlan, target: int) -> list[FlownCorner]:
-    """Plan again with the corner at one target (from 0, not the last) at each percentage.
-
-    Raises:
-        PlannerCrashed, PlanningTimedOut: the solver crashed, or found no end.
-    """
-    corners = []
-    for percent in PERCENTAGES:
-        moves = list(plan.moves)
-        moves[target] = replace(moves[target], fly=FlyPercent(percent))
-        again = in_child(plan_moves, plan.start, moves, plan.limits, plan.overrides)
-        corners.append(
-            FlownCorner(percent, again, again.targets[target], *corner_times(again)[target])
-        )
-    return corners
-
-
-def sharpest_corner(plan: MotionPlan) -> int | None:
-    """Return the target at which the path turns most, of those it can fly by; None if none."""
-    points = np.array([plan.start, *(move.target for move in plan.moves)])
-    steps = np.diff(points, axis=0)
-    areas = [float(np.max(np.abs(_turn(a, b)))) for a, b in pairwise(steps)]
-    return int(np.argmax(areas)) if areas and max(areas) > 0.0 else None
-
-
-def draw_corner(
-    path: Axes,
-    speed: Axes,
-    corners: Sequence[FlownCorner],
-    joint_names: Sequence[str],
-    frame: AngleFrame,
-) -> None:
-    """Draw the path in the plane of the two joints that turn most, and the speed along it."""
-    widest = corners[-1]
-    index = widest.passage.index
-    points = [widest.plan.start, *(move.target for move in widest.plan.moves)]
-    before, target, after = (np.asarray(points[index + k]) for k in range(3))
-    turn = np.abs(_turn(target - before, after - target))
-    first, second = divmod(int(np.argmax(turn)), target.size)
-    for corner, (colour, dashes) in zip(corners, style.FLIES, strict=True):
-        look = {"color": colour, "linestyle": dashes, "linewidth": 1.6}
-        _path(path, corner, widest, (first, second), frame, look)
-        _speed(speed, corner, widest, look)
-    _zoom(path, widest, (first, second), frame)
-    goal = frame.shown(target)
-    path.plot(goal[first], goal[second], "+", color=style.INK, markersize=11, markeredgewidth=1.4)
-    path.set_xlabel(f"{joint_names[first]} [deg]")
-    path.set_ylabel(f"{joint_names[second]} [deg]")
-    path.set_title(
-        f"path at target {index + 1}, a dot each {_TICK * 1000:.0f} ms",
-        loc="left",
-        color=style.MUTED,
-    )
-    speed.set_xlabel("time from where the target is nearest [s]")
-    speed.set_title("joint-space speed [deg/s]", loc="left", color=style.MUTED)
-    speed.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False, fontsize=style.TEXT)
-    for axes in (path, speed):
-        style.bare(axes)
-
-
-def _turn(before: Array, after: Array) -> Array:
-    """Return by how much a path turns in the plane of each two joints, (n, n) [rad²]."""
-    return np.asarray(np.outer(before, after) - np.outer(after, before), dtype=np.float64)
-
-
-def _window(corner: FlownCorner, widest: FlownCorner) -> Array:
-    """Return the times of a plan while it runs where the widest corner is rounded."""
-    around = 0.6 * max(widest.end - widest.begin, 0.1)
-    middle = corner.passage.time
-    duration = corner.plan.trajectory.duration
-    return np.linspace(max(middle - around, 0.0), min(middle + around, duration), _SAMPLES)
-
-
-def _path(
-    axes: Axes,
-    corner: FlownCorner,
-    widest: FlownCorner,
-    joints: tuple[int, int],
-    frame: AngleFrame,
-    look: dict[str, Any],
-) -> None:
-    time = _window(corner, widest)
-    q = frame.shown(corner.plan.trajectory.sample(time)[0])[:, joints]
-    axes.plot(*q.T, **look)
-    middle = corner.passage.time
-    dots = middle + _TICK * np.arange(
-        np.ceil((time[0] - middle) / _TICK), np.floor((time[-1] - middle) / _TICK) + 1
-    )
-    at = frame.shown(corner.plan.trajectory.sample(dots)[0])[:, joints]
-    axes.plot(*at.T, linestyle="none", marker="o", markersize=2.6, color=look["color"])
-
-
-def _zoom(axes: Axes, widest: FlownCorner, joints: tuple[int, int], frame: AngleFrame) -> None:
-    """Show the widest corner but for its ends, where the paths hardly differ."""
-    edge = 0.15 * (widest.end - widest.begin)
-    time = np.linspace(widest.begin + edge, widest.end - edge, _SAMPLES)
-    seen = np.vstack(
-        (
-            frame.shown(widest.plan.trajectory.sample(time)[0]),
-            frame.shown(widest.plan.moves[widest.passage.index].target),
-        )
-    )[:, joints]
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    room = _MARGIN * np.maximum(high - low, 1e-9)
-    axes.set_xlim(low[0] - room[0], high[0] + room[0])
-    axes.set_ylim(low[1] - room[1], high[1] + room[1])
-
-
-def _speed(axes: Axes, corner: FlownCorner, widest: FlownCorner, look: dict[str, Any]) -> None:
-    time = _window(corner, widest)
-    speed = np.degrees(np.linalg.norm(corner.plan.trajectory.sample(time)[1], axis=1))
-    passed = corner.passage
-    label = (
-        f"fly {corner.percent:.0f} %: passes at {np.degrees(passed.distance):.2f}°,\n"
-        f"motion {corner.plan.trajectory.duration:.3f} s"
-    )
-    if corner.percent > 0.0 and passed.how != "flown":
-        label += f" ({passed.how})"
-    axes.plot(time - passed.time, speed, label=label, **look)
-
-
 FORMATS = (".png", ".svg", ".pdf")
-_WIDTH, _ROW, _CORNER = 11.0, 1.25, 3.0
-_TOP, _BOTTOM, _GAP = 0.95, 0.55, 0.95
+_SAMPLES = 4000
+_LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
+_LETTERS = 12  # As many as a line along a row's height takes
+# inch
+_WIDTH, _ROW, _TOP, _BOTTOM = 11.0, 1.25, 0.95, 0.55
 _DOTS_PER_INCH = 110
 
 
-def draw_plan(
-    plan: MotionPlan,
+def draw_motion(
+    rows: Sequence[Sequence[Axes]],
+    trajectory: Trajectory,
+    limits: JointLimits,
     joint_names: Sequence[str],
     frame: AngleFrame,
-    *,
-    title: str = "",
-    corner: int | None = None,
-) -> Figure:
-    """Draw a plan.
+    postures: Sequence[float] | Array = (),
+) -> None:
+    """Draw one row per joint: position, velocity and, in a third column, acceleration.
 
     Args:
-        plan: What to draw.
-        joint_names: One name per joint.
-        frame: Which angles to show.
-        title: Stands above the page.
-        corner: Target (from 0) to draw the corner of; the sharpest if None.
+        rows: two or three axes per joint.
+        trajectory: what to draw.
+        limits: its limits, URDF angles.
+        joint_names: one per joint.
+        frame: which angles to show.
+        postures: times that are numbered (k,) [s].
     """
-    corner = sharpest_corner(plan) if corner is None else corner
+    time = np.linspace(0.0, trajectory.duration, _SAMPLES)
+    q, *rates = trajectory.sample(time)
+    ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
+    fastest, most = np.degrees(limits.velocity), np.degrees(limits.acceleration)
+    columns = (
+        (f"position [deg, {frame.name} angles]", frame.shown(q), *ends, style.POSITION),
+        ("velocity [deg/s]", frame.shown_rate(rates[0]), -fastest, fastest, style.VELOCITY),
+        ("acceleration [deg/s²]", frame.shown_rate(rates[1]), -most, most, style.ACCELERATION),
+    )
+    for joint, (name, row) in enumerate(zip(joint_names, rows, strict=True)):
+        for axes, (_, values, low, high, colour) in zip(row, columns, strict=False):
+            _against_limits(axes, float(low[joint]), float(high[joint]), values[:, joint])
+            for at in postures:
+                axes.axvline(at, color=style.RULE, linewidth=0.8)
+            axes.plot(*thinned(time, values[:, joint], 400), color=colour, linewidth=1.1)
+            axes.set_xlim(0.0, max(trajectory.duration, 1e-9))
+            axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
+            style.bare(axes)
+            axes.grid(False, axis="x")
+        name = broken(name)
+        size = style.TEXT - (1.0 if "\n" in name else 0.0)
+        row[0].set_ylabel(name, color=style.INK, fontsize=size)
+    for axes, (title, *_) in zip(rows[0], columns, strict=False):
+        axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
+        for number, at in enumerate(postures, 1):
+            _number(axes, number, at, fontweight="bold", annotation_clip=False)
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+
+
+def broken(name: str) -> str:
+    """A joint's name in at most two lines, none longer than a row of the page is high.
+
+    What does not fit is left out of the middle: beginnings and ends tell joints apart.
+    """
+    name = "".join(c if c.isprintable() else " " for c in name).strip()
+    ends = [match.end() for match in re.finditer(r"[_\W]+", name)]
+    fitting = [end for end in ends if end <= _LETTERS and end < len(name)]
+    at = fitting[-1] if fitting and len(name) > _LETTERS else 0
+    rest, half = name[at:], (_LETTERS - 1) // 2
+    if len(rest) > _LETTERS:
+        rest = f"{rest[:half]}…{rest[half + 1 - _LETTERS :]}"
+    return f"{name[:at].rstrip()}\n{rest}" if at else rest
+
+
+def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
+    """Show both limits and all values, with some room about them.
+
+    Zero, or the middle where it lies outside, has a tick too, if that lies apart from both limits.
+    """
+    for bound in (low, high):
+        axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
+    least, most = min(low, float(values.min())), max(high, float(values.max()))
+    room = 0.1 * (most - least)
+    axes.set_ylim(least - room, most + room)
+    middle = 0.0 if low < 0.0 < high else (low + high) / 2.0
+    inside = min(abs(middle - low), abs(high - middle)) > 2.0 * room
+    axes.set_yticks([low, middle, high] if inside else [low, high])
+    axes.yaxis.set_major_formatter("{x:.4g}")
+
+
+def _number(axes: Axes, number: int, at: float, **words: Any) -> None:
+    """Write a number above the axes."""
+    axes.annotate(
+        str(number), (at, 1.0), xycoords=("data", "axes fraction"), xytext=(0.0, 2.0),
+        textcoords="offset points", ha="center", fontsize=style.SMALL, color=style.INK, **words,
+    )  # fmt: skip
+
+
+def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
+    """From when to when each target but the last is rounded [s]; both alike for a stop."""
+    times = []
+    end = 0.0
+    entered = 0.0
+    for duration, corner in zip(plan.durations, plan.corners, strict=False):
+        begin = end + max(duration - entered - corner.leave, 0.0)
+        end = begin + (0.0 if corner.join is None else corner.join.duration)
+        times.append((begin, end))
+        entered = corner.enter
+    return times
+
+
+def draw_plan(
+    plan: MotionPlan, joint_names: Sequence[str], frame: AngleFrame, *, title: str = ""
+) -> Figure:
+    """Draw a plan in angles of a frame: a row of three axes per joint, its targets and corners."""
     n = len(joint_names)
-    below = 0.0 if corner is None else _CORNER + _GAP
-    height = _TOP + n * _ROW + below + _BOTTOM
+    height = _TOP + n * _ROW + _BOTTOM
+    targets = np.array([frame.shown(move.target) for move in plan.moves])
+    times = [target.time for target in plan.targets]
+    # No number lies upon another.
+    apart = 0.03 * plan.trajectory.duration
+    shown = [True, *(b - a >= apart for a, b in pairwise(times))]
     with style.page():
         figure = Figure(figsize=(_WIDTH, height))
         grid = figure.add_gridspec(
-            n,
-            3,
-            left=0.08,
-            right=0.985,
-            top=1.0 - _TOP / height,
-            bottom=(below + _BOTTOM) / height,
-            hspace=0.16,
-            wspace=0.2,
-        )
+            n, 3, left=0.08, right=0.985, top=1.0 - _TOP / height, bottom=_BOTTOM / height,
+            hspace=0.16, wspace=0.2,
+        )  # fmt: skip
         rows = [[figure.add_subplot(grid[j, k]) for k in range(3)] for j in range(n)]
-        draw_joints(rows, plan, joint_names, frame)
-        figure.align_ylabels([row[0] for row in rows])
-        if corner is not None:
-            lower = figure.add_gridspec(
-                1, 2, left=0.08, right=0.76, top=(_BOTTOM + _CORNER) / height,
-                bottom=_BOTTOM / height, wspace=0.22,
+        draw_motion(rows, plan.trajectory, plan.limits, joint_names, frame)
+        for joint, row in enumerate(rows):
+            for axes in row:
+                for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
+                    axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0, zorder=0.5)
+                    line = _LINES[target.how]
+                    axes.axvline(target.time, color=style.MUTED, linewidth=0.7, linestyle=line)
+            row[0].plot(
+                times, targets[:, joint], linestyle="none", marker="o", markersize=3.2,
+                markerfacecolor="white", markeredgecolor=style.INK, markeredgewidth=0.8,
+                clip_on=False, zorder=4.0,
             )  # fmt: skip
-            path, speed = (figure.add_subplot(lower[0, k]) for k in range(2))
-            draw_corner(path, speed, flown_corners(plan, corner), joint_names, frame)
-        figure.text(
-            0.08, 1.0 - 0.3 / height, _headline(plan, title), fontsize=style.TITLE, color=style.INK
-        )
-        figure.text(
-            0.08,
-            1.0 - 0.52 / height,
+        for axes in rows[0]:
+            for number, (time, show) in enumerate(zip(times, shown, strict=True), 1):
+                if show:
+                    _number(axes, number, time)
+        figure.align_ylabels([row[0] for row in rows])
+        legend = (
             "red dashes: limits; shaded: corners; line at each numbered target: solid flown by as "
-            "asked, dashed less than asked, dotted stop; circles: targets",
-            fontsize=style.SMALL + 0.5,
-            color=style.MUTED,
+            "asked, dashed less than asked, dotted stop; circles: targets"
         )
+        for text, at, size, colour in (
+            (_headline(plan, title), 0.3, style.TITLE, style.INK),
+            (legend, 0.52, style.SMALL + 0.5, style.MUTED),
+        ):
+            figure.text(0.08, 1.0 - at / height, text, fontsize=size, color=colour)
     return figure
 
 
@@ -268,5 +215,4 @@ def _headline(plan: MotionPlan, title: str) -> str:
     share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""
     count = np.unique([target.how for target in plan.targets[:-1]], return_counts=True)
     passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
-    parts = [title, f"{duration:.3f} s{share}", passed]
-    return " · ".join(part for part in parts if part)
+    return " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))

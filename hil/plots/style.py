@@ -13,13 +13,6 @@ from hil.report.drawing import drawing
 INK, MUTED, RULE, SHADE = "#1a1a1a", "#666666", "#dddddd", "#f0e8d2"
 LIMIT = "#b3261e"
 POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
-# Darker for a wider fly, and a line style of its own for grey print.
-FLIES = (
-    ("#000000", (0, ())),
-    ("#56a0d3", (0, (6, 1.5))),
-    ("#d98200", (0, (3, 1.2, 1, 1.2))),
-    ("#a5004c", (0, (1.4, 1))),
-)
 SMALL, TEXT, TITLE = 7.5, 9.0, 12.0
 
 

@@ -47,8 +47,7 @@ INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, OUTSIDE_3 = CSS_VAR
 """`WIDE` is a light, broad line that another one may lie upon."""
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0
-PANEL_WIDTH: Final = 370.0
-"""Of most figures, px."""
+PANEL_WIDTH: Final = 370.0  #: Of most figures, px
 DASHED: Final = (0, (4, 3))
 _TOP: Final = 20.0
 _SVG: Final = "http://www.w3.org/2000/svg"
@@ -57,8 +56,7 @@ _LONG_DECIMAL: Final = re.compile(r"-?\d+\.\d{3,}")
 _FONT_FAMILY: Final = re.compile(r"font-family:[^;]*;?\s*")
 _REFERENCE: Final = re.compile(r"url\(#([^)]+)\)")
 _LABEL_LENGTH: Final = 28
-FEWEST_FOR_A_BOX: Final = 5
-"""Quartiles of fewer are nearly the values themselves."""
+FEWEST_FOR_A_BOX: Final = 5  #: Quartiles of fewer are nearly the values themselves
 _settings = threading.RLock()
 
 
@@ -86,8 +84,7 @@ class Panel:
     title: str
     note: str
     svg: Markup
-    width: float
-    """Width [px] at which its letters have their intended size."""
+    width: float  #: Width [px] at which its letters have their intended size
 
 
 def blank(width: float, height: float) -> Figure:
@@ -265,50 +262,33 @@ def _restyle(element: ET.Element) -> None:
         del element.attrib["transform"]
 
 
-MOST_POINTS: Final = 3000
-"""Of a line; more than three times what a panel shows at once."""
+MOST_POINTS: Final = 3000  #: Of a line; more than three times what a panel shows at once
 _STEPS: Final = 65534
-_NOTHING: Final = 65535
-"""Stands where nothing was recorded."""
+_NOTHING: Final = 65535  # Stands where nothing was recorded
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One line.
+    """One line."""
 
-    Attributes:
-        values: (m,); NaN where nothing was recorded.
-        colour: of the palette.
-        width: of the line [px].
-        name: what it is, in a word.
-        dashed: so that two of a colour's lightness differ in print.
-    """
-
-    values: Array
-    colour: str
-    width: float
-    name: str
-    dashed: bool = False
+    values: Array  #: (m,); NaN where nothing was recorded
+    colour: str  #: of the palette
+    width: float  #: of the line [px]
+    name: str  #: what it is, in a word
+    dashed: bool = False  #: so that two of a colour's lightness differ in print
 
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Axes of a panel with time to the right.
+    """Axes of a panel with time to the right."""
 
-    Attributes:
-        box: left, top, width and height in the panel [px].
-        heading: what stands above: the quantity and its unit.
-        traces: its lines, the lowest first.
-        limits: values at which dashed lines are drawn.
-        shaded: stretches of time [s] that are shaded, from the first instant on.
-        reach: largest value of a range about zero; the range of the lines if None.
-    """
-
-    box: tuple[float, float, float, float]
-    heading: str
-    traces: Sequence[Trace]
-    limits: Sequence[float] = ()
+    box: tuple[float, float, float, float]  #: left, top, width and height in the panel [px]
+    heading: str  #: what stands above: the quantity and its unit
+    traces: Sequence[Trace]  #: its lines, the lowest first
+    limits: Sequence[float] = ()  #: values at which dashed lines are drawn
+    #: stretches of time [s] that are shaded, from the first instant on
     shaded: Sequence[tuple[float, float]] = ()
+    #: largest value of a range about zero; the range of the lines if None
     reach: float | None = None
 
 

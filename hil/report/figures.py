@@ -54,8 +54,7 @@ _LEFT, _RIGHT = 46.0, 10.0
 _INNER: Final = PANEL_WIDTH - _LEFT - _RIGHT
 _POINTS: Final = 1200  # of lines that are smooth
 _BAND_POINTS: Final = 400
-_INTERVAL: Final = 1.96
-"""Half a 95 % interval, in standard errors."""
+_INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
 MEAN_ABS_OF_NORMAL: Final = math.sqrt(2.0 / math.pi)
 """Mean |e| of normal residuals of standard deviation 1."""
 PARTS: Final = (

@@ -37,8 +37,7 @@ _CRITERIA: Final = (
 _MOST_CANDIDATES: Final = 6
 """Candidates of one choice that are shown: the first, and the best of the others."""
 
-Fact = tuple[str, str]
-"""A term and what is known of it."""
+Fact = tuple[str, str]  #: A term and what is known of it
 
 
 def report_bytes(results: Results, series: ReportSeries) -> bytes:

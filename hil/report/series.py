@@ -37,38 +37,9 @@ def _empty() -> Array:
 class ReportSeries:
     """Motion of the excitation, one validation run in time, and what friction and residual are.
 
-    Torques are in N·m, of joints that slide in N; likewise rad is m. The series after the
-    predicted torque may be empty: figures that need them are then left out.
-
-    Attributes:
-        excitation_time: (m,) [s].
-        excitation_position: (m, n) [rad].
-        excitation_velocity: (m, n) [rad/s].
-        example_archive: Name of the archive the example was read from.
-        example_time: (k,) [s]; k = 0 where no validation run exists.
-        example_measured: (k, n) [N·m], already low-passed for display.
-        example_predicted: (k, n) [N·m], low-passed alike.
-        excitation_fitted: (m, n), 1 where the row was fitted and 0 where not.
-        example_used: (k, n), 1 where the row counts in the error of the verdict, else 0.
-        example_inertia: (k, n) part of the predicted torque; the four parts add up to it.
-        example_coriolis: (k, n), centrifugal torque included.
-        example_gravity: (k, n).
-        example_friction: (k, n), offsets included.
-        friction_speed: (c, n) [rad/s] of fitted rows; NaN where there are fewer.
-        friction_torque: (c, n) measured torque less what is predicted without friction.
-        law_speed: (s, n) [rad/s] along the friction law.
-        law_torque: (s, n) of a joint that slides.
-        reversal_travel: (r, n) displacement since a reversal [rad]; NaN where friction jumps.
-        reversal_torque: (r, n) of a joint that creeps forwards after it has gone backwards.
-        spectrum_frequency: (f,) [Hz] of the example.
-        spectrum_torque: (f, n) [N·m/√Hz], of the measured torque, every row.
-        spectrum_residual: (f, n) of measured less predicted torque.
-        motion_bandwidth: (n,) [Hz] of the smoothed positions of the example; NaN where unknown.
-        replay_time: (q,) [s] of a replay; empty where none was made.
-        replay_error: (q, n) simulated less recorded position of the identified model [° or mm].
-        replay_nominal: (q, n) of the nominal model.
-        replay_spread: (q, n) standard deviation of variants of the identified model.
-        replay_words: why the identified model drifts, a sentence a line.
+    Shapes stand beside the types, n being the number of joints. Times are in s; torques in N·m, of
+    joints that slide in N; likewise rad is m. Series with a default may be empty: figures that need
+    them are then left out.
 
     Raises:
         SeriesError: the shapes do not belong together.
@@ -77,31 +48,44 @@ class ReportSeries:
     excitation_time: Annotated[Array, "m"]
     excitation_position: Annotated[Array, "mn"]
     excitation_velocity: Annotated[Array, "mn"]
-    example_archive: str
-    example_time: Annotated[Array, "k"]
+    example_archive: str  #: name of the archive the example was read from
+    example_time: Annotated[Array, "k"]  #: empty where no validation run exists
+    #: low-passed for display
     example_measured: Annotated[Array, "kn"]
     example_predicted: Annotated[Array, "kn"]
+    #: 1 where the row was fitted and 0 where not
     excitation_fitted: Annotated[Array, "mn"] = field(default_factory=_empty)
+    #: 1 where the row counts in the error of the verdict, else 0
     example_used: Annotated[Array, "kn"] = field(default_factory=_empty)
+    #: parts of the predicted torque, which add up to it
     example_inertia: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_coriolis: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_gravity: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_friction: Annotated[Array, "kn"] = field(default_factory=_empty)
+    #: of fitted rows, the measured torque less what is predicted without friction; NaN where there
+    #: are fewer
     friction_speed: Annotated[Array, "cn"] = field(default_factory=_empty)
     friction_torque: Annotated[Array, "cn"] = field(default_factory=_empty)
+    #: along the friction law of a joint that slides
     law_speed: Annotated[Array, "sn"] = field(default_factory=_empty)
     law_torque: Annotated[Array, "sn"] = field(default_factory=_empty)
+    #: displacement since a reversal and torque of a joint that creeps forwards after it has gone
+    #: backwards; NaN where friction jumps
     reversal_travel: Annotated[Array, "rn"] = field(default_factory=_empty)
     reversal_torque: Annotated[Array, "rn"] = field(default_factory=_empty)
-    spectrum_frequency: Annotated[Array, "f"] = field(default_factory=_empty)
+    spectrum_frequency: Annotated[Array, "f"] = field(default_factory=_empty)  #: [Hz]
+    #: of the example, every row [N·m/√Hz]
     spectrum_torque: Annotated[Array, "fn"] = field(default_factory=_empty)
     spectrum_residual: Annotated[Array, "fn"] = field(default_factory=_empty)
+    #: of the smoothed positions of the example [Hz]; NaN where unknown
     motion_bandwidth: Annotated[Array, "n"] = field(default_factory=_empty)
     replay_time: Annotated[Array, "q"] = field(default_factory=lambda: np.empty(0))
+    #: simulated less recorded position of the identified and of the nominal model [° or mm]
     replay_error: Annotated[Array, "qn"] = field(default_factory=_empty)
     replay_nominal: Annotated[Array, "qn"] = field(default_factory=_empty)
+    #: standard deviation of variants of the identified model
     replay_spread: Annotated[Array, "qn"] = field(default_factory=_empty)
-    replay_words: str = ""
+    replay_words: str = ""  #: why the identified model drifts, a sentence a line
 
     def __post_init__(self) -> None:
         position = self.excitation_position

@@ -1,7 +1,7 @@
 """The paper's study: methods A and B designed, executed, identified and compared."""
 
 from .results import StudyResults
-from .run import run_study, study_campaigns
+from .run import run_study
 from .settings import FULL, QUICK, StudySettings, study_settings
 
 __all__ = [
@@ -10,6 +10,5 @@ __all__ = [
     "StudyResults",
     "StudySettings",
     "run_study",
-    "study_campaigns",
     "study_settings",
 ]

@@ -30,6 +30,8 @@ from .settings import Effort, StudyFolder, StudySettings
 
 A, B, B0, AP = "a", "b", "b0", "a-printed"
 LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
+OWN_CLASS: Final = {B: "fly-by", B0: "stop-to-stop", A: "sinusoid"}
+"""Class of the held-out motions of each method's campaign, which its excitation is of."""
 SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -59,20 +61,6 @@ class Search:
     words: str
     settings: DesignSettings
     excitation: Excitation | None = None
-
-    @property
-    def found(self) -> Excitation:
-        """The motion.
-
-        Raises:
-            NoExcitationError: there is none.
-        """
-        if self.excitation is None:
-            raise NoExcitationError(
-                f"{self.words} found no motion that satisfies all constraints of the cell;"
-                " search longer (without --quick), or with another --seed"
-            )
-        return self.excitation
 
     @property
     def notes(self) -> str:
@@ -163,15 +151,13 @@ def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionCheck
     Raises:
         NoExcitationError: the motion must not be sent, or cannot be planned.
     """
-    assert excitation.via_points is not None and excitation.speed is not None
+    points, speed = excitation.via_points, excitation.speed
+    assert points is not None and speed is not None
     try:
-        trajectory = plan_in_child(
-            excitation.via_points, cell.joint_limits, speed=excitation.speed, fly=fly
-        )
+        trajectory = plan_in_child(points, cell.joint_limits, speed=speed, fly=fly)
     except PlannerError as error:
         raise NoExcitationError(f"fly {fly:g}: {error}") from error
-    refusal = checks.refusal(trajectory)
-    if refusal is not None:
+    if (refusal := checks.refusal(trajectory)) is not None:
         raise NoExcitationError(f"fly {fly:g}: {refusal}")
     criteria = Objective(cell.model).criteria(trajectory, RESCORE_PERIOD)
     return replace(excitation, trajectory=trajectory, criteria=criteria, fly=fly)
@@ -180,8 +166,7 @@ def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionCheck
 T = TypeVar("T")
 
 NO_EFFECTS, EFFECTS, ABLATION = "plain", "effects", "ablation"
-LONGEST: Final = 6 * 3600.0
-"""s that one campaign, or one reading of archives, may last."""
+LONGEST: Final = 6 * 3600.0  #: s that one campaign, or one reading of archives, may last
 
 # Streams of random numbers that no search and no other class draws from.
 _STOPS_SEED, _SINES_SEED, _TRIES = 1_000_003, 5, 400
@@ -219,18 +204,13 @@ class Execution:
 
 @dataclass(frozen=True, eq=False)
 class Plans:
-    """All campaigns of a study.
-
-    Attributes:
-        searched: key of the search that each method's excitation is of; `AP`, the paper's own
-            sines, is there only where these are not those of A.
-        executions: by condition and key.
-        missing: what cannot be run, in sentences.
-    """
+    """All campaigns of a study."""
 
     searched: dict[str, str]
-    executions: dict[str, dict[str, Execution]]
-    missing: list[str]
+    """Key of the search that each method's excitation is of; `AP`, the paper's own sines, is there
+    only where these are not those of A."""
+    executions: dict[str, dict[str, Execution]]  #: By condition and key
+    missing: list[str]  #: What cannot be run, in sentences
 
     @property
     def all(self) -> list[Execution]:
@@ -245,20 +225,22 @@ class Plans:
             StudyError: A, B or B with fly 0 itself was ended.
         """
         missing = list(self.missing)
-        executions: dict[str, dict[str, Execution]] = {name: {} for name in self.executions}
         for condition, some in self.executions.items():
             for key, one in some.items():
-                why = ended.get(one.root)
-                if why is None:
-                    executions[condition][key] = one
-                elif key == B or (condition != ABLATION and key != AP):
+                if one.root not in ended:
+                    continue
+                if key == B or (condition != ABLATION and key != AP):
                     raise StudyError(
                         f"{one.root}: this arm cannot bear the excitation that was found for it:"
-                        f" {why}; another search (--seed, in another folder) finds another one"
+                        f" {ended[one.root]}; another search (--seed, in another folder) finds"
+                        " another one"
                     )
-                else:
-                    missing.append(f"{key} could not be run: {why}")
-        return replace(self, executions=executions, missing=missing)
+                missing.append(f"{key} could not be run: {ended[one.root]}")
+        left = {
+            condition: {key: one for key, one in some.items() if one.root not in ended}
+            for condition, some in self.executions.items()
+        }
+        return replace(self, executions=left, missing=missing)
 
 
 def noise_key(method: str, factor: float) -> str:
@@ -271,21 +253,24 @@ def plan_study(
 ) -> Plans:
     """Plan all campaigns of a study.
 
-    Each method's campaign holds its excitation and the held-out motions of its own class, so that
-    it is a whole campaign by itself.
+    Each method's campaign is a whole one: its excitation, and held-out motions of its own class.
 
     Raises:
         NoExcitationError: a method has no motion, or no held-out motion satisfies the constraints.
     """
-    checks, sines, printed = MotionChecks.of(cell), best_sines(found), None
-    if sines is None:
-        raise NoExcitationError(
-            "no sum of sines satisfies all constraints of the cell; search longer (without --quick)"
-        )
-    if sines not in PRINTED_SINES:
-        printed = best_sines(found, PRINTED_SINES)
-    searched = {A: sines, B: B, B0: B0} | ({} if printed is None else {AP: printed})
-    excitations = {key: found[name].found for key, name in searched.items()}
+    checks, printed = MotionChecks.of(cell), best_sines(found, PRINTED_SINES)
+    sines = best_sines(found) or next(key for key in SINES if key in found)
+    searched = {A: sines, B: B, B0: B0}
+    if printed is not None and sines not in PRINTED_SINES:
+        searched[AP] = printed
+    excitations: dict[str, Excitation] = {}
+    for key, name in searched.items():
+        if (one := found[name].excitation) is None:
+            raise NoExcitationError(
+                f"{found[name].words} found no motion that satisfies all constraints of the cell;"
+                " search longer (without --quick), or with another --seed"
+            )
+        excitations[key] = one
     count, seed, fly = settings.motions, settings.seed, excitations[B].fly
     assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
 
@@ -303,18 +288,15 @@ def plan_study(
         repetitions=settings.repetitions, validation_runs=count, simulation_seed=seed
     )
     few = cell.with_campaign(repetitions=settings.ablation_repetitions, simulation_seed=seed)
-    executions: dict[str, dict[str, Execution]] = {}
-    for condition in (NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,):
-        executions[condition] = {
-            key: Execution(
-                folder.campaign(condition, key),
-                main,
-                _plan(main, one, held_out.get(key, ())),
-                effects=condition == EFFECTS,
-            )
-            for key, one in excitations.items()
+    plans = {key: _plan(main, one, held_out.get(key, ())) for key, one in excitations.items()}
+    executions = {
+        condition: {
+            key: Execution(folder.campaign(condition, key), main, plan, condition == EFFECTS)
+            for key, plan in plans.items()
         }
-    varied, missing = _varied(cell, settings, found, checks)
+        for condition in ((NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,))
+    }
+    varied, missing = _varied(cell, settings, found, excitations[B], checks)
     arms = {key: (few, one) for key, one in varied.items()}
     for factor in settings.noise:
         noise = {"simulation.current_noise": factor * cell.simulation.current_noise}
@@ -328,15 +310,19 @@ def plan_study(
 
 
 def _varied(
-    cell: Cell, settings: StudySettings, found: Mapping[str, Search], checks: MotionChecks
+    cell: Cell,
+    settings: StudySettings,
+    found: Mapping[str, Search],
+    own: Excitation,
+    checks: MotionChecks,
 ) -> tuple[dict[str, Excitation], list[str]]:
-    """Excitations of the ablations by key, B itself among them; and what there is none of."""
-    varied, missing = {B: found[B].found}, list[str]()
+    """Excitations of the ablations by key, B's own among them; and what there is none of."""
+    varied, missing = {B: own}, list[str]()
     for fly in settings.fly:
         key = variant_key("fly", fly)
         if key not in varied:
             try:
-                varied[key] = with_fly(cell, varied[B], fly, checks)
+                varied[key] = with_fly(cell, own, fly, checks)
             except NoExcitationError as error:
                 missing.append(f"B's via points cannot be run so: {error}.")
     wanted = [variant_key("via", n) for n in settings.n_via]

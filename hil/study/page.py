@@ -89,9 +89,7 @@ def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[Pa
 
 def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
     """Mean |e| on fly-by motions, a box for each estimate and a panel for each joint (Fig. 3)."""
-    found = next((one for one in condition.classes if one.motion_class == "fly-by"), None)
-    if found is None:
-        return []
+    found = next(one for one in condition.classes if one.motion_class == "fly-by")
     errors = [np.array(found.mean_abs[one.key]) for one in condition.methods]
     labels = [one.label.replace(" ", "\n") for one in condition.methods]
     panels = []
@@ -101,54 +99,32 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
             for one, own in zip(condition.methods, errors, strict=True)
         )
         caption = Caption(f"b{condition.key}{j}", name, f"medians {medians}", "mean |e| in N·m")
-        columns, colours = (
-            [own[:, j] for own in errors],
-            [COLOURS[k % 4] for k in range(len(errors))],
-        )
+        columns, colours = [own[:, j] for own in errors], COLOURS[: len(errors)]
         panels.append(box_panel(caption, columns, colours, "mean |e| [N·m]", labels))
     return panels
 
 
 def _examples(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
     """One held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
-    panels = []
-    for example in condition.examples[:1]:
-        time, labels = np.array(example.time), condition.labels
-        for j, name in enumerate(joint_names):
-            measured = np.array(example.measured[j])
-            lines = [
-                Trace(np.array(series[j]), COLOURS[k % 4], 1.1, labels[key], dashed=k % 4 == 1)
-                for key, series in example.predicted.items()
-                for k in [list(labels).index(key)]
-            ]
-            errors = [measured - one.values for one in lines]
-            reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-            # A row for each error: where there is noise, one line over another would hide it.
-            plots = [
-                Plot(
-                    (46.0, 20.0, 314.0, 128.0),
-                    "torque [N·m]",
-                    [Trace(measured, WIDE, 4.0, "measured"), *lines],
-                )
-            ]
-            plots += [
-                Plot(
-                    (46.0, 172.0 + 72.0 * row, 314.0, 48.0),
-                    f"measured − {one.name} [N·m]",
-                    [Trace(error, one.colour, 1.0, one.name)],
-                    reach=reach,
-                )
-                for row, (one, error) in enumerate(zip(lines, errors, strict=True))
-            ]
-            rms = ", ".join(
-                f"{one.name} {significant(float(np.sqrt(np.mean(error**2))))}"
-                for one, error in zip(lines, errors, strict=True)
-            )
-            words = Caption(
-                f"e{condition.key}{j}",
-                name,
-                f"RMS error {rms} N·m",
-                "measured and predicted torque",
-            )
-            panels.append(time_panel(188.0 + 72.0 * len(errors), time, plots, words))
+    (example,) = condition.examples
+    time, panels = np.array(example.time), []
+    for j, name in enumerate(joint_names):
+        measured = np.array(example.measured[j])
+        lines = [
+            Trace(np.array(series[j]), COLOURS[k], 1.1, condition.labels[key], dashed=k == 1)
+            for k, (key, series) in enumerate(example.predicted.items())
+        ]
+        errors = [measured - one.values for one in lines]
+        reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
+        both = [Trace(measured, WIDE, 4.0, "measured"), *lines]
+        plots, rms = [Plot((46.0, 20.0, 314.0, 128.0), "torque [N·m]", both)], []
+        # A row for each error: where there is noise, one line over another would hide it.
+        for row, (one, error) in enumerate(zip(lines, errors, strict=True)):
+            box, heading = (46.0, 172.0 + 72.0 * row, 314.0, 48.0), f"measured − {one.name} [N·m]"
+            trace = Trace(error, one.colour, 1.0, one.name)
+            plots.append(Plot(box, heading, [trace], reach=reach))
+            rms.append(f"{one.name} {significant(float(np.sqrt(np.mean(error**2))))}")
+        note, what = f"RMS error {', '.join(rms)} N·m", "measured and predicted torque"
+        caption = Caption(f"e{condition.key}{j}", name, note, what)
+        panels.append(time_panel(188.0 + 72.0 * len(errors), time, plots, caption))
     return panels

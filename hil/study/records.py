@@ -10,16 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
 from hil.batch.workers import LocalWorkers
 from hil.campaign import CampaignFolder
-from hil.campaign.plan import moves_from_dict
-from hil.errors import ArchiveError, InputError
 from hil.files import make_folder, write_or_tell
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
@@ -35,23 +32,17 @@ from identification.excitation import correlation, coupling_index, information, 
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
 from identification.validation.prediction import FIGURE_BANDWIDTH, for_figure
-from planner import FlyDistance, FlyPercent, InvalidPlanFile
 
-from .campaigns import in_children
+from .campaigns import OWN_CLASS, in_children
 
 Array = NDArray[np.float64]
-MotionClass = Literal["fly-by", "stop-to-stop", "sinusoid"]
 
-VERSION: Final = 6
+VERSION: Final = 7
 """Counted up when the same archives come to give other numbers, or a record another form."""
-PLANTED: Final = "planted"
-"""Name of the planted parameters among the estimates."""
-CLASSES: Final[tuple[MotionClass, ...]] = ("fly-by", "stop-to-stop", "sinusoid")
-SHOWN: Final = 1200
-"""Rows of a series that a figure is drawn from, at most."""
+PLANTED: Final = "planted"  #: Name of the planted parameters among the estimates
+SHOWN: Final = 1200  #: Rows of a series that a figure is drawn from, at most
 FIGURE_DIGITS: Final = 5
-_MOVES: Final = 1e-3
-"""rad/s or m/s: a joint that is faster moves."""
+_MOVES: Final = 1e-3  # rad/s or m/s: a joint that is faster moves
 
 
 class Record(Frozen):
@@ -66,23 +57,19 @@ class Fitted(Frozen):
     pooled: list[float]
     pooled_std: list[float]
     undetermined: list[str]
-    log10_det: float
-    """Of the motion as it was executed, as the next ones."""
+    log10_det: float  #: Of the motion as it was executed, as the next ones
     coupling_index: float
     correlation: list[list[float]]
     time: list[float]
-    position: list[list[float]]
-    """Joint by joint, of the first repetition."""
+    position: list[list[float]]  #: Joint by joint, of the first repetition
 
 
 class FitRecord(Record, Fitted):
     """Estimates from the repetitions of one excitation."""
 
     repetitions: list[str]
-    values: list[list[float]]
-    """Of each repetition by itself (eq. 4)."""
-    n_samples: int
-    """Of one repetition, as it was executed."""
+    values: list[list[float]]  #: Of each repetition by itself (eq. 4).
+    n_samples: int  #: Of one repetition, as it was executed
     duration: float
 
 
@@ -99,22 +86,18 @@ class MotionForm(Frozen):
     """Gram matrices of one held-out motion, over its usable rows, all joints; p parameters."""
 
     archive: str
-    torque_squared: float
-    """Sum of the measured torque²."""
-    slow: list[list[float]]
-    """Of the low-passed [Phi | tau] (p + 1, p + 1)."""
-    whole: list[list[float]]
-    """Of Phi as it is (p, p)."""
+    torque_squared: float  #: Sum of the measured torque²
+    slow: list[list[float]]  #: Of the low-passed [Phi | tau] (p + 1, p + 1)
+    whole: list[list[float]]  #: Of Phi as it is (p, p)
 
 
 class ScoreRecord(Record):
     """The motions of one class, and what of their errors the forms do not give."""
 
     durations: list[float]
-    samples: list[int]
-    """Of each motion, from the first to the last at which a joint moves."""
-    left_out: list[list[int]]
-    """How many of them the errors leave out, each per joint: at rest, near ends, at reversals."""
+    left_out: list[float]
+    """Share of the samples, from the first to the last at which a joint moves, that the errors
+    leave out, per joint: at rest, near ends, at reversals."""
     forms: list[MotionForm]
     mean_abs: dict[str, list[list[float]]]
     """By estimate, motion by motion: mean |e| per joint, N·m."""
@@ -145,17 +128,11 @@ def write_record(path: Path, record: Record) -> None:
 
 
 class ClassForms(NamedTuple):
-    """The forms of all motions of one class; m motions, n joints, p parameters.
+    """The forms of all motions of one class; m motions, n joints, p parameters."""
 
-    Attributes:
-        slow: of the low-passed [Phi | tau], all joints together (m, p + 1, p + 1).
-        whole: of Phi, likewise (m, p, p).
-        torque_squared: sum over all joints (m,).
-    """
-
-    slow: Array
-    whole: Array
-    torque_squared: Array
+    slow: Array  #: of the low-passed [Phi | tau], all joints together (m, p + 1, p + 1)
+    whole: Array  #: of Phi, likewise (m, p, p)
+    torque_squared: Array  #: sum over all joints (m,)
 
     @classmethod
     def of(cls, forms: Sequence[MotionForm]) -> ClassForms:
@@ -227,7 +204,7 @@ def low_passed(run: Samples, values: Array) -> Array:
 # Reading archives
 
 
-def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
+def fit(inputs: str, archives: Sequence[Path]) -> FitRecord:
     """Estimate from each repetition and from all (eq. 4)."""
     prepared = _prepared(archives)
     model, sources = prepared.sources.cell.model, prepared.sources.training
@@ -256,45 +233,32 @@ def fit(archives: Sequence[Path], inputs: str) -> FitRecord:
 
 
 def score(
-    groups: Sequence[tuple[str, Sequence[Path]]],
-    inputs: str,
-    estimates: Mapping[str, Sequence[float]],
-    shown: Sequence[str],
+    inputs: str, archives: Sequence[Path], key: str, estimates: Mapping[str, Sequence[float]]
 ) -> ScoreRecord:
-    """Predict held-out motions by several estimates.
+    """Predict held-out motions of a campaign by several estimates (p,).
 
-    Args:
-        groups: key of each campaign, its held-out archives and those of its standstill.
-        inputs: digest of all this rests on.
-        estimates: parameters (p,) by name.
-        shown: estimates of the example in time, drawn on the motion of median error.
+    `archives` are those of its standstill, too. The motion of median error is predicted in time by
+    the first two estimates.
     """
-    runs: dict[str, Samples] = {}  # every campaign numbers its archives from 0
-    for key, archives in groups:
-        prepared = _prepared(archives)
-        names = [f"{key}/{source.name}" for source in prepared.sources.training]
-        runs |= zip(names, prepared.fitted, strict=True)
+    prepared = _prepared(archives)
+    names = [f"{key}/{source.name}" for source in prepared.sources.training]
+    runs = dict(zip(names, prepared.fitted, strict=True))
     model = prepared.sources.cell.model
     table = np.array(list(estimates.values()), dtype=np.float64)
     errors = [_errors(model, table, run) for run in runs.values()]
     usable = [run.usable[_motion_rows(run)] for run in runs.values()]
     forms = [motion_form(model, name, run) for name, run in runs.items()]
-    examples = []
-    if shown:
-        series = {name: np.asarray(estimates[name]) for name in shown}
-        both = ClassForms.of(forms)
-        every = np.mean([both.overall(one) for one in series.values()], axis=0)
-        typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
-        examples.append(_example(model, runs[typical], typical, series))
+    both, series = ClassForms.of(forms), dict(zip(estimates, table[:2], strict=False))
+    every = np.mean([both.overall(one) for one in series.values()], axis=0)
+    typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
     return ScoreRecord(
         inputs=inputs,
         durations=[float(run.motion.time[-1] - run.motion.time[0]) for run in runs.values()],
-        samples=[len(rows) for rows in usable],
-        left_out=[np.count_nonzero(~rows, axis=0).tolist() for rows in usable],
+        left_out=(1.0 - np.mean(np.concatenate(usable), axis=0)).tolist(),
         forms=forms,
         mean_abs={n: [one[k].tolist() for one, _ in errors] for k, n in enumerate(estimates)},
         all_rows={n: [float(one[k]) for _, one in errors] for k, n in enumerate(estimates)},
-        examples=examples,
+        examples=[_example(model, runs[typical], typical, series)],
     )
 
 
@@ -361,32 +325,11 @@ def _rounded(values: Array) -> list[float]:
 # Campaigns
 
 
-@dataclass(frozen=True)
-class Run:
-    """One excitation that was executed: its key among the others, label, and campaign folder."""
-
-    key: str
-    label: str
-    root: Path
-
-    @property
-    def folder(self) -> CampaignFolder:
-        """The same, to be read."""
-        return CampaignFolder(self.root)
-
-    def archives(self, *kinds: str) -> dict[str, str]:
-        """Checksums of its whole archives of some kinds by name.
-
-        Raises:
-            CampaignFolderError: there is no manifest that can be read.
-        """
-        names = [path.name for kind in kinds for path in self.folder.completed(kind)]
-        sums = {entry.name: entry.sha256 for entry in self.folder.manifest()}
-        return {name: sums[name] for name in names}
-
-    def paths(self, names: Sequence[str]) -> list[Path]:
-        """Its archives of these names, and those of the standstill, for the noise of positions."""
-        return [self.folder.archives / name for name in (*names, *self.archives("standstill"))]
+def archives_of(root: Path, *kinds: str) -> dict[str, str]:
+    """Checksums of a campaign's whole archives of some kinds, by name."""
+    folder = CampaignFolder(root)
+    sums = {entry.name: entry.sha256 for entry in folder.manifest()}
+    return {path.name: sums[path.name] for kind in kinds for path in folder.completed(kind)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,106 +340,51 @@ class Reader:
     reporter: Reporter
     workers: LocalWorkers
 
-    def fit(self, runs: Sequence[Run]) -> dict[str, FitRecord]:
-        """Estimate from the excitations of each run, by key.
-
-        Raises:
-            InputError: a run has no whole excitation.
-        """
-        tasks = []
-        for run in runs:
-            if not (archives := run.archives("excitation")):
-                problem, remedy = "holds no whole excitation", "run the campaign first (hil run)"
-                raise InputError(run.root, problem, remedy=remedy)
-            inputs = _digest([*run.archives("excitation", "standstill").items()], {})
-            tasks.append((run.key, inputs, (run.paths([*archives]), inputs)))
-        found = self._read(FitRecord, fit, tasks, "estimating (excitations)")
-        return {run.key: record for run, record in zip(runs, found, strict=True)}
+    def fit(self, roots: Mapping[str, Path]) -> dict[str, FitRecord]:
+        """Estimate from the excitations of each campaign, by key."""
+        records = self._read(
+            fit,
+            [(key, root, "excitation", {}, ()) for key, root in roots.items()],
+            "estimating (excitations)",
+        )
+        return dict(zip(roots, records, strict=True))
 
     def score(
-        self, runs: Sequence[Run], estimates: Mapping[str, Array], shown: Sequence[str]
+        self, roots: Mapping[str, Path], estimates: Mapping[str, Array]
     ) -> dict[str, ScoreRecord]:
-        """Predict the held-out motions of all runs, class by class; by class."""
+        """Predict the held-out motions of each class; the first two estimates in time, too."""
         values = {name: estimate.tolist() for name, estimate in estimates.items()}
-        names = {run.key: classes_of(run) for run in runs}
-        tasks, found = [], [one for one in CLASSES if any(one in own for own in names.values())]
-        for one in found:
-            members = [(run, names[run.key][one]) for run in runs if one in names[run.key]]
-            sums = [
-                s for run, _ in members for s in run.archives("validation", "standstill").items()
-            ]
-            others = {"estimates": values, "shown": [*shown], "archives": [o for _, o in members]}
-            inputs = _digest(sums, others)
-            groups = [(run.key, run.paths(own)) for run, own in members]
-            place = f"{'+'.join(key for key, _ in groups)}-{one}"
-            tasks.append((place, inputs, (groups, inputs, values, [*shown])))
-        records = self._read(ScoreRecord, score, tasks, "predicting (classes of motion)")
-        return dict(zip(found, records, strict=True))
+        tasks = [
+            (f"{key}-{name}", roots[key], "validation", values, (key, values))
+            for key, name in OWN_CLASS.items()
+        ]
+        records = self._read(score, tasks, "predicting (classes of motion)")
+        return dict(zip(OWN_CLASS.values(), records, strict=True))
 
     def _read(
         self,
-        kind: type[R],
         function: Callable[..., R],
-        tasks: Sequence[tuple[str, str, tuple[Any, ...]]],
+        tasks: Sequence[tuple[str, Path, str, object, tuple[Any, ...]]],
         title: str,
     ) -> list[R]:
-        """Records by name and inputs; those missing, or of other inputs, the function makes."""
-        places = [self.fits / f"{name}.json" for name, _, _ in tasks]
-        found = [read_record(p, kind, own) for p, (_, own, _) in zip(places, tasks, strict=True)]
-        missing = [k for k, record in enumerate(found) if record is None]
-        calls = [(places[k], (places[k], function, *tasks[k][2])) for k in missing]
-        made = in_children(make_record, calls, title, self.reporter, self.workers, of=len(tasks))
-        fresh = iter(made)
-        return [next(fresh) if record is None else record for record in found]
+        """Records of a function by name, root, kind of archives, what else they rest on, and rest.
+
+        Archives of the standstill are read as well, for the noise of positions.
+        """
+        calls = []
+        for name, root, kind, others, arguments in tasks:
+            sums, place = archives_of(root, kind, "standstill"), self.fits / f"{name}.json"
+            paths = [CampaignFolder(root).archives / one for one in sums]
+            inputs = json_digest([VERSION, list(sums.items()), others])
+            calls.append((place, (place, function, inputs, paths, *arguments)))
+        return in_children(made, calls, title, self.reporter, self.workers, of=len(tasks))
 
 
-def make_record(place: Path, function: Callable[..., R], *arguments: Any) -> R:
-    """In a child: read archives, and write the record before anything else can fail."""
-    record = function(*arguments)
-    write_record(place, record)
+def made(place: Path, function: Callable[..., R], inputs: str, *arguments: Any) -> R:
+    """In a child: the record in a file, or a new one, written before anything else can fail."""
+    kind: type[R] = get_type_hints(function)["return"]
+    record = read_record(place, kind, inputs)
+    if record is None:
+        record = function(inputs, *arguments)
+        write_record(place, record)
     return record
-
-
-def _digest(archives: Sequence[tuple[str, str]], others: Mapping[str, Any]) -> str:
-    """Digest of archives (name, checksum) and of whatever else a record rests on."""
-    return json_digest([VERSION, list(archives), others])
-
-
-def classes_of(run: Run) -> dict[MotionClass, list[str]]:
-    """Names of the held-out archives of a run by the class of their planned motion."""
-    found: dict[MotionClass, list[str]] = {}
-    for name in run.archives("validation"):
-        motion_class = class_in(open_archive(run.folder.archives / name))
-        found.setdefault(motion_class, []).append(name)
-    return found
-
-
-def plan_in(archive: Archive) -> dict[str, Any]:
-    """What an archive says of its planned motion; {} where it says nothing that can be read."""
-    try:
-        return archive.table("plan.json")
-    except ArchiveError:
-        return {}
-
-
-def class_in(archive: Archive) -> MotionClass:
-    """Class of the planned motion in an archive.
-
-    A motion in pieces without its moves counts as fly-by, as the interpolator runs it.
-
-    Raises:
-        ArchiveError: its plan is not what it should be.
-    """
-    plan = plan_in(archive)
-    trajectory = plan.get("trajectory")
-    if isinstance(trajectory, dict) and trajectory.get("type") == "fourier_series":
-        return "sinusoid"
-    try:
-        moves = moves_from_dict(plan)
-    except InvalidPlanFile as error:
-        raise ArchiveError(archive.path, f"its plan cannot be read: {error}") from error
-    for move in () if moves is None else moves.moves:
-        match move.fly:
-            case FlyPercent(extent) | FlyDistance(extent) if extent > 0.0:
-                return "fly-by"
-    return "fly-by" if moves is None else "stop-to-stop"

@@ -15,15 +15,13 @@ from pydantic import Field
 from hil.report.numbers import capitalised, fixed, significant
 from hil.results import Frozen
 
-from .campaigns import AP, B0, A, B
+from .campaigns import AP, OWN_CLASS, A, B
 from .records import ExampleRecord, Fitted
 from .settings import StudySettings, load_json
 
 SCHEMA_VERSION: Final = 1
-ALPHA: Final = 0.05
-"""How often, at most, a table shows any difference where there is none."""
-SMALL: Final = 0.02
-"""A difference of errors below this share exists and does not matter."""
+ALPHA: Final = 0.05  #: How often, at most, a table shows any difference where there is none
+SMALL: Final = 0.02  #: A difference of errors below this share exists and does not matter
 
 Quantity = Literal["error", "own", "parameter_error"]
 Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse", "too few"]
@@ -34,13 +32,10 @@ class StudyParameter(Frozen):
 
     name: str
     unit: str
-    truth: float | None
-    """Planted value; only a simulated arm has one."""
-    printed_id: int | None = None
-    """Row of the paper's Table 2."""
+    truth: float  #: Planted value
+    printed_id: int | None = None  #: Row of the paper's Table 2
     printed_symbol: str | None = None
-    printed_factor: float = 1.0
-    """What a value is multiplied with to compare it with the print."""
+    printed_factor: float = 1.0  #: What a value is multiplied with to compare it with the print
     printed_a: float | None = None
     printed_b: float | None = None
     printed_c: float | None = None
@@ -51,13 +46,12 @@ class SearchResult(Frozen):
 
     key: str
     words: str
-    chosen: bool
-    """Whether its motion was executed in full."""
-    tried: int
-    infeasible: dict[str, int]
-    log10_det: float | None
-    coupling_index: float | None
-    duration: float | None
+    chosen: bool  #: Whether its motion was executed in full
+    tried: int = 0
+    infeasible: dict[str, int] = Field(default_factory=dict)
+    log10_det: float | None = None
+    coupling_index: float | None = None
+    duration: float | None = None
 
 
 class MotionRow(Frozen):
@@ -80,12 +74,9 @@ class MethodResult(Fitted):
     key: str
     label: str
     repetitions: int
-    seconds: float
-    """Of motion that was fitted, all repetitions."""
-    mean: list[float]
-    """Over the repetitions' own estimates: the paper's Table 2."""
-    std: list[float]
-    """Over the repetitions, of one of them."""
+    seconds: float  #: Of motion that was fitted, all repetitions
+    mean: list[float]  #: Over the repetitions' own estimates: the paper's Table 2
+    std: list[float]  #: Over the repetitions, of one of them
 
 
 class ComparisonResult(Frozen):
@@ -98,23 +89,17 @@ class ComparisonResult(Frozen):
     first: str
     second: str
     motions: int
-    repetitions: list[int]
-    """Of `first` and `second`."""
-    ratio: float
-    """Geometric mean over the motions."""
-    wins: int
-    """Motions that `second` predicts better."""
+    repetitions: list[int]  #: Of `first` and `second`
+    ratio: float  #: Geometric mean over the motions
+    wins: int  #: Motions that `second` predicts better
     error: float | None
     """Standard error of the log ratio; null with fewer than three repetitions, or one motion."""
-    freedom: float | None
-    """Its degrees of freedom."""
+    freedom: float | None  #: Its degrees of freedom
     level: float = 1.0 - ALPHA
     """Of the interval by itself, such that all of its table hold at 95 % (Bonferroni)."""
     low: float | None = None
-    high: float | None = None
-    """Interval of the ratio at that level."""
-    verdict: Verdict = "too few"
-    """On `second`: whether the interval excludes 1."""
+    high: float | None = None  #: Interval of the ratio at that level
+    verdict: Verdict = "too few"  #: On `second`: whether the interval excludes 1
 
     @property
     def differs(self) -> bool:
@@ -132,10 +117,9 @@ class ClassResult(Frozen):
     motion_class: str
     archives: list[str]
     durations: list[float]
-    overall: dict[str, list[float]]
-    """Of all joints together, for each estimate."""
+    overall: dict[str, list[float]]  #: Of all joints together, for each estimate
     own: dict[str, list[float]]
-    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, where that is known."""
+    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, without effects."""
     mean_abs: dict[str, list[list[float]]]
     """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
     all_rows: dict[str, list[float]]
@@ -158,17 +142,14 @@ class ClosenessResult(Frozen):
     second: str
     parameters: int
     second_closer: int
-    printed_second_closer: int | None
-    """Of the paper's own columns A and B."""
+    printed_second_closer: int | None  #: Of the paper's own columns A and B
 
 
 class EqualDataResult(Frozen):
     """The first two methods with as much motion of each: the longer one cut."""
 
-    cut: str
-    """Key of the method of which only the first repetitions are used."""
-    name: str
-    """Of that estimate in the cross table."""
+    cut: str  #: Key of the method of which only the first repetitions are used
+    name: str  #: Of that estimate in the cross table
     repetitions: int
     seconds: float
     other: str
@@ -178,7 +159,7 @@ class EqualDataResult(Frozen):
 
 
 class ConditionResult(Frozen):
-    """Everything under one condition: with or without effects, or as recorded."""
+    """Everything under one condition: with or without effects."""
 
     key: str
     words: str
@@ -188,8 +169,7 @@ class ConditionResult(Frozen):
     comparisons: list[ComparisonResult]
     own_comparisons: list[ComparisonResult]
     """The first two, class by class, in the errors of the estimates themselves."""
-    equal_data: EqualDataResult | None
-    """Null where both have as much motion anyway."""
+    equal_data: EqualDataResult | None  #: Null where both have as much motion anyway
     closeness: list[ClosenessResult]
     examples: list[ExampleRecord]
 
@@ -209,21 +189,17 @@ class AblationPoint(Frozen):
     """One setting of what is varied."""
 
     value: float
-    label: str = ""
-    """Where the setting is not a number, which `value` then only counts."""
+    label: str = ""  #: Where the setting is not a number, which `value` then only counts
     method: str
-    base: bool
-    """Whether it is the setting of the study itself."""
+    base: bool  #: Whether it is the setting of the study itself
     repetitions: int
     log10_det: float | None
     coupling_index: float | None
     duration: float | None
     parameter_error: float | None
     """Geometric mean over the parameters of distance to the planted value, the study's B = 1."""
-    error: dict[str, float]
-    """Median over the motions of each class of ||e|| / ||tau||."""
-    own: dict[str, float]
-    """The same of the estimate itself; empty where nothing is planted."""
+    error: dict[str, float]  #: Median over the motions of each class of ||e|| / ||tau||
+    own: dict[str, float]  #: The same of the estimate itself
 
     @property
     def name(self) -> str:
@@ -235,14 +211,11 @@ class ChanceRange(Frozen):
     """Range of a figure over subsets of the study's own repetitions of one method."""
 
     method: str
-    repetitions: int
-    """In each subset."""
+    repetitions: int  #: In each subset
     quantity: Quantity
-    motion_class: str | None
-    """Null for the parameters."""
+    motion_class: str | None  #: Null for the parameters
     low: float
-    high: float
-    """2.5 and 97.5 % of the subsets."""
+    high: float  #: 2.5 and 97.5 % of the subsets
     subsets: int
 
 
@@ -263,8 +236,7 @@ class Paragraph(Frozen):
 
     key: str
     heading: str
-    verdict: str = ""
-    """The conclusion in one line, where the heading is a question."""
+    verdict: str = ""  #: The conclusion in one line, where the heading is a question
     sentences: list[str]
 
 
@@ -276,8 +248,7 @@ class StudyResults(Frozen):
     cell: str
     simulated: bool
     quick: bool
-    settings: StudySettings | None
-    """Null for a study of recorded campaigns."""
+    settings: StudySettings
     software: dict[str, str]
     joint_names: list[str]
     n_base: int
@@ -289,10 +260,8 @@ class StudyResults(Frozen):
     ranges: list[ChanceRange]
     """Of as many repetitions as the ablations have; none where the study has no more itself."""
     reading: list[Paragraph]
-    missing: list[str]
-    """What of the paper's study is not in this one, and why."""
-    times: dict[str, float]
-    """Wall time [s] of each stage in the last session."""
+    missing: list[str]  #: What of the paper's study is not in this one, and why
+    times: dict[str, float]  #: Wall time [s] of each stage in the last session
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -304,8 +273,6 @@ class StudyResults(Frozen):
         return load_json(cls, path, "is not the result of a study", "run the study again")
 
 
-OWN_CLASS: Final = {A: "sinusoid", B: "fly-by", B0: "stop-to-stop"}
-"""Class of motion by the method whose excitation is of it."""
 _OUTCOMES: Final = {
     "none": "No significant difference",
     "too few": "Too few repetitions or motions for a conclusion",
@@ -322,12 +289,11 @@ def conclusions(results: StudyResults) -> list[Paragraph]:
 def summary_of(results: StudyResults) -> dict[str, Any]:
     """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
     fields = {"motion_class", "first", "second", "ratio", "level", "verdict"}
-    lines = [f"{one.heading} {one.verdict}" for one in results.reading if one.verdict]
     return {
         "name": results.name,
         "simulated": results.simulated,
         "quick": results.quick,
-        "line": " ".join(lines) or f"{results.name}: one excitation, nothing to compare.",
+        "line": " ".join(f"{one.heading} {one.verdict}" for one in results.reading if one.verdict),
         "ratios": [
             {
                 "condition": condition.key,
@@ -342,50 +308,32 @@ def summary_of(results: StudyResults) -> dict[str, Any]:
     }
 
 
-def _prediction(results: StudyResults) -> Paragraph | None:
+def _prediction(results: StudyResults) -> Paragraph:
     """The first two methods on the robot's own motions: the paper's Fig. 3."""
     conditions = results.conditions
-    first, second, *_ = [*conditions[0].labels.values(), None, None]
-    if second is None:
-        return None
-    pairs = [(one, row) for one in conditions if (row := _main(one)) is not None]
+    pairs = [(one, _main(one)) for one in conditions]
     printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
-    sentences = [
-        f"{capitalised(one.words)}, the error with {one.labels[row.second]} is"
-        f" {fixed(row.ratio, 3)} times that with {one.labels[row.first]}"
-        f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
-        f" smaller on {row.wins} of {row.motions} motions."
-        for one, row in pairs
-    ]
-    if printed:
-        sentences.append(
-            "A is its best search here, beyond the frequencies that the paper prints. Compared"
-            f" with A as printed: {_each(printed)}"
-        )
-    opposite = len({row.ratio < 1.0 for _, row in pairs if row.differs}) == 2
-    if opposite and pairs[0][0].key.startswith("recorded"):
-        sentences.insert(
-            0,
-            "The same motions, run in each campaign, lead to opposite conclusions: the state of"
-            " the arm differs from one campaign to the other.",
-        )
-    kind = pairs[0][1].motion_class if pairs else "held-out"
     return Paragraph(
         key="prediction",
-        heading=f"Does {second} predict {kind} motions better than {first}?",
-        verdict=_each(pairs) if pairs else "There is no held-out motion to predict.",
-        sentences=sentences or ["Tables and figures are of the excitations and the parameters."],
+        heading="Does B predict fly-by motions better than A?",
+        verdict=_each(pairs),
+        sentences=[
+            f"{capitalised(one.words)}, the error with {one.labels[row.second]} is"
+            f" {fixed(row.ratio, 3)} times that with {one.labels[row.first]}"
+            f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
+            f" smaller on {row.wins} of {row.motions} motions."
+            for one, row in (*pairs, *printed)
+        ],
     )
 
 
 def _classes(results: StudyResults) -> Paragraph | None:
     """Whether estimates predict their own class of motion best: the paper's main argument."""
-    upheld: dict[str, list[bool]] = {}
-    for condition in results.conditions:
-        present = [one.motion_class for one in condition.classes]
-        own = [k for k, name in OWN_CLASS.items() if k in condition.labels and name in present]
-        if len(own) > 1:  # of one class there is nothing to compare it with
-            upheld[condition.words] = [_best(condition, key, OWN_CLASS[key]) for key in own]
+    upheld = {
+        condition.words: [_best(condition, key, name) for key, name in OWN_CLASS.items()]
+        for condition in results.conditions
+        if len(condition.classes) == len(OWN_CLASS)
+    }
     if not upheld:
         return None
     every = [one for own in upheld.values() for one in own]
@@ -410,21 +358,20 @@ def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
 
 def _effects(results: StudyResults) -> Paragraph | None:
     """How the conclusion depends on what the model leaves out."""
-    by_key = {one.key: one for one in results.conditions}
-    pair = [_main(by_key[key]) if key in by_key else None for key in ("plain", "effects")]
-    before, after = pair
-    if before is None or after is None:
+    if len(results.conditions) < 2:
         return None
+    rigid, effects = results.conditions
+    before, after = _main(rigid), _main(effects)
     same = (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0)
     same = same or not (before.differs or after.differs)
     return Paragraph(
         key="effects",
         heading="Does that depend on the unmodelled effects?",
-        verdict="No." if same else f"Yes: {_each([(by_key['effects'], after)])}",
+        verdict="No." if same else f"Yes: {_each([(effects, after)])}",
         sentences=[
             f"The effects change the ratio of the errors from {fixed(before.ratio, 3)} to"
             f" {fixed(after.ratio, 3)} on {after.motion_class} motions.",
-            f"Effects: {'; '.join(by_key['effects'].effects)}.",
+            f"Effects: {'; '.join(effects.effects)}.",
         ],
     )
 
@@ -450,13 +397,11 @@ def _ablation(ablation: AblationResult, ranges: Sequence[ChanceRange]) -> Paragr
     return Paragraph(key=f"ablation-{ablation.key}", heading=ablation.title, sentences=[text])
 
 
-def _main(condition: ConditionResult) -> ComparisonResult | None:
-    """The first two methods on the robot's own motions; on the first class where there are none."""
-    names = [one.motion_class for one in condition.classes]
-    if len(condition.methods) < 2 or not names:
-        return None
-    first, second = list(condition.labels)[:2]
-    return condition.compared("fly-by" if "fly-by" in names else names[0], first, second)
+def _main(condition: ConditionResult) -> ComparisonResult:
+    """A and B on the robot's own motions."""
+    row = condition.compared("fly-by", A, B)
+    assert row is not None  # every study has them
+    return row
 
 
 def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:

@@ -184,7 +184,7 @@ def ranges_of(
     values: Array,
     size: int,
     forms: Mapping[str, ClassForms],
-    truth: Array | None,
+    truth: Array,
     reference: Array,
 ) -> list[ChanceRange]:
     """Where figures lie for other repetitions of the very same motion.
@@ -199,14 +199,12 @@ def ranges_of(
     figures: list[tuple[Quantity, str | None, Array]] = []
     for name, one in forms.items():
         errors = one.relative(one.torque_kernels(values), weights)
+        own = one.relative(one.own_kernels(values, truth), weights)
         figures.append(("error", name, np.median(errors, axis=0)))
-        if truth is not None:
-            own = one.relative(one.own_kernels(values, truth), weights)
-            figures.append(("own", name, np.median(own, axis=0)))
-    if truth is not None:
-        distances = [parameter_error(one, reference, truth) for one in weights @ values]
-        known = np.array([one for one in distances if one is not None])
-        figures += [("parameter_error", None, known)] if len(known) else []
+        figures.append(("own", name, np.median(own, axis=0)))
+    distances = [parameter_error(one, reference, truth) for one in weights @ values]
+    known = np.array([one for one in distances if one is not None])
+    figures += [("parameter_error", None, known)] if len(known) else []
     return [
         ChanceRange(
             method=method,

@@ -18,7 +18,7 @@ from hil.version import software
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
 from .campaigns import AP, SINES, A, B, noise_key, variant_key
-from .records import CLASSES, PLANTED, ClassForms, FitRecord, Fitted, ScoreRecord
+from .records import PLANTED, ClassForms, FitRecord, Fitted, ScoreRecord
 from .results import (
     AblationPoint,
     AblationResult,
@@ -53,7 +53,7 @@ TABLE1: Final = (
 """The paper's Table 1: method, N, log det in units that are not named, I_c, notes."""
 
 
-def study_results(root: Path, cell: Cell, truth: Array | None, **tables: Any) -> StudyResults:
+def study_results(root: Path, cell: Cell, truth: Array, **tables: Any) -> StudyResults:
     """Results of a study with what its numbers say; `tables` are the other fields."""
     results = StudyResults(
         name=root.resolve().name,
@@ -82,7 +82,7 @@ def printed_rows(cell: Cell) -> list[MotionRow]:
     ]
 
 
-def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
+def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
     """The model's parameters with the print; `truth` (p,) is planted.
 
     Rows 41 to 52 are read as interleaved. The print's viscous and third friction terms are read as
@@ -100,20 +100,13 @@ def parameters_of(cell: Cell, truth: Array | None) -> list[StudyParameter]:
             "printed_c": row.pi_c,
         }
     return [
-        StudyParameter(
-            name=name,
-            unit=model.units[k],
-            truth=None if truth is None else float(truth[k]),
-            **printed.get(name, {}),
-        )
-        for k, name in enumerate(model.parameter_names)
+        StudyParameter(name=name, unit=unit, truth=float(planted), **printed.get(name, {}))
+        for name, unit, planted in zip(model.parameter_names, model.units, truth, strict=True)
     ]
 
 
 def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
     """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
-    if len(fits) < 2:
-        return None
     whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
     other, cut = sorted(whole, key=lambda key: whole[key])
     count = max(1, round(whole[other] / fits[cut].duration))
@@ -169,43 +162,39 @@ def condition_result(
     """
     keys, equal, repetitions = list(fits), equal_data(fits), repetitions_of(fits)
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
-    truth = None
-    if all(one.truth is not None for one in parameters):
-        truth = np.array([one.truth for one in parameters], dtype=np.float64)
-    rigid = None if condition.effects else truth
+    truth = np.array([one.truth for one in parameters], dtype=np.float64)
 
     def pair(name: str, two: tuple[str, str], *, own: bool = False) -> ComparisonResult:
         """Two estimates by the torque they miss, or by their own error."""
         first, second = (
-            forms[name].own_kernels(repetitions[key], rigid)
-            if own and rigid is not None
+            forms[name].own_kernels(repetitions[key], truth)
+            if own
             else forms[name].torque_kernels(repetitions[key])
             for key in two
         )
         return compared_on(name, two, (first, second), drifts=condition.drifts)
 
     compared = compared_pairs(keys)
-    two = compared[:1] if rigid is not None else []
+    two = [] if condition.effects else compared[:1]
     if equal is not None:
         cut = [equal.name if key == equal.cut else key for key in keys[:2]]
         rows = corrected([pair(name, (cut[0], cut[1])) for name in forms])
         equal = equal.model_copy(update={"comparisons": rows})
     estimates = {key: values.mean(axis=0) for key, values in repetitions.items()}
-    example = scores.get("fly-by") or next(iter(scores.values()), None)
     return ConditionResult(
         key=condition.key,
         words=condition.words,
         effects=list(condition.effects),
         methods=[_method(key, labels[key], fits[key]) for key in keys],
         classes=[
-            _class_result(name, one, forms[name], estimates, truth, rigid)
+            _class_result(name, one, forms[name], estimates, truth, own=not condition.effects)
             for name, one in scores.items()
         ],
         comparisons=corrected([pair(name, some) for name in forms for some in compared]),
         own_comparisons=corrected([pair(name, some, own=True) for name in forms for some in two]),
         equal_data=equal,
         closeness=_closeness(fits, keys, parameters),
-        examples=[] if example is None else example.examples,
+        examples=scores["fly-by"].examples,
     )
 
 
@@ -227,22 +216,21 @@ def _class_result(
     record: ScoreRecord,
     forms: ClassForms,
     estimates: Mapping[str, Array],
-    truth: Array | None,
-    rigid: Array | None,
+    truth: Array,
+    *,
+    own: bool,
 ) -> ClassResult:
-    every = dict(estimates) | ({} if truth is None else {PLANTED: truth})
-    own = {} if rigid is None else {key: forms.own(one, rigid) for key, one in estimates.items()}
+    every = dict(estimates) | {PLANTED: truth}
+    errors = {key: forms.own(one, truth).tolist() for key, one in estimates.items()}
     return ClassResult(
         motion_class=name,
         archives=[one.archive for one in record.forms],
         durations=record.durations,
-        overall={
-            key: forms.overall(one).tolist() for key, one in every.items() if key in record.all_rows
-        },
-        own={key: one.tolist() for key, one in own.items()},
+        overall={key: forms.overall(one).tolist() for key, one in every.items()},
+        own=errors if own else {},
         mean_abs=record.mean_abs,
         all_rows=record.all_rows,
-        left_out=(np.sum(record.left_out, axis=0) / sum(record.samples)).tolist(),
+        left_out=record.left_out,
     )
 
 
@@ -256,7 +244,7 @@ def _closeness(
     fits: Mapping[str, FitRecord], keys: Sequence[str], parameters: Sequence[StudyParameter]
 ) -> list[ClosenessResult]:
     """How often the second of the first two methods comes closer to the manufacturer's column."""
-    if len(keys) < 2 or not any(one.printed_id for one in parameters):
+    if not any(one.printed_id for one in parameters):
         return []
     factor = np.array([one.printed_factor for one in parameters])
     columns = [factor * np.mean(fits[key].values, axis=0) for key in keys[:2]]
@@ -324,48 +312,33 @@ _LABELS: Final = dict(zip(SINES, _SINES_LABELS, strict=True))
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What ablations are made from.
+    """What ablations are made from."""
 
-    Attributes:
-        fits: of every executed excitation of the ablations, by key.
-        main: of A and B with all repetitions.
-        scores: of the held-out motions, by class, of one or several campaigns.
-        truth: planted parameters (p,), None for a real arm.
-        sines: key of the sines that method A is represented by.
-    """
-
-    fits: Mapping[str, FitRecord]
-    main: Mapping[str, FitRecord]
-    scores: Sequence[Mapping[str, ScoreRecord]]
-    truth: Array | None
-    sines: str = ""
+    fits: Mapping[str, FitRecord]  #: of every executed excitation of the ablations, by key
+    main: Mapping[str, FitRecord]  #: of A and B with all repetitions
+    scores: Mapping[str, ScoreRecord]  #: of the held-out motions, by class
+    truth: Array  #: planted parameters (p,)
+    sines: str  #: key of the sines that method A is represented by
 
     @cached_property
     def forms(self) -> dict[str, ClassForms]:
         """Of the held-out motions, by class: the error of any estimate."""
-        every = {
-            name: [form for own in self.scores if name in own for form in own[name].forms]
-            for name in CLASSES
-        }
-        return {name: ClassForms.of(forms) for name, forms in every.items() if forms}
+        return {name: ClassForms.of(one.forms) for name, one in self.scores.items()}
 
     def point(
         self, value: float, record: FitRecord, values: Array, reference: Array, **named: Any
     ) -> AblationPoint:
         """One setting: estimates (r, p) of its repetitions beside a reference (p,)."""
         estimate, truth, forms = values.mean(axis=0), self.truth, self.forms.items()
-        own = {}
-        if truth is not None:
-            own = {name: float(np.median(one.own(estimate, truth))) for name, one in forms}
         return AblationPoint(
             value=value,
             repetitions=len(values),
             log10_det=record.log10_det,
             coupling_index=record.coupling_index,
             duration=record.duration,
-            parameter_error=None if truth is None else parameter_error(estimate, reference, truth),
+            parameter_error=parameter_error(estimate, reference, truth),
             error={name: float(np.median(one.overall(estimate))) for name, one in forms},
-            own=own,
+            own={name: float(np.median(one.own(estimate, truth))) for name, one in forms},
             **named,
         )
 
@@ -374,7 +347,7 @@ def ablations(
     settings: StudySettings, evidence: Evidence
 ) -> tuple[list[AblationResult], list[ChanceRange]]:
     """All of a simulated study, and where A and B lie by chance."""
-    fits = evidence.fits
+    fits, main = evidence.fits, {key: np.array(evidence.main[key].values) for key in (A, B)}
     values = {key: np.array(one.values) for key, one in fits.items()}
     reference = values[B].mean(axis=0)
     sines = [key for key in SINES if key in fits]
@@ -406,37 +379,27 @@ def ablations(
             if key in fits
         ]
         found.append(_result(name, points, corrected(beside_b) if name == "sines" else ()))
-    found.insert(-1, repetition_ablation(evidence, settings.subsets, (A, B)))
+    points = [
+        evidence.point(
+            float(size),
+            evidence.main[method],
+            main[method][:size],
+            main[B][:size].mean(axis=0),
+            method=method,
+            base=size == len(main[method]),
+        )
+        for method in (A, B)
+        for size in settings.subsets
+        if size <= len(main[method])
+    ]
+    found.insert(-1, _result("repetitions", points))
+    forms, truth, size = evidence.forms, evidence.truth, len(values[B])
     ranges = [
         one
         for method in (A, B)
-        for one in ranges_of(
-            method,
-            np.array(evidence.main[method].values),
-            len(values[B]),
-            evidence.forms,
-            evidence.truth,
-            reference,
-        )
+        for one in ranges_of(method, main[method], size, forms, truth, reference)
     ]
     return found, ranges
-
-
-def repetition_ablation(
-    evidence: Evidence, sizes: Sequence[int], methods: Sequence[str]
-) -> AblationResult:
-    """Estimates from the first repetitions only, each size beside the last method's."""
-    last, points = np.array(evidence.main[methods[-1]].values), []
-    for method in methods:
-        record = evidence.main[method]
-        values = np.array(record.values)
-        for size in (one for one in sizes if one <= len(values)):
-            reference, base = last[:size].mean(axis=0), size == len(values)
-            point = evidence.point(
-                float(size), record, values[:size], reference, method=method, base=base
-            )
-            points.append(point)
-    return _result("repetitions", points)
 
 
 def _result(

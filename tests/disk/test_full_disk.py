@@ -144,10 +144,6 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "compare": (
         *("compare campaign second -o pages/compare.html", ("pages", "campaign", "second")),
     ),
-    "study": (
-        "study -o study --campaign campaign --campaign second --workers 1",
-        ("study", "campaign", "second"),
-    ),
     "rehearse": ("rehearse campaign --again", ("campaign",)),
     "identify": ("identify campaign --quiet", ("campaign",)),
     "report": ("report campaign", ("campaign",)),
@@ -185,7 +181,7 @@ def as_before(disk: Disk, campaign: Campaign) -> None:
     torn = disk.root / "excitation_000_a1.mcap"
     torn.write_bytes((campaign.folder.archives / torn.name).read_bytes()[:100_000])
     (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
-    for made in ("designed", "pages", "study", "batch"):
+    for made in ("designed", "pages", "batch"):
         shutil.rmtree(disk.root / made, ignore_errors=True)
 
 

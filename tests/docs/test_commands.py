@@ -213,9 +213,8 @@ AFTER_TWO = {
     "commands.md": ("march", "june"),
     "compare.md": ("march", "june"),
     "design.md": ("demo",),
-    "study.md": ("a", "b"),
 }  # Pages that name campaigns of one arm, and how
-SLOW = ("commands.md", "compare.md", "design.md", "study.md", "tutorial.md")
+SLOW = ("commands.md", "compare.md", "design.md", "tutorial.md")
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,7 @@ from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.compare import Comparison, compare_campaigns, gather
-from hil.compare.comparison import Gathered
-from hil.compare.spread import against_first, effective_count, holm, known
+from hil.compare.comparison import Gathered, against_first, effective_count, holm, known
 from hil.errors import InputError
 from hil.identify import identify_campaign
 from hil.progress import Silent
@@ -136,8 +135,7 @@ def in_memory(
     repetitions: Callable[[LevelEstimate], Array] = lambda level: np.array([level.values] * 2),
     folders: Sequence[str] = (),
 ) -> Comparison:
-    random = np.random.default_rng(11)
-    levels = [arm_histories.campaign(one, k, random) for k, one in enumerate(conditions)]
+    levels = arm_histories.history(lambda k, _: conditions[k], len(conditions), seed=11)
     if folders:
         levels = [replace(o, campaign=f) for o, f in zip(levels, folders, strict=True)]
     single = [
@@ -227,8 +225,7 @@ def test_a_page_of_hostile_names_is_inert() -> None:
 
 
 def test_what_cannot_be_known_is_not_judged() -> None:
-    random = np.random.default_rng(11)
-    first, second = (arm_histories.campaign(Condition(), k, random) for k in range(2))
+    first, second = arm_histories.history(lambda *_: Condition(), 2, seed=11)
     unknown = replace(second, std=np.full_like(second.std, np.inf), covariance=None)
     arm = Arm("digest", arm_histories.cell())
     levels = (first, unknown)

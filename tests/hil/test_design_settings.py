@@ -106,10 +106,7 @@ def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
         ),
         ("seed = -1", ["seed = -1", "0 or more"]),
         ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
-        (
-            '[objective]\nparameters = ["mc2y"]',
-            ["names one parameter", "hil identify"],
-        ),
+        ('[objective]\nparameters = ["mc2y"]', ["names one parameter", "hil identify"]),
         (
             '[objective]\nparameters = ["mc2y", "mc2z"]\nmax_relative_std = 30.0',
             ["objective", "leave one of them out"],
@@ -127,9 +124,6 @@ def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_p
         assert word in said
     for word in ("Value error", "value error", "dictionary", "instance of"):
         assert word not in said
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
         load_settings(tmp_path / "none.toml")
 
@@ -156,13 +150,10 @@ def test_frequencies_are_the_papers_or_from_the_limits(cell):
 
 def test_an_offset_is_read_in_the_frame_of_the_limits(cell):
     settings = preset("a").kinematic()
-    home = problem_of(cell, settings.replaced(sines={"offset": "home"})).genome
-    typed = problem_of(
-        cell, settings.replaced(sines={"offset": [0.0, 0.0, -90.0, 0.0, 90.0, 0.0]})
-    ).genome
-    assert isinstance(home, SineGenome) and isinstance(typed, SineGenome)
-    np.testing.assert_array_equal(home.centre, cell.home)
-    np.testing.assert_array_equal(typed.centre, cell.home)
+    for offset in ("home", [0.0, 0.0, -90.0, 0.0, 90.0, 0.0]):
+        genome = problem_of(cell, settings.replaced(sines={"offset": offset})).genome
+        assert isinstance(genome, SineGenome)
+        np.testing.assert_array_equal(genome.centre, cell.home)
 
 
 @pytest.mark.parametrize("angle", [120.0, -170.0])
@@ -188,12 +179,8 @@ def test_a_bare_series_is_not_asked_to_rest(cell):
     settings = preset("a").kinematic()
     assert problem_of(cell, settings).constraints.at_rest
     assert not problem_of(cell, settings.replaced(sines={"ramp": 0.0})).constraints.at_rest
-
-
-def test_lists_must_have_one_entry_per_joint(cell):
-    settings = preset("a").kinematic().replaced(sines={"fastest": [1.0, 2.0]})
     with pytest.raises(SettingsError, match=r"sines\.fastest.*2 entries.*6 joints.*joint_6"):
-        problem_of(cell, settings)
+        problem_of(cell, settings.replaced(sines={"fastest": [1.0, 2.0]}))
 
 
 def test_named_parameters_are_the_ones_that_count(cell):
@@ -265,11 +252,6 @@ def test_text_restores_every_bit(angles, numbers, words, key):
 def test_an_angle_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match=r"turn_deg.*'far'"):
         from_text('turn_deg = [1.0, "far"]')
-
-
-def test_seeds_and_repetitions_of_the_cell_play_no_part_in_the_problem(cell):
-    other = cell.with_campaign(repetitions=3)
-    assert problem_of(other, preset("b").kinematic()).objective.repetitions == 1
 
 
 class TestPayload:

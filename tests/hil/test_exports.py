@@ -67,22 +67,22 @@ def arm() -> IdentifiedArm:
 
 
 def exported(arm: IdentifiedArm, folder: Path) -> Exports:
-    names = arm.essential.elimination.estimate.names
+    names, consistent = arm.essential.elimination.estimate.names, arm.consistency.consistent
     return write_exports(
-        folder,
-        arm.cell,
-        arm.estimate,
-        arm.consistency.consistent,
-        essential=names,
-        provenance=PROVENANCE,
+        folder, arm.cell, arm.estimate, consistent, essential=names, provenance=PROVENANCE
     )
 
 
-def test_six_files_are_written_and_named(arm: IdentifiedArm, tmp_path: Path) -> None:
+def test_six_files_are_written_and_say_where_they_come_from(
+    arm: IdentifiedArm, tmp_path: Path
+) -> None:
     found = exported(arm, tmp_path)
     assert set(found.written) == ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
     assert not found.withheld
     assert set(found.result.written) == ALL
+    assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE
+    for name in ALL - {"parameters.json"}:
+        assert "sha256 0a1b" in (tmp_path / name).read_text(), name
 
 
 def robots() -> Iterator[tuple[str, str, str]]:
@@ -212,13 +212,6 @@ def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
-def test_every_file_says_where_it_comes_from(arm: IdentifiedArm, tmp_path: Path) -> None:
-    exported(arm, tmp_path)
-    assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE
-    for name in ALL - {"parameters.json"}:
-        assert "sha256 0a1b" in (tmp_path / name).read_text(), name
-
-
 def test_without_consistent_parameters_there_is_no_urdf_and_an_old_one_goes(
     arm: IdentifiedArm, tmp_path: Path
 ) -> None:
@@ -330,22 +323,14 @@ def fields(model: type[BaseModel]) -> Iterator[str]:
                 yield from fields(part)
 
 
-def test_every_field_of_results_json_is_explained(text: str) -> None:
-    assert set(fields(Results)) <= named(text)
-
-
-def test_every_field_of_parameters_json_is_explained(text: str, arm: IdentifiedArm) -> None:
+def test_every_file_and_field_is_explained(text: str, arm: IdentifiedArm) -> None:
     found = parameters_json(arm.cell.model, arm.estimate, consistent=arm.consistency.consistent)
-    content = json.loads(found)
-    assert set(content) <= named(text)
-    assert set(content["parameters"][0]) <= named(text)
-    assert set(content["standard"]) <= named(text)
+    content, explained = json.loads(found), named(text)
+    assert set(fields(Results)) <= explained
+    assert set(content) | set(content["parameters"][0]) | set(content["standard"]) <= explained
     tensor = {"Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz"}
-    assert set(content["standard"]["links"][0]) - tensor <= named(text)
-
-
-def test_every_file_is_listed(text: str) -> None:
-    assert ALL | {"results.json", "report.html"} <= named(text)
+    assert set(content["standard"]["links"][0]) - tensor <= explained
+    assert ALL | {"results.json", "report.html"} <= explained
 
 
 def test_the_python_example_predicts_the_torque_of_the_model(

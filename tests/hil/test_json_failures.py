@@ -33,7 +33,7 @@ FAILING = {
     "plot": ("plot", NOWHERE),
     "move": ("move", NOWHERE, "--to", "home"),
     "compare": ("compare", NOWHERE),
-    "study": ("study", "--campaign", NOWHERE),
+    "study": ("study", "--cell", NOWHERE),
     "reidentify": ("reidentify", NOWHERE, "--workers", "1"),
     "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
     "payload": ("payload", NOWHERE, "--loaded", NOWHERE),

@@ -15,8 +15,7 @@ from hil.cell import AngleFrame, Cell
 from hil.cli.plan import plan, read_plan_file
 from hil.errors import InputError
 from hil.plots import draw_plan
-from hil.plots.joints import corner_times
-from hil.plots.plan_picture import flown_corners, sharpest_corner
+from hil.plots.plan_picture import corner_times
 from planner.moves import FlyPercent, Move, plan_moves
 from planner.plan_file import PlanFile
 from sim_fixtures.ns16 import CELL_PATH
@@ -140,7 +139,7 @@ def test_the_table_holds_the_motion(run, via, tmp_path, cell):
 
 def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
     path = tmp_path / "plan.png"
-    run("--via", via, "--picture", path, "--corner", 2)
+    run("--via", via, "--picture", path)
     pixels = matplotlib.image.imread(path)
     assert pixels.shape[0] > 800 and pixels.shape[1] > 800
     assert 0.02 < np.mean(np.any(pixels[..., :3] < 0.8, axis=2)) < 0.5
@@ -155,7 +154,6 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         ([], "--via or --random: one of them is needed"),
         (["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
         (["--via", "missing.csv"], "cannot be read"),
-        (["--via", "VIA", "--corner", "3"], "no corner"),
         (["--via", "VIA", "--picture", "plan.bmp"], "no format"),
         (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
         (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
@@ -264,15 +262,13 @@ ruckig.Ruckig = Crashing
 """
 
 
-@pytest.mark.parametrize("how", ["via", "file", "picture"])
+@pytest.mark.parametrize("how", ["via", "file"])
 def test_a_solver_that_crashes_is_one_sentence(run, via, tmp_path, how):
     (tmp_path / "sitecustomize.py").write_text(CRASH)
     arguments = ["--via", str(via)]
     if how == "file":
         run("--via", via, "--output", tmp_path / "plan.toml")
         arguments = ["--via", str(tmp_path / "plan.toml")]
-    if how == "picture":  # nothing to round but in the corner that is drawn
-        arguments += ["--fly", "0", "--picture", str(tmp_path / "plan.png")]
     ended = subprocess.run(
         [sys.executable, "-m", "hil", "plan", str(CELL_PATH), *arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))},
@@ -283,7 +279,6 @@ def test_a_solver_that_crashes_is_one_sentence(run, via, tmp_path, how):
     assert ended.returncode == 2, ended
     (sentence,) = ended.stderr.splitlines()
     assert sentence.startswith("error:") and "killed by signal 11" in sentence
-    assert not (tmp_path / "plan.png").exists()
 
 
 def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):
@@ -323,24 +318,9 @@ def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
     assert np.mean(straight[inside]) < 0.2
 
 
-def test_flies_of_one_corner_leave_the_others_alone(cell):
-    plan = planned(cell, 5)
-    corners = flown_corners(plan, 1)
-    assert [corner.percent for corner in corners] == [0.0, 25.0, 50.0, 100.0]
-    distances = [corner.passage.distance for corner in corners]
-    assert distances == sorted(distances) and distances[0] == 0.0
-    for corner in corners:
-        for other in (0, 2):
-            ours, theirs = corner.plan.targets[other], plan.targets[other]
-            assert ours.distance == pytest.approx(theirs.distance)
-
-
 def test_a_plan_without_corners_is_drawn_too(cell):
-    for without in (planned(cell, 2), planned(cell, 3, fly=0.0)):
-        figure = draw_plan(without, cell.joint_names, AngleFrame.of(cell))
-        assert len(figure.axes) in (18, 20)
-    assert sharpest_corner(planned(cell, 2)) is None
     limits = cell.joint_limits
     middle = (limits.lower + limits.upper) / 2.0
     still = plan_moves(middle, [Move(middle), Move(middle)], limits)
-    draw_plan(still, cell.joint_names, AngleFrame.of(cell))
+    for without in (planned(cell, 2), planned(cell, 3, fly=0.0), still):
+        assert len(draw_plan(without, cell.joint_names, AngleFrame.of(cell)).axes) == 18

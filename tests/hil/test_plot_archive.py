@@ -20,8 +20,14 @@ from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
-from hil.plots.archive_picture import PAGE_BINS, archive_page, draw_archive, even
-from hil.plots.archive_view import ArchiveView, Trace, view_of
+from hil.plots.archive_view import (
+    ArchiveView,
+    Trace,
+    archive_page,
+    draw_archive,
+    even,
+    view_of,
+)
 
 
 @pytest.fixture
@@ -33,17 +39,13 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
     excitation: Path, campaign: Campaign
 ) -> None:
     view, columns = view_of(excitation), open_archive(excitation).columns
-    titles = [quantity.title.partition(" [")[0] for quantity in view.quantities]
-    assert titles == [
-        "position", "speed", "motor current", "torque at the joint", "following error"
-    ]  # fmt: skip
+    titles = ", ".join(quantity.title.partition(" [")[0] for quantity in view.quantities)
+    assert titles == "position, speed, motor current, torque at the joint, following error"
     current = view.quantities[2]
     for joint, trace in enumerate(current.traces):
-        # Thinned to a fraction, but the largest and the smallest sample are there.
-        assert trace.value.size < 0.5 * len(columns["stamp"])
         assert trace.value.max() == columns["target_current"][:, joint].max()
         assert trace.value.min() == columns["target_current"][:, joint].min()
-        assert trace.high == campaign.cell.drive_table.current_limit[joint]
+        assert trace.limits[1] == campaign.cell.drive_table.current_limit[joint]
     pendant = np.degrees(campaign.cell.controller_angles(columns["position"]))
     assert view.quantities[0].traces[1].value.max() == pytest.approx(pendant[:, 1].max())
     assert [name for _, _, name in view.states] == [
@@ -67,7 +69,7 @@ class TestFrame:
             assert np.nanmin(trace.value) == shown.min()
 
     def test_it_is_named(self, excitation: Path) -> None:
-        view = view_of(excitation, bins=PAGE_BINS)
+        view = view_of(excitation)
         frame = "angles, speeds and torques as on the teach pendant"
         assert view.frame == frame
         assert frame in html.unescape(archive_page(view).decode("utf-8"))
@@ -103,7 +105,7 @@ def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:
     )
     view = view_of(path)
     (trace,) = view.quantities[-1].traces
-    assert trace.value.size < 5000
+    assert trace.value.size < 10_000
     at = trace.time[np.nanargmax(trace.value)]
     assert np.nanmax(trace.value) == 77.0
     assert at == pytest.approx(time[123_457], abs=1e-6)
@@ -144,7 +146,7 @@ def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path
 
 
 def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
-    view = view_of(excitation, joints=("2",), bins=PAGE_BINS)
+    view = view_of(excitation, joints=("2",))
     page = archive_page(view).decode("utf-8")
     (text,) = re.findall(r'data-traces="([^"]*)"', page)
     content = json.loads(html.unescape(text))
@@ -152,15 +154,11 @@ def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
     (line,) = content["plots"][2]["lines"]
     counts = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
     current = open_archive(excitation).columns["target_current"][:, 1]
-    kept = current if len(current) <= 2 * PAGE_BINS else view.quantities[2].traces[0].value
     values = line["low"] + line["step"] * counts
-    assert values.max() == pytest.approx(kept.max(), abs=line["step"])
-    assert values.min() == pytest.approx(kept.min(), abs=line["step"])
+    assert values.max() == pytest.approx(current.max(), abs=line["step"])
+    assert values.min() == pytest.approx(current.min(), abs=line["step"])
     assert content["marks"] == [round(time, 6) for time, _, _, _ in view.events]
-    assert content["plots"][2]["limits"] == [
-        pytest.approx(bound) for bound in (view.quantities[2].traces[0].low,
-                                           view.quantities[2].traces[0].high)
-    ]  # fmt: skip
+    assert content["plots"][2]["limits"] == pytest.approx(view.quantities[2].traces[0].limits)
     assert "Zoom over time" in page and "MotionEnded" in page
 
 

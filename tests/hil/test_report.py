@@ -517,9 +517,9 @@ class TestParameters:
         parameters = [p.model_dump() for p in make_results().parameters]
         for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
             parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
-        found = rendered(make_results(parameters=parameters))
-        remarks = [row["Remark"].replace("\xa0", " ") for row in found.table("Estimate")]
-        assert remarks[: len(cases)] == [remark for *_, remark in cases]
+        rows = rendered(make_results(parameters=parameters)).table("Estimate")
+        for row, (*_, remark) in zip(rows, cases, strict=False):
+            assert row["Remark"].replace("\xa0", " ") == remark
 
     def test_have_routes_to_their_deviation(self, whole: Page, results: Results) -> None:
         rows = {row["Route"]: row for row in whole.table("Route")}
@@ -560,8 +560,6 @@ class TestErrors:
         assert page.every_row_errors(results) == [0.06] * N
         assert page.every_row_errors(make_results()) == []
         assert all("every row 6.00 %" in one.error for one in figures.joints_of(results))
-
-    def test_are_those_of_the_fit_where_nothing_was_held_out(self) -> None:
         alone = make_results(fitted=FITTED, validation=[], repetitions=["log.mcap"])
         (row,) = page.error_rows(alone)
         assert "in-sample" in row[0]
@@ -594,6 +592,7 @@ class TestFigures:
         ):
             assert [one.title for one in made(series, joints)] == expected
             assert not made(make_series(), joints)
+        assert figures.split_panels(series, joints)[0].note.startswith("RMS [N·m]: gravity")
 
     def test_show_friction_at_a_reversal_and_row_by_row(self, results: Results) -> None:
         panels = figures.friction_curve_panels(full_series(), figures.joints_of(results))
@@ -601,10 +600,6 @@ class TestFigures:
         assert "at reversal" not in panels[1].svg
         longest = max(re.findall(r' d="([^"]*)"', panels[1].svg), key=len)
         assert longest.count("M") == 300
-
-    def test_name_the_size_of_each_part(self, results: Results) -> None:
-        series, joints = full_series(), figures.joints_of(results)
-        assert figures.split_panels(series, joints)[0].note.startswith("RMS [N·m]: gravity")
 
     @pytest.mark.parametrize(
         ("field", "values"),
@@ -680,12 +675,10 @@ class TestConduct:
         assert "0.15 %, at most 0.2 % wanted" in text
         assert "not warm" not in text
 
-    def test_may_be_missing_or_empty(self) -> None:
+    def test_may_be_missing_or_empty_or_of_a_cold_arm(self) -> None:
         assert "How it was run" not in rendered(make_results()).text
         text = rendered(make_results(conduct=conduct(warm_up=None, recorded=[]))).text
         assert "No archive could be read" in text and "Warm-up" not in text
-
-    def test_says_that_an_arm_did_not_get_warm(self) -> None:
         cold = conduct()
         cold["warm_up"] |= {"verdict": "not warm"}
         words = {"done": False, "words": "not warm after 3 motions", "details": ["still 1.3%"]}
@@ -792,13 +785,9 @@ class TestTrust:
         assert {mark for mark, _ in marks[2:]} == {""}
 
     def test_a_grade_is_by_relative_standard_deviation(self, arm: IdentifiedArm) -> None:
-        graded = {one.name: one.grade for one in Sections(arm).parameters}
         relative = arm.estimate.std / np.abs(arm.estimate.values)
-        for name, std in zip(arm.estimate.names, relative, strict=True):
-            grade = "well" if std <= 0.1 else "roughly" if std <= 0.5 else "hardly"
-            assert graded[name] == grade
-
-    def test_what_the_data_do_not_determine_is_named(self) -> None:
+        for one, std in zip(Sections(arm).parameters, relative, strict=True):
+            assert one.grade == ("well" if std <= 0.1 else "roughly" if std <= 0.5 else "hardly")
         html = Sections(identified_arm(TWO_LINK, still=(1,))).html
         named = html.split("Not determined by these data")[1].split("</p>")[0]
         assert "f0_2" in named and "I2m" in named
@@ -820,27 +809,19 @@ class TestTrust:
         sections = Sections(arm)
         html, part = sections.html, sections.essential
         text = re.sub(r"<[^>]*>", "", html)
-        assert part.reason in text
-        assert f"{part.by_spread_held_out:.2%}" in text
-        assert f"{part.blind.essential:.2%}" in text
+        for words in (part.reason, f"{part.by_spread_held_out:.2%}", f"{part.blind.essential:.2%}"):
+            assert words in text
         for parameter in part.parameters:
             assert f'<th scope="row">{parameter.name}</th>' in html
-
-    def test_gives_the_blind_figure_or_says_that_there_is_none(self, arm: IdentifiedArm) -> None:
         assert "too short to tell" in Sections(arm, essential={"blind": None}).html
         blind = BlindResult(left=7, essential=0.0612, full=0.0534)
         words = "7 parameters predict the held-out motion with an error of 6.12%, against 5.34%"
         assert words in Sections(arm, essential={"blind": blind}).html
-
-    def test_has_only_grades_without_the_rest(self, arm: IdentifiedArm) -> None:
         html = Sections(arm, essential=None, consistency=None).html
         assert 'id="trust"' in html
-        assert "Essential parameters" not in html
-        assert 'id="consistency"' not in html
+        assert "Essential parameters" not in html and 'id="consistency"' not in html
 
-
-class TestConsistency:
-    def test_names_links_bounds_and_what_it_moves(self, arm: IdentifiedArm) -> None:
+    def test_names_links_bounds_and_what_consistency_moves(self, arm: IdentifiedArm) -> None:
         bound = "rotor inertia of elbow would be negative (-0.3)"
         html = Sections(arm, consistency={"bounds": [bound], "moved": ["mc2x", "f0_1"]}).html
         assert bound in html
@@ -850,8 +831,6 @@ class TestConsistency:
         mass = arm.consistency.consistent.standard[arm.cell.model.layout.links[1, 9]]
         assert f"<td>{mass:.2f}</td>" in html
         assert "At odds" not in Sections(arm, consistency={"moved": []}).html
-
-    def test_shows_names_of_joints_as_text(self, arm: IdentifiedArm) -> None:
         link = Sections(arm).consistency.links[0].model_copy(update={"joint": "<script>alert(1)"})
         assert "<script>" not in Sections(arm, consistency={"links": [link]}).html
 

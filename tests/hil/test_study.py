@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,15 +14,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from typer.testing import CliRunner
 
+from hil.archive import open_archive
 from hil.batch.workers import LocalWorkers
-from hil.campaign import Campaign, CampaignFolder
-from hil.campaign.plan import design
+from hil.campaign import CampaignFolder
+from hil.campaign.plan import moves_from_dict
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import InputError, OperatorStopError
 from hil.progress import Silent
 from hil.simulation import planted_values
-from hil.study import StudyResults, StudySettings, run_study, study_campaigns, study_settings
+from hil.study import QUICK, StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import (
     AP,
     B0,
@@ -41,7 +40,7 @@ from hil.study.campaigns import (
     in_children,
 )
 from hil.study.page import study_page
-from hil.study.records import ClassForms, FitRecord, MotionForm, Run, ScoreRecord, classes_of
+from hil.study.records import PLANTED, ClassForms, ExampleRecord, FitRecord, MotionForm, ScoreRecord
 from hil.study.results import (
     AblationPoint,
     AblationResult,
@@ -52,7 +51,6 @@ from hil.study.results import (
     conclusions,
     summary_of,
 )
-from hil.study.run import homes, recorded_runs
 from hil.study.settings import Effort
 from hil.study.statistics import (
     FEWEST,
@@ -109,17 +107,17 @@ def flagged(count: int, of: int, repetitions: int, noise: float = 0.0) -> Array:
 
 def scored(errors: Mapping[str, Array]) -> ScoreRecord:
     """Motions on which the k-th method, whose own parameter is 1, has these errors (m,)."""
-    table = np.array(list(errors.values()))
+    table, line = np.array(list(errors.values())), [[0.0, 1.0]] * 2
     motions = table.shape[1]
+    example = {"archive": "v.mcap", "time": [0.0, 1.0], "measured": line}
     return ScoreRecord(
         inputs="",
         durations=[10.0] * motions,
-        samples=[100] * motions,
-        left_out=[[10, 30]] * motions,
+        left_out=[0.1, 0.3],
         forms=[form(np.diag([*column, 0.0]) ** 2) for column in table.T],
-        all_rows={name: (2.0 * values).tolist() for name, values in errors.items()},
+        all_rows={name: [0.04] * motions for name in (*errors, PLANTED)},
         mean_abs={name: np.outer(values, [1.0, 2.0]).tolist() for name, values in errors.items()},
-        examples=[],
+        examples=[ExampleRecord(**example, predicted=dict.fromkeys(errors, line))],
     )
 
 
@@ -167,7 +165,6 @@ class TestErrors:
         assert (equal.other, equal.other_seconds) == ("b", 48.0)
         assert estimates_of(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
         assert equal_data({"a": short, "b": short}) is None
-        assert equal_data({"a": short}) is None
 
     def test_the_distance_of_the_base_itself_is_one(self) -> None:
         truth, base = np.zeros(3), np.array([1.0, -2.0, 3.0])
@@ -186,8 +183,6 @@ class TestErrors:
         assert bands["own"].low == pytest.approx(error.low)
         assert bands["parameter_error"].low <= 1.0 <= bands["parameter_error"].high
         assert ranges_of("b", values, 6, forms, np.zeros(4), values[0]) == []
-        some = ranges_of("b", values, 3, forms, None, values[0])
-        assert {one.quantity for one in some} == {"error"}
 
     def test_planted_values_in_printed_units_are_the_manufacturers(self) -> None:
         cell = Cell.load(CELL_PATH)
@@ -316,21 +311,18 @@ def condition(
     scatter: float = 0.05,
     repetitions: int = 5,
     noise: float = 0.01,
-    labels: Sequence[str] = ("A", "B"),
-    classes: Sequence[str] = ("fly-by",),
-    parameters: Sequence[StudyParameter] = PARAMETERS,
 ) -> ConditionResult:
     """The second method's errors are so many times the first's, but for scatter over motions."""
     random = np.random.default_rng(5)
     a = random.uniform(0.01, 0.03, 30)
     b = ratio * a * np.exp(scatter * random.standard_normal(30))
-    keys = [label.lower() for label in labels]
+    methods = {"a": a, "b": b}
     return condition_result(
         named,
-        dict(zip(keys, labels, strict=True)),
-        {key: fitted(flagged(k, 2, repetitions, noise)) for k, key in enumerate(keys)},
-        {name: scored(dict(zip(keys, (a, b), strict=True))) for name in classes},
-        parameters,
+        {"a": "A", "b": "B"},
+        {key: fitted(flagged(k, 2, repetitions, noise)) for k, key in enumerate(methods)},
+        {"fly-by": scored(methods)},
+        PARAMETERS,
     )
 
 
@@ -340,7 +332,7 @@ def study(
     ranges: Sequence[ChanceRange] = (),
 ) -> StudyResults:
     results = StudyResults(
-        name="made up", cell="arm", simulated=True, quick=False, settings=None, software={},
+        name="made up", cell="arm", simulated=True, quick=False, settings=QUICK, software={},
         joint_names=["hip", "knee"], n_base=2, parameters=PARAMETERS, searches=[], table1=[],
         conditions=list(conditions), ablations=list(ablations), ranges=list(ranges), reading=[],
         missing=[], times={},
@@ -361,14 +353,13 @@ class TestConclusion:
     ) -> None:
         results = study(condition(ratio))
         (one,) = results.conditions[0].comparisons
-        answer = results.reading[0]
+        answer, summary = results.reading[0], summary_of(results)
         assert one.low is not None and one.high is not None
         saved = 100.0 * (1.0 - min(one.ratio, 1.0 / one.ratio))
         assert answer.verdict == f"{winner} is better, its error {saved:.0f} % smaller."
-        assert f"{one.ratio:.3f} times" in answer.sentences[0]
-        assert f"(interval {one.low:.3f} to {one.high:.3f})" in answer.sentences[0]
+        interval = f"{one.ratio:.3f} times that with A (interval {one.low:.3f} to {one.high:.3f})"
+        assert interval in answer.sentences[0]
         assert f"{loser} is better" not in text_of(results)
-        summary = summary_of(results)
         assert summary["line"] == f"{answer.heading} {answer.verdict}"
         (ratios,) = summary["ratios"]
         assert (ratios["condition"], ratios["interval"]) == ("plain", [one.low, one.high])
@@ -379,7 +370,6 @@ class TestConclusion:
             ({"ratio": 1.0, "scatter": 0.3}, "No significant difference."),
             ({"ratio": 0.99, "scatter": 0.002, "noise": 1e-3}, "B is slightly better, its"),
             ({"ratio": 0.8, "repetitions": 1}, "Too few repetitions or motions"),
-            ({"ratio": 0.8, "classes": ()}, "There is no held-out motion"),
         ],
     )
     def test_what_is_small_or_uncertain_is_called_so(
@@ -415,30 +405,6 @@ class TestConclusion:
         assert verdict.startswith("A is better")
         assert ("% smaller, but not with as much motion of each." in verdict) is gone
 
-    def test_of_unknown_methods_it_names_neither_a_nor_b(self) -> None:
-        print_ = {"printed_a": 1.0, "printed_b": 2.0, "printed_c": 0.5}
-        printed = [
-            one.model_copy(update=print_ | {"printed_id": k + 1})
-            for k, one in enumerate(PARAMETERS)
-        ]
-        recorded = Condition("recorded", "as recorded", ())
-        results = study(
-            condition(0.8, named=recorded, labels=("march", "june"), parameters=printed)
-        )
-        assert "with june is closer to π_C than that with march" in study_page(results).decode()
-        assert re.search(r"\b(than|with|of|and) [AB]\b|\b[AB]'s", text_of(results)) is None
-
-    def test_campaigns_that_contradict_each_other_are_named(self) -> None:
-        answer = study(
-            *(
-                condition(ratio, named=Condition(f"recorded-{k}", f"on the motions of {k}", ()))
-                for k, ratio in (("march", 1.3), ("june", 0.7))
-            )
-        ).reading[0]
-        assert answer.verdict.startswith("On the motions of march: A is better")
-        assert "On the motions of june: B is better" in answer.verdict
-        assert "opposite conclusions" in answer.sentences[0]
-
     def test_settings_outside_the_range_of_chance_are_named(self) -> None:
         points = [
             AblationPoint(
@@ -463,15 +429,12 @@ class TestPlans:
 
     def test_the_best_sines_are_those_of_largest_determinant(self) -> None:
         def found(**log10_det: float) -> dict[str, Search]:
-            return {
-                key.replace("_", "-"): cast(
-                    Search,
-                    SimpleNamespace(
-                        excitation=SimpleNamespace(criteria=SimpleNamespace(log10_det=one))
-                    ),
-                )
+            motions = {
+                key.replace("_", "-"): SimpleNamespace(criteria=SimpleNamespace(log10_det=one))
                 for key, one in log10_det.items()
             }
+            searches = {key: SimpleNamespace(excitation=one) for key, one in motions.items()}
+            return cast(dict[str, Search], searches)
 
         both = found(a_middle=60.0, a_home=65.0, a_middle_fast=80.0, b=90.0)
         assert best_sines(both) == "a-middle-fast"
@@ -506,17 +469,10 @@ class TestPlans:
 @pytest.fixture(scope="module")
 def small() -> StudySettings:
     few = Effort(population=8, generations=1)
-    return study_settings(quick=True, repetitions=2, motions=3, effects=False).model_copy(
-        update={
-            "effort_a": few,
-            "effort_b": few,
-            "fly": (0.0, 0.5),
-            "n_via": (6,),
-            "coupling_weight": (0.3,),
-            "subsets": (1, 2),
-            "noise": (1.0,),
-        }
-    )
+    update = {"effort_a": few, "effort_b": few, "fly": (0.0, 0.5), "n_via": (6,)}
+    update |= {"coupling_weight": (0.3,), "subsets": (1, 2), "noise": (1.0,)}
+    settings = study_settings(quick=True, repetitions=2, motions=3, effects=False)
+    return settings.model_copy(update=update)
 
 
 @pytest.fixture(scope="module")
@@ -602,22 +558,21 @@ class TestWhole:
         names = ["sines", "fly", "n_via", "weight", "repetitions", "noise"]
         assert [one.key for one in found.ablations] == names
         assert all(point.own for one in found.ablations for point in one.points)
-
-    def test_estimates_of_a_rigid_arm_are_near_the_planted_values(self, whole: Whole) -> None:
-        _, found = whole
+        # Estimates of a rigid arm are near the planted values.
         truth = np.array([one.truth for one in found.parameters])
         for method in found.conditions[0].methods:
             assert not method.undetermined
             distance = np.abs(np.array(method.pooled) - truth)
             assert np.mean(distance <= 4.0 * np.array(method.pooled_std)) >= 0.8, method.key
 
-    @pytest.mark.parametrize(
-        ("key", "name"), [("a", "sinusoid"), ("b", "fly-by"), ("b0", "stop-to-stop")]
-    )
-    def test_held_out_motions_are_of_their_class(self, whole: Whole, key: str, name: str) -> None:
-        run = Run(key, key, whole[0] / "campaigns" / "plain" / key)
-        assert {one: len(names) for one, names in classes_of(run).items()} == {name: 3}
-        assert len(CampaignFolder(run.root).completed("validation")) == 3
+    def test_held_out_motions_are_of_their_class(self, whole: Whole) -> None:
+        for key in ("a", "b", "b0"):
+            folder = CampaignFolder(whole[0] / "campaigns" / "plain" / key)
+            archives = [open_archive(path) for path in folder.completed("validation")]
+            moves = [moves_from_dict(archive.table("plan.json")) for archive in archives]
+            assert len(moves) == 3
+            flies = {one and any(m.fly.percent > 0.0 for m in one.moves[:-1]) for one in moves}
+            assert flies == {{"a": None, "b": True, "b0": False}[key]}
 
     @pytest.mark.usefixtures("no_page")
     def test_started_again_nothing_whole_is_done_again(
@@ -672,62 +627,8 @@ class TestWhole:
             run_study(root / "fits", small, Silent(), workers=1, cell=arm)
 
 
-class TestRecorded:
-    """Campaigns that were recorded."""
-
-    @pytest.mark.usefixtures("no_page")
-    def test_they_give_what_they_allow(self, whole: Whole, tmp_path: Path) -> None:
-        """Their excitations say which is A and which is B, whatever the folders are called."""
-        root, found = whole
-        runs = [
-            Path(shutil.copytree(root / "campaigns" / "plain" / key, tmp_path / name))
-            for key, name in (("b", "tuesday"), ("a", "monday"))
-        ]
-        recorded = study_campaigns(tmp_path / "out", runs, Silent(), workers=1)
-        (condition,) = recorded.conditions
-        assert [one.label for one in condition.methods] == ["A (monday)", "B (tuesday)"]
-        assert recorded.reading[0].heading.startswith("Does B (tuesday) predict")
-        means = [one.mean for one in found.conditions[0].methods[:2]]
-        assert [one.mean for one in condition.methods] == means
-        assert {one.motion_class for one in condition.classes} == {"fly-by", "sinusoid"}
-        assert any("stop-to-stop" in sentence for sentence in recorded.missing)
-        assert [one.key for one in recorded.ablations] == ["repetitions"]
-        with pytest.raises(InputError, match="named twice"):
-            recorded_runs([runs[0], runs[0]])
-
-    @pytest.mark.slow
-    def test_a_folder_named_like_a_method_makes_no_method(self, tmp_path: Path) -> None:
-        """Two campaigns of method B, that run the same held-out motions; and one of another arm."""
-        cell = fast_cell(tmp_path, repetitions=1)
-        other = cell.text.replace("gear_ratio = [100.0", "gear_ratio = [110.0")
-        plan, folders = design(cell, Silent()), [tmp_path / name for name in ("a", "b", "other")]
-        for folder, text in zip(folders, (cell.text, cell.text, other), strict=True):
-            arm = Cell.from_texts(text, cell.urdf, cell.path)
-            own = plan if text == cell.text else design(arm, Silent())
-            Campaign.create(folder, arm, own).run(unrehearsed=True, durable=False)
-        runs = [one.run for one in recorded_runs(folders[:2])]
-        assert not {one.key for one in runs} & {"a", "b", "b0"}
-        assert [one.label for one in runs] == ["a", "b"]
-        assert homes(runs) == runs
-        with pytest.raises(InputError, match=r"another arm.*\[drive_train\]"):
-            recorded_runs([folders[0], folders[2]])
-
-
 class TestCommand:
     """`hil study`."""
-
-    def test_one_campaign(self, whole: Whole, tmp_path: Path) -> None:
-        only = whole[0] / "campaigns" / "plain" / "b"
-        words = ["--campaign", str(only), "-o", str(tmp_path / "one"), "--json", "--workers", "1"]
-        done = CliRunner().invoke(app, ["study", *words])
-        assert done.exit_code == 0, done.output
-        assert any("nothing is compared" in line for line in json.loads(done.stdout)["missing"])
-        assert (tmp_path / "one" / "report.html").stat().st_size > 10_000
-
-    def test_a_campaign_is_not_run_again(self, tmp_path: Path) -> None:
-        done = CliRunner().invoke(app, ["study", "--quick", "--campaign", str(tmp_path)])
-        assert isinstance(done.exception, InputError)
-        assert "is recorded already" in str(done.exception)
 
     def test_ctrl_c_leaves_one_sentence_and_its_exit_status(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

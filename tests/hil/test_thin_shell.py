@@ -21,7 +21,7 @@ OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
 TERMINAL = ("typer", "click", "rich")
 ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvxpy", "clarabel",
            "matplotlib", "mcap", "zstandard", "lz4", "isal", "rosbags", "can", "serial", "pydantic",
-           "jinja2", "viser", "foxglove", "distributed", "fsspec", "pyarrow")  # fmt: skip
+           "jinja2", "foxglove", "distributed", "fsspec", "pyarrow")  # fmt: skip
 WIRE = ("socket", "struct", "multiprocessing", "ctypes", "mmap")
 OF_NUMPY = {"array", "asarray", "isfinite", "degrees", "max", "abs", "argmax", "float64"}
 """What it takes to say a number: nothing here estimates, solves, draws lots or integrates."""

@@ -20,14 +20,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from types import MethodType, SimpleNamespace
-from typing import cast
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hil.archive import Archive, ArchiveHeader, ArchiveName, Samples, open_archive, write_samples
+from hil.archive import ArchiveHeader, ArchiveName, Samples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
 from hil.campaign import Campaign, CampaignFolderError
@@ -49,7 +48,7 @@ from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
 from hil.reading import json_of, opened, text_of, toml_of
 from hil.results import Results
-from hil.study.records import Record, class_in, read_record, write_record
+from hil.study.records import Record, read_record, write_record
 from hil.study.results import StudyResults
 from identification import IdentificationError
 from identification.excitation import Journal
@@ -602,12 +601,6 @@ def test_planted_values_that_are_no_numbers_are_none(value: object) -> None:
     assert planted(value) == {}
 
 
-@pytest.mark.parametrize("text", [b"[1]", b"{bad", b"[" * 100_000, b"\xff", b'{"trajectory": 3}'])
-def test_a_plan_that_is_none_tells_no_other_class(text: bytes, tmp_path: Path) -> None:
-    header = ArchiveHeader.of(HEADER)
-    assert class_in(Archive(tmp_path, header, None, {"plan.json": text}, {}, (), None)) == "fly-by"
-
-
 def test_a_name_that_is_no_text_is_told_as_json(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "hil", "status", b"x\xff", "--json"],
@@ -631,17 +624,6 @@ def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: 
     for content in ('{"inputs": 1}', '{"inputs": "digest", "more": 1}', "[" * 10_000, "\0"):
         path.write_text(content)
         assert read_record(path, Record, "digest") is None
-
-
-def test_a_plan_whose_moves_are_none_is_told_with_its_archive(tmp_path: Path) -> None:
-    path = tmp_path / "validation_000_a1.mcap"
-    plan = json.dumps({"moves": [{"target": "x"}]}).encode()
-    forged = SimpleNamespace(path=path, attachments={"plan.json": plan})
-    forged.table = MethodType(Archive.table, forged)
-    archive = cast("Archive", forged)
-    with pytest.raises(ArchiveError, match="its plan cannot be read") as raised:
-        class_in(archive)
-    assert str(path) in str(raised.value)
 
 
 # What a search keeps

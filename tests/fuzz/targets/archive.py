@@ -87,7 +87,7 @@ def as_told(path: Path) -> None:
 def as_drawn(path: Path) -> None:
     """`hil plot`, without the seconds that drawing itself takes."""
     try:
-        view_of(path, bins=8)
+        view_of(path)
     except InputError:
         return
 
