@@ -49,7 +49,8 @@ Array = NDArray[np.float64]
 
 # Errors of a model come and go with the moves of the arm, that is over some tenths of a second.
 SHORTEST_BLOCK: Final = 2  # fine blocks
-# Blocks are lengthened until the scores of neighbours hardly correlate, ...
+# Blocks are lengthened until the scores of neighbours hardly correlate (`_sandwich` allows for
+# what is left), ...
 _CORRELATED: Final = 0.1
 # ... but fewer blocks than this would make the covariance itself too uncertain.
 _FEWEST_BLOCKS: Final = 20
@@ -149,8 +150,14 @@ def _sandwich(
     duration: float,
     prior: Array | None = None,
 ) -> Clustered:
-    """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p)."""
-    corrected = leverage_corrected(shares, scores @ solution.root)
+    """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p).
+
+    Scores that correlate by r with those of the next block add up to a variance 1 + 2 r times as
+    large; r is the mean over the directions, and never counted below zero.
+    """
+    scores = scores @ solution.root
+    corrected = leverage_corrected(shares, scores)
+    corrected *= np.sqrt(1.0 + 2.0 * max(0.0, _neighbours(scores)))
     moved = corrected @ solution.root.T
     covariance = np.asarray(moved.T @ moved)
     effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
@@ -193,12 +200,15 @@ def block_length(scores: Array) -> int:
     longest = max(1, len(scores) // _FEWEST_BLOCKS)
     shortest = min(SHORTEST_BLOCK, longest)
     for length in range(shortest, longest):
-        runs = merged(scores, length)
-        power = (runs**2).sum(axis=0)
-        both = (runs[1:] * runs[:-1]).sum(axis=0)
-        if np.mean(both[power > 0.0] / power[power > 0.0]) < _CORRELATED:
+        if _neighbours(merged(scores, length)) < _CORRELATED:
             return length
     return longest
+
+
+def _neighbours(scores: Array) -> float:
+    """Mean correlation of scores (B, k) with those of the next block."""
+    power, both = (scores**2).sum(axis=0), (scores[1:] * scores[:-1]).sum(axis=0)
+    return float(np.mean(both[power > 0.0] / power[power > 0.0])) if power.any() else 0.0
 
 
 def spread(information: Array, scores: Array, root: Array, left: Array | None = None) -> Array:

@@ -105,8 +105,10 @@ def mask_rows(
     Of that smoothing `bandwidth` (n,) [Hz]; `torque_bandwidth` (n,) [Hz] is of a low-pass that
     torque and regressor go through, `current_limit` (n,) [A] of the motors; the motion was read
     `delay` [s] earlier than the rows. Of slow rows are left out: "rests": those of a joint that is
-    slower than standstill for longer than `LONGEST_HALT`; "slow": all, and those near a velocity
-    reversal; "none": neither.
+    slower than standstill for longer than `LONGEST_HALT`, and the two between which a velocity
+    changes its sign, for where between them friction turns is not known, and rows on the wrong side
+    make Coulomb friction too small; "slow": all, and those near a velocity reversal; "none":
+    neither.
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)
@@ -123,7 +125,8 @@ def mask_rows(
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {TORN: np.broadcast_to(torn[:, None], shape)}
     if left_out == "rests":
-        reasons[REST] = long_rests(motion.time, still)
+        at_once = near_any_reversal(model, motion, np.zeros(shape[1]))
+        reasons |= {REST: long_rests(motion.time, still), REVERSAL: at_once}
     elif left_out == "slow":
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated

@@ -7,13 +7,20 @@ from scipy.signal import lfilter
 
 from identification.estimators.covariance import (
     block_length,
+    cluster_covariance,
     left_out,
     leverage_corrected,
     spread,
     with_block_covariance,
 )
 from identification.estimators.least_squares import estimate_repetitions
-from identification.factor.factor import Factor, estimate, joint_weights, solve
+from identification.factor.factor import (
+    Factor,
+    NormalEquations,
+    estimate,
+    joint_weights,
+    solve,
+)
 from identification.factor.phases import PhaseFactor
 from identification.signals.samples import Samples
 from tests.identification.two_link import (
@@ -154,6 +161,21 @@ def test_the_spread_is_that_of_leaving_out_one_block_where_none_stands_alone() -
     moved = left_out(information, scores, solution.root)
     rows = spread(information, scores, solution.root)
     np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.09])
+def test_what_neighbouring_blocks_share_is_in_the_variance(shared: float) -> None:
+    """Estimates of a mean from blocks that correlate with the next one alone."""
+    rng = np.random.default_rng(3)
+    blocks, k = 300, 40
+    weight = (1.0 - np.sqrt(1.0 - 4.0 * shared**2)) / (2.0 * shared) if shared else 0.0
+    white = rng.standard_normal((blocks + 1, k)) / np.sqrt(blocks * (1.0 + weight**2))
+    scores = white[1:] + weight * white[:-1]
+    information = np.tile(np.eye(k) / blocks, (blocks, 1, 1))
+    solution = solve(NormalEquations(np.eye(k), scores.sum(axis=0)))
+    found = cluster_covariance(information, scores, solution)
+    assert found.blocks == blocks // 2
+    assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
 
 
 def test_blocks_grow_with_the_correlation_of_the_scores() -> None:

@@ -276,6 +276,19 @@ def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) ->
         assert np.all(mask.counts[reason] > 0)
 
 
+def test_where_only_rests_are_left_out_so_are_the_two_rows_of_a_reversal(
+    model: RobotModel,
+) -> None:
+    motion, recording = motion_and_recording(model)
+    mask = mask_rows(recording, model, motion, np.full(2, 40.0), left_out="rests")
+    for joint, speed in enumerate(motion.velocity.T):
+        last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
+        assert last.size
+        np.testing.assert_array_equal(
+            np.flatnonzero(mask.reasons[REVERSAL][:, joint]), np.sort([*last, *(last + 1)])
+        )
+
+
 @pytest.mark.parametrize("friction", [True, False])
 def test_rows_beside_a_reversal_of_a_coupled_motor_are_left_out(friction: bool) -> None:
     turns = np.array([[1.0, 0.0], [-0.8, 1.0]])
