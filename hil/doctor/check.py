@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, NamedTuple, ParamSpec
 
 
 class Status(StrEnum):
@@ -40,27 +41,18 @@ class Check:
     why: str = ""
 
 
-def ok(found: str) -> Check:
-    """It works."""
-    return Check("", Status.OK, found)
-
-
-def warn(found: str, *remedy: str) -> Check:
-    """It costs latency, or depends on chance."""
-    return Check("", Status.WARN, found, remedy)
-
-
-def bad(found: str, *remedy: str) -> Check:
-    """The link does not work so."""
-    return Check("", Status.BAD, found, remedy)
-
-
-def unknown(found: str, *remedy: str) -> Check:
-    """It cannot be found out from here."""
-    return Check("", Status.UNKNOWN, found, remedy)
-
-
+Outcome = Callable[..., Check]
 P = ParamSpec("P")
+
+
+def _with_status(status: Status) -> Outcome:
+    def made(found: str, *remedy: str) -> Check:
+        return Check("", status, found, remedy)
+
+    return made
+
+
+ok, warn, bad, unknown = map(_with_status, Status)
 
 
 def named(name: str) -> Callable[[Callable[P, Check]], Callable[P, Check]]:
@@ -84,16 +76,12 @@ COMMAND_TIMEOUT = 3.0
 _LARGEST = 4_000_000
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """What a command said: exit status and both streams."""
 
     status: int
     output: str
     errors: str = ""
-
-
-Runner = Callable[[Sequence[str]], Answer | None]
 
 
 def run_command(command: Sequence[str]) -> Answer | None:
@@ -126,7 +114,7 @@ class System:
     """
 
     root: Path = Path("/")
-    run: Runner = run_command
+    run: Callable[[Sequence[str]], Answer | None] = run_command
 
     def path(self, name: str) -> Path:
         """The file called `name` (absolute) on this system."""
@@ -142,9 +130,8 @@ class System:
 
     def number(self, name: str) -> int | None:
         """The integer in a file; None if there is none."""
-        text = self.text(name)
         try:
-            return None if text is None else int(text)
+            return int(self.text(name) or "")
         except ValueError:
             return None
 
@@ -153,4 +140,12 @@ class System:
         try:
             return sorted(path.name for path in self.path(folder).iterdir())
         except OSError:
+            return []
+
+    def ip(self, *words: str) -> list[dict[str, Any]] | None:
+        """What `ip` of iproute2 lists; nothing where it refuses, None where it is not installed."""
+        answer = self.run(["ip", "-json", *words])
+        try:
+            return None if answer is None else [*json.loads(answer.output)]
+        except ValueError:
             return []

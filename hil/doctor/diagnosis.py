@@ -48,13 +48,7 @@ EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]
 
 @dataclass(frozen=True, eq=False)
 class Latency:
-    """Latencies of one kind.
-
-    Attributes:
-        name: "wake-up" or "turnaround".
-        samples: (m,) s, m >= 1.
-        seconds: how long was measured.
-    """
+    """Latencies (m,) [s] of one kind, "wake-up" or "turnaround", and how long was measured."""
 
     name: str
     samples: NDArray[np.float64]
@@ -180,10 +174,7 @@ def run_probe(
 ) -> dict[str, Any] | None:
     """The JSON answer of `hil.doctor.probe`; None if it failed or took `_GRACE` s too long.
 
-    Args:
-        words: of its command line.
-        seconds: that it measures.
-        advance: is called with the seconds that passed meanwhile.
+    It measures for `seconds`; `advance` is called with those that passed meanwhile.
     """
     probe = subprocess.Popen(
         [sys.executable, "-m", "hil.doctor.probe", *words],
@@ -207,9 +198,9 @@ def run_probe(
             probe.wait(timeout=1.0)
         if probe.stdout is not None:
             probe.stdout.close()
-    answer: dict[str, Any] | None = None
-    if output and probe.returncode == 0:
-        answer = json.loads(output.splitlines()[-1])
+    if not output or probe.returncode:
+        return None
+    answer: dict[str, Any] = json.loads(output.splitlines()[-1])
     return answer
 
 

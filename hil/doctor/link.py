@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import errno
 import ipaddress
-import json
 import re
 import socket
-import struct
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,11 +64,13 @@ def can_check(bus: CanTable, system: System) -> Check:
     state = system.text(f"{folder}/operstate") or "unknown"
     if state == "down":
         return bad("down", bring_up)
-    details = _details(bus.channel, system)
+    shown = system.ip("-details", "link", "show", bus.channel) or [{}]
+    details = shown[0].get("linkinfo", {})
     if details.get("info_kind") == "vcan":
         return ok("virtual bus, no bit rate")
-    nominal, data = (_rate(details, timing) for timing in ("bittiming", "data_bittiming"))
-    if nominal is None:
+    timings = details.get("info_data", {})
+    nominal, data = (timings.get(of, {}).get("bitrate") for of in ("bittiming", "data_bittiming"))
+    if not nominal:
         return unknown(f"{state}; bit rate not stated", f"ip -details link show {bus.channel}")
     found = f"{state}, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
     wanted = bus.data_bitrate or data if fd else data
@@ -77,23 +78,6 @@ def can_check(bus: CanTable, system: System) -> Check:
         return ok(found)
     down = f"sudo ip link set {bus.channel} down"
     return bad(f"{found}; the cell needs otherwise", down, bring_up)
-
-
-def _details(channel: str, system: System) -> dict[str, Any]:
-    """`linkinfo` of `ip`, empty if it cannot be had."""
-    answer = system.run(["ip", "-details", "-json", "link", "show", channel])
-    try:
-        found = json.loads(answer.output)[0]["linkinfo"] if answer else {}
-    except (ValueError, LookupError, TypeError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def _rate(details: dict[str, Any], timing: str) -> int | None:
-    try:
-        return int(details["info_data"][timing]["bitrate"]) or None
-    except (LookupError, TypeError, ValueError):
-        return None
 
 
 def try_port(bind: str, port: int) -> int:
@@ -116,8 +100,10 @@ def port_check(bind: str, port: int, error: int, system: System) -> Check:
     if error == 0:
         return ok(f"can be bound on {bind}")
     if error == errno.EADDRINUSE:
-        user = owner_of(port, system) or "a program of another user"
-        return bad(f"in use by {user}", f"sudo ss -lunp sport = :{port}")
+        answer = system.run(["ss", "-lunpH", f"sport = :{port}"])
+        user = re.search(r'"(.*?)",pid=(\d+)', "" if answer is None else answer.output)
+        who = f"{user[1]} (process {user[2]})" if user else "a program of another user"
+        return bad(f"in use by {who}", f"sudo ss -lunp sport = :{port}")
     if error == errno.EADDRNOTAVAIL:
         look = "ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0"
         return bad(f"{bind} is no address of this PC", look)
@@ -132,161 +118,62 @@ def port_check(bind: str, port: int, error: int, system: System) -> Check:
     return bad(f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})")
 
 
-def owner_of(port: int, system: System) -> str | None:
-    """Program and process that listen on a UDP port, as far as this user may see."""
-    inodes = set()
-    for line in (system.text("/proc/net/udp") or "").splitlines()[1:]:
-        words = line.split()
-        local = re.fullmatch(r"[0-9A-F]{8}:([0-9A-F]{4})", words[1]) if len(words) > 9 else None
-        if local and int(local[1], 16) == port:
-            inodes.add(words[9])
-    for process in system.names("/proc"):
-        if process.isdigit() and _holds(system.path(f"/proc/{process}/fd"), inodes):
-            return f"{system.text(f'/proc/{process}/comm') or 'a program'} (process {process})"
-    return None
-
-
-def _holds(folder: Path, inodes: set[str]) -> bool:
-    try:
-        return any(
-            re.fullmatch(r"socket:\[(\d+)\]", (target := str(link.readlink()))) is not None
-            and target[8:-1] in inodes
-            for link in folder.iterdir()
-        )
-    except OSError:
-        return False
-
-
-_UP = 0x1
-_REJECT = 0x200
-_COMPLETE = 0x2
-_PERMANENT = 0x4
-LOOPBACK = "lo"
-
-
-@dataclass(frozen=True)
-class Route:
-    """How packets to an address leave: card, and gateway (None if it is on the card's network)."""
-
-    device: str
-    gateway: str | None
-    is_default: bool = False
-
-
 def address_of(host: str, system: System) -> str | None:
     """An IPv4 address as written, or by name from /etc/hosts; None otherwise. No DNS."""
-    try:
-        return str(ipaddress.IPv4Address(host))
-    except ValueError:
-        pass
-    for line in (system.text("/etc/hosts") or "").splitlines():
-        words = line.split("#")[0].split()
-        if host in words[1:] and re.fullmatch(r"[\d.]+", words[0]):
-            return words[0]
-    return None
-
-
-def routes(system: System) -> list[tuple[ipaddress.IPv4Network, int, Route]]:
-    """Network, metric and way of every usable line of /proc/net/route."""
-    found = []
-    for line in (system.text("/proc/net/route") or "").splitlines()[1:]:
-        words = line.split()
+    lines = (line.split("#")[0].split() for line in (system.text("/etc/hosts") or "").splitlines())
+    for text in (host, *(words[0] for words in lines if host in words[1:])):
         try:
-            flags, metric = int(words[3], 16), int(words[6])
-            target, gateway, mask = (_dotted(words[i]) for i in (1, 2, 7))
-            network = ipaddress.IPv4Network(f"{target}/{mask}", strict=False)
-        except (IndexError, ValueError, struct.error):
+            return str(ipaddress.IPv4Address(text))
+        except ValueError:
             continue
-        if not flags & _UP or flags & _REJECT:
-            continue
-        way = Route(words[0], None if gateway == "0.0.0.0" else gateway, network.prefixlen == 0)
-        found.append((network, metric, way))
-    return found
-
-
-def route_to(address: str, system: System) -> Route | None:
-    """The way the main routing table gives: the longest prefix, then the lowest metric."""
-    target = ipaddress.IPv4Address(address)
-    if target.is_loopback or address in own_addresses(system):
-        return Route(LOOPBACK, None)
-    fits = [(-net.prefixlen, metric, way) for net, metric, way in routes(system) if target in net]
-    return min(fits, key=lambda fit: fit[:2])[2] if fits else None
-
-
-def default_devices(system: System) -> set[str]:
-    """Cards that carry a default route."""
-    return {way.device for _, _, way in routes(system) if way.is_default}
-
-
-def own_addresses(system: System) -> set[str]:
-    """IPv4 addresses of this PC, from the local part of /proc/net/fib_trie."""
-    text = system.text("/proc/net/fib_trie") or ""
-    return set(re.findall(r"\|-- ([\d.]+)\n\s+/32 host LOCAL", text))
-
-
-def neighbour(address: str, device: str, system: System) -> tuple[str, bool] | None:
-    """Hardware address of an address on a card, and whether its ARP entry is permanent."""
-    for line in (system.text("/proc/net/arp") or "").splitlines()[1:]:
-        words = line.split()
-        if len(words) >= 6 and words[0] == address and words[5] == device:
-            flags = int(words[2], 16) if re.fullmatch(r"0x[0-9a-fA-F]+", words[2]) else 0
-            if flags & _COMPLETE and words[3] != "00:00:00:00:00:00":
-                return words[3], bool(flags & _PERMANENT)
     return None
 
 
-def _dotted(word: str) -> str:
-    """An address of /proc/net/route: hexadecimal in the processor's (little-endian) order."""
-    return str(ipaddress.IPv4Address(struct.unpack("<I", struct.pack(">I", int(word, 16)))[0]))
-
-
-_NET = "/sys/class/net"
 _SPARE_USECS = 50
 """µs that a card may gather packets before it interrupts."""
 
 
 @named("route to the controller")
-def route_check(host: str, address: str | None, route: Route | None) -> Check:
+def route_check(host: str, address: str | None, route: Mapping[str, Any] | None) -> Check:
     """A router or a wrong card in between adds delay, or loses all."""
+    # `route` as `ip route get` has it: empty where there is none, None where nobody can say.
     if address is None:
         remedy = f"# write the address in the cell file: host = 10.2.12.150 or the like, not {host}"
         return bad(f"{host!r} is no IPv4 address nor in /etc/hosts", remedy)
-    add = f"sudo ip addr add {_neighbouring(address)}/24 dev CARD"
     if route is None:
+        return unknown("ip is not installed", "sudo apt install iproute2")
+    add = f"sudo ip addr add {_neighbouring(address)}/24 dev CARD"
+    if not route:
         look = "ip -brief link   # which card is the controller's?"
         return bad(f"none to {address}", look, f"{add} && sudo ip link set CARD up")
-    if route.device == LOOPBACK:
+    if route.get("type") == "local":
         return ok(f"{address} is this PC itself (a simulated controller)")
-    if route.gateway is not None:
-        found = f"over gateway {route.gateway} on {route.device}"
+    if "gateway" in route:
+        found = f"over gateway {route['gateway']} on {route['dev']}"
         return bad(found, f"{add}   # CARD: the one cabled to the controller")
-    return ok(f"{address} directly on {route.device}")
+    return ok(f"{address} directly on {route['dev']}")
 
 
 @named("card {0}")
 def device_check(device: str, system: System) -> Check:
     """Packets of the controller come every millisecond; nothing else should share the card."""
-    folder = f"{_NET}/{device}"
-    if device == LOOPBACK:
-        return ok("loopback")
+    folder = f"/sys/class/net/{device}"
     if not system.path(folder).exists():
         return bad("does not exist", "ip -brief link")
     state = system.text(f"{folder}/operstate") or "unknown"
     if state not in ("up", "unknown") or system.text(f"{folder}/carrier") == "0":
         return bad(f"{state}, no carrier", f"sudo ip link set {device} up", "# check the cable")
-    if system.path(f"{folder}/wireless").exists() or system.path(f"{folder}/phy80211").exists():
+    if any(system.path(f"{folder}/{name}").exists() for name in ("wireless", "phy80211")):
         return bad("is wireless", "# use a cable")
     speed, duplex = system.number(f"{folder}/speed"), system.text(f"{folder}/duplex")
     words = [state, f"{speed} Mbit/s" if speed and speed > 0 else "speed not stated"]
     words += [f"{duplex} duplex"] if duplex in ("half", "full") else []
-    try:
-        words.append(f"driver {system.path(f'{folder}/device/driver').resolve(strict=True).name}")
-    except OSError:
-        words.append("driver none (virtual)")
+    driver = system.path(f"{folder}/device/driver")
+    words.append(f"driver {driver.resolve().name if driver.exists() else 'none (virtual)'}")
     found = ", ".join(words)
     if duplex == "half" or (speed is not None and 0 < speed < 100):
         return bad(found, f"sudo ethtool -s {device} autoneg on")
-    if device in default_devices(system):
+    if any(one.get("dev") == device for one in system.ip("route", "show", "default") or ()):
         remedy = "# give the controller a card of its own; this one carries the default route too"
         return warn(f"{found}; shared with other traffic", remedy)
     return ok(found)
@@ -313,13 +200,16 @@ def coalescing(device: str, system: System) -> Check:
 
 
 @named("ARP entry of the controller")
-def neighbour_check(address: str, device: str, entry: tuple[str, bool] | None) -> Check:
+def neighbour_check(address: str, device: str, system: System) -> Check:
     """An entry that expires is asked for anew in mid-motion, and answers wait for it."""
-    mac, permanent = entry or ("MAC", False)
+    entries = system.ip("neigh", "show", "to", address, "dev", device) or []
+    entry = next((one for one in entries if "lladdr" in one), {})
+    mac = entry.get("lladdr", "MAC")
     remedy = f"sudo ip neigh replace {address} lladdr {mac} dev {device} nud permanent"
-    if entry is None:
+    if not entry:
         hint = "# MAC: read it off the controller; a C4G's begins with 00:04:50"
         return warn("none (the table was read, no request was sent)", remedy, hint)
+    permanent = "PERMANENT" in entry.get("state", ())
     return ok(f"{mac}, permanent") if permanent else warn(f"{mac}, will expire", remedy)
 
 
@@ -362,22 +252,23 @@ def _neighbouring(address: str) -> str:
     return f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
 
 
-def network_checks(host: str, port: int, address: str | None, system: System) -> list[Check]:
+def network_checks(host: str, port: int, system: System) -> list[Check]:
     """Everything between this PC and the controller."""
-    route = None if address is None else route_to(address, system)
+    address, route = address_of(host, system), None
+    if address is not None and (routes := system.ip("route", "get", address)) is not None:
+        route = next(iter(routes), {})
     first = route_check(host, address, route)
     # The card of a wrong route is not the one that matters.
-    if address is None or route is None or first.status is not Status.OK:
+    if address is None or not route or first.status is not Status.OK or "type" in route:
         return [first]
-    device = route.device
-    checks = [first, device_check(device, system)]
-    if device != LOOPBACK:
-        checks += [
-            coalescing(device, system),
-            neighbour_check(address, device, neighbour(address, device, system)),
-            firewall(address, port, system),
-        ]
-    return checks
+    device = route["dev"]
+    return [
+        first,
+        device_check(device, system),
+        coalescing(device, system),
+        neighbour_check(address, device, system),
+        firewall(address, port, system),
+    ]
 
 
 def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
@@ -388,6 +279,6 @@ def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
     if table.can is not None and table.transport == "can":
         return [can_check(table.can, system)]
     return [
-        *network_checks(table.host, table.port, address_of(table.host, system), system),
+        *network_checks(table.host, table.port, system),
         port_check(table.bind, table.port, try_port(table.bind, table.port), system),
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import gzip
 import os
 import re
@@ -17,6 +16,7 @@ from .check import Check, System, bad, named, ok, unknown, warn
 
 GROUP = "realtime"
 RULE_FILE = "/etc/udev/rules.d/90-hil.rules"
+_JOIN = f'sudo groupadd -f {GROUP} && sudo usermod -aG {GROUP} "$USER"'
 _LOG_IN_AGAIN = "# log out and in again, then: ulimit -r; ulimit -l"
 
 
@@ -34,7 +34,7 @@ def permissions(given: RealTimeReport | None, system: System) -> list[Check]:
 def user(uid: int) -> Check:
     """Nothing of hil needs root, and what root may do says nothing about other users."""
     if uid:
-        return ok(f"{_name()}, not root")
+        return ok(f"number {uid}, not root")
     return warn("root", "# run hil doctor as the user who will run hil")
 
 
@@ -79,7 +79,7 @@ def processor_awake(given: RealTimeReport | None, system: System) -> Check:
     rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
     return warn(
         "/dev/cpu_dma_latency may not be written",
-        _join(),
+        _JOIN,
         f"echo '{rule}' | sudo tee {RULE_FILE}",
         "sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency",
         "# log out and in again, then: ls -l /dev/cpu_dma_latency; groups",
@@ -88,18 +88,7 @@ def processor_awake(given: RealTimeReport | None, system: System) -> Check:
 
 def _limit_lines(item: str, value: str) -> tuple[str, ...]:
     line = f"echo '@{GROUP} - {item} {value}' | sudo tee -a {LIMITS_FILE}"
-    return (_join(), line, _LOG_IN_AGAIN)
-
-
-def _join() -> str:
-    return f"sudo groupadd -f {GROUP} && sudo usermod -aG {GROUP} {_name()}"
-
-
-def _name() -> str:
-    try:
-        return os.environ.get("SUDO_USER") or getpass.getuser()
-    except (OSError, KeyError):
-        return str(os.getuid())
+    return (_JOIN, line, _LOG_IN_AGAIN)
 
 
 BYTES_PER_CYCLE = 400
@@ -128,9 +117,8 @@ class DiskTrial:
 
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     """Room and write time; None stands for a disk that gave no answer in time."""
-    return [disk_write(place, trial)] if trial is None else [
-        disk_space(trial), disk_write(place, trial)
-    ]  # fmt: skip
+    space = [] if trial is None else [disk_space(trial)]
+    return [*space, disk_write(place, trial)]
 
 
 @named("disk space")
@@ -162,12 +150,7 @@ _UNSTATED = "not stated by the kernel"
 
 
 def computer(system: System, *, no_sleep: bool) -> list[Check]:
-    """The processor, the kernel and what lies below them.
-
-    Args:
-        system: the computer.
-        no_sleep: whether an exchange keeps the processor from idle states.
-    """
+    """Processor, kernel and host; `no_sleep` says that an exchange prevents idle states."""
     return [
         clock_source(system),
         governor(system),
@@ -307,20 +290,12 @@ def virtualisation(system: System) -> Check:
 def stolen_share(stat: str, since: str = "") -> float | None:
     """Share of processor time that the host gave to others, from texts of /proc/stat.
 
-    Args:
-        stat: the text now.
-        since: an earlier one; since boot if left out.
+    That of now, and an earlier one; since boot if left out.
     """
-    now, before = _ticks(stat), _ticks(since) or [0] * 8
-    if now is None:
-        return None
+    lines = (re.search(r"^cpu +((?:\d+ +){7}\d+)", text, re.MULTILINE) for text in (stat, since))
+    now, before = ([int(word) for word in line[1].split()] if line else [0] * 8 for line in lines)
     spent = [late - early for late, early in zip(now, before, strict=True)]
     return spent[7] / sum(spent) if sum(spent) > 0 else None
-
-
-def _ticks(stat: str) -> list[int] | None:
-    line = re.search(r"^cpu +((?:\d+ +){7}\d+)", stat, re.MULTILINE)
-    return None if line is None else [int(word) for word in line[1].split()]
 
 
 @named("stolen time while measuring")

@@ -391,14 +391,6 @@ CPU = "/sys/devices/system/cpu"
 C4G = "10.2.12.150"
 FD = CanTable(interface="socketcan", channel="can0", bitrate=1_000_000, data_bitrate=5_000_000)
 BUS = {"/sys/class/net/can0/type": "280", "/sys/class/net/can0/operstate": "up"}
-ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT
-eth0\t00000000\t010200C0\t0003\t0\t0\t0\t00000000\t0\t0\t0
-eth1\t000C020A\t00000000\t0001\t0\t0\t100\t00FFFFFF\t0\t0\t0
-eth2\t000C020A\t00000000\t0001\t0\t0\t200\t00FFFFFF\t0\t0\t0
-"""
-GATEWAY = {"/proc/net/route": ROUTES.replace("eth1", "eth9").replace("000C020A", "00636363")}
-SHARED = {"/proc/net/route": ROUTES.replace("eth0", "eth1")}
-UDP_USERS = "header\n 12: 00000000:03E8 00000000:0000 07 0:0 0:0 0 1000 0 4711 2 0 0\ngarbage\n"
 CHAIN = "table inet filter { chain input { type filter hook input priority 0; policy %s; %s} }"
 UFW = "-P INPUT ACCEPT\n-A INPUT -j ufw-input\n-A ufw-input -p udp -j DROP\n"
 
@@ -423,15 +415,14 @@ def card(**files: str) -> dict[str, str]:
     return {f"/sys/class/net/eth1/{name.replace('__', '/')}": given[name] for name in given}
 
 
-def arp(entry: str) -> dict[str, str]:
-    head = "IP address       HW type     Flags       HW address            Mask     Device\n"
-    return {"/proc/net/arp": f"{head}{entry}\n"}
+def ip(*entries: object) -> dict[str, Answer]:
+    return {"ip": Answer(0, json.dumps(entries))}
 
 
-def rates(nominal: int, data: int | None) -> Answer:
+def rates(nominal: int, data: int | None) -> dict[str, Answer]:
     fast = {"data_bittiming": {"bitrate": data}} if data else {}
     info = {"bittiming": {"bitrate": nominal}, **fast}
-    return Answer(0, json.dumps([{"linkinfo": {"info_kind": "can", "info_data": info}}]))
+    return ip({"linkinfo": {"info_kind": "can", "info_data": info}})
 
 
 Judge = Callable[[System], Check]
@@ -523,7 +514,7 @@ JUDGED = [
         (card(speed="-1", duplex="unknown"), OK, "speed not stated"),
         (card(speed="gibberish"), OK, "speed not stated"),
         (card(wireless__x=""), BAD, "wireless"),
-        (card() | SHARED, WARN, "shared with other traffic"),
+        (card(), WARN, "shared with other traffic", ip({"dst": "default", "dev": "eth1"})),
     ),
     *of(
         lambda s: link.coalescing("eth1", s),
@@ -536,13 +527,11 @@ JUDGED = [
         ({}, OK, "not stated", says(0, "\x00nonsense")),
     ),
     *of(
-        lambda s: link.neighbour_check(C4G, "eth1", link.neighbour(C4G, "eth1", s)),
-        (arp("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth1"), OK, "permanent"),
-        (arp("10.2.12.150 0x1 0x2 00:04:50:00:00:01 * eth1"), WARN, "will expire"),
-        (arp("10.2.12.150 0x1 0x0 00:00:00:00:00:00 * eth1"), WARN, "none"),
-        (arp("10.2.12.150 0x1 0x6 00:04:50:00:00:01 * eth2"), WARN, "none"),
-        (arp("10.2.12.150 0x1 what? 00:04:50:00:00:01 * eth1"), WARN, "none"),
-        (arp(""), WARN, "sudo ip neigh replace 10.2.12.150 lladdr "),
+        lambda s: link.neighbour_check(C4G, "eth1", s),
+        ({}, OK, "permanent", ip({"lladdr": "00:04:50:00:00:01", "state": ["PERMANENT"]})),
+        ({}, WARN, "will expire", ip({"lladdr": "00:04:50:00:00:01", "state": ["STALE"]})),
+        ({}, WARN, "none", ip({"dst": C4G, "state": ["FAILED"]})),
+        ({}, WARN, "sudo ip neigh replace 10.2.12.150 lladdr ", ip()),
     ),
     *of(
         lambda s: link.firewall(C4G, 1000, s),
@@ -566,13 +555,13 @@ JUDGED = [
         (BUS | {"/sys/class/net/can0/type": "1"}, BAD, "is no CAN interface"),
         (BUS | {"/sys/class/net/can0/operstate": "down"}, BAD,
          "bitrate 1000000 dbitrate 5000000 fd on"),
-        (BUS, OK, "5000000", {"ip": rates(1_000_000, 5_000_000)}),
-        (BUS, BAD, "500000", {"ip": rates(500_000, 5_000_000)}),
-        (BUS, BAD, "2000000", {"ip": rates(1_000_000, 2_000_000)}),
-        (BUS, BAD, "1000000", {"ip": rates(1_000_000, None)}),
-        (BUS, UNKNOWN, "not stated", {"ip": Answer(0, "[]")}),
+        (BUS, OK, "5000000", rates(1_000_000, 5_000_000)),
+        (BUS, BAD, "500000", rates(500_000, 5_000_000)),
+        (BUS, BAD, "2000000", rates(1_000_000, 2_000_000)),
+        (BUS, BAD, "1000000", rates(1_000_000, None)),
+        (BUS, UNKNOWN, "not stated", ip()),
         (BUS, UNKNOWN, "not stated", {"ip": Answer(0, "not json")}),
-        (BUS, OK, "virtual bus", {"ip": Answer(0, '[{"linkinfo": {"info_kind": "vcan"}}]')}),
+        (BUS, OK, "virtual bus", ip({"linkinfo": {"info_kind": "vcan"}})),
     ),
     *of(lambda s: link.can_check(CanTable(interface="slcan", channel="/dev/ttyACM0"), s),
         ({}, UNKNOWN, "not a kernel device")),
@@ -616,13 +605,10 @@ def test_nonsense_of_the_kernel_never_stops_the_examination(
     idle = {"cpuidle__state0__latency": text, "cpuidle__state0__disable": text}
     tree.write(processors(2, cpufreq__scaling_governor=text, **idle))
     tree.write(card(speed=text, duplex=text))
-    tree.write(dict.fromkeys(("/proc/net/route", "/proc/net/arp"), f"header\n{text}"))
     names = ("loadavg", "stat", "cpuinfo", "cmdline", "version")
     system = tree.write({f"/proc/{name}": text for name in names}).system()
     checks = [*machine.computer(system, no_sleep=False), machine.load(system)]
     assert all(check.found for check in [*checks, link.device_check("eth1", system)])
-    assert link.route_to(C4G, system) is None
-    assert link.neighbour(C4G, "eth1", system) is None
 
 
 def test_the_preemption_model_is_read_from_the_packed_kernel_configuration(tree: Tree) -> None:
@@ -661,45 +647,35 @@ def test_a_command_that_is_not_there_or_hangs_gives_no_answer(
     assert answer.status == 0
 
 
-class TestRoute:
-    def first(self, tree: Tree, files: dict[str, str], address: str | None = C4G) -> Check:
-        return link.network_checks("c4g", 1000, address, tree.write(files).system())[0]
-
-    def test_the_longest_prefix_then_the_lowest_metric(self, tree: Tree) -> None:
-        system = tree.write({"/proc/net/route": ROUTES}).system()
-        assert link.route_to(C4G, system) == link.Route("eth1", None)
-        assert link.route_to("10.2.13.1", system) == link.Route("eth0", "192.0.2.1", True)
-        assert link.route_to("127.0.0.1", system) == link.Route("lo", None)
-
-    def test_a_gateway_or_none_at_all_is_bad(self, tree: Tree) -> None:
-        check = self.first(tree, GATEWAY)
-        assert check.status is BAD
-        assert "192.0.2.1" in check.found and "10.2.12.149/24" in check.remedy[0]
-        assert self.first(tree, {"/proc/net/route": ""}).found == f"none to {C4G}"
-        assert self.first(tree, {}, None).status is BAD
-
-    def test_an_own_address_is_loopback_and_needs_no_card(self, tree: Tree) -> None:
-        trie = "Local:\n  +-- 10.2.12.0/24\n     |-- 10.2.12.150\n        /32 host LOCAL\n"
-        tree.write({"/proc/net/fib_trie": trie, "/proc/net/route": ROUTES})
-        checks = link.network_checks(C4G, 1000, C4G, tree.system())
-        assert {check.status for check in checks} == {OK}
-
-    def test_a_name_is_looked_up_in_the_hosts_file_and_nowhere_else(self, tree: Tree) -> None:
-        tree.write({"/etc/hosts": "127.0.0.1 localhost\n10.2.12.150 c4g robot # ours\n"})
-        assert link.address_of("robot", tree.system()) == C4G
-        assert link.address_of("ours", tree.system()) is None
+@pytest.mark.parametrize(
+    ("host", "commands", "status", "word"),
+    [
+        (C4G, ip({"dst": C4G, "dev": "eth1"}), OK, "directly on eth1"),
+        ("robot", ip({"dst": C4G, "dev": "eth1"}), OK, C4G),
+        ("ours", ip(), BAD, "nor in /etc/hosts"),
+        (C4G, ip({"dst": C4G, "gateway": "192.0.2.1", "dev": "eth0"}), BAD, "10.2.12.149/24"),
+        (C4G, {"ip": Answer(2, "", "Network is unreachable")}, BAD, f"none to {C4G}"),
+        (C4G, ip({"type": "local", "dst": C4G, "dev": "lo"}), OK, "this PC itself"),
+        (C4G, {}, UNKNOWN, "iproute2"),
+    ],
+)
+def test_the_way_to_the_controller_is_judged(
+    host: str, commands: dict[str, Answer], status: Status, word: str, tree: Tree
+) -> None:
+    """An address of this PC, or a wrong way, needs no card; names come from the hosts file only."""
+    tree.write({"/etc/hosts": "127.0.0.1 localhost\n10.2.12.150 c4g robot # ours\n"})
+    first, *others = link.network_checks(host, 1000, tree.system(**commands))
+    assert first.status is status
+    assert word in "\n".join([first.found, *first.remedy])
+    assert len(others) == (4 if "directly" in first.found else 0)
 
 
-class TestPort:
-    def test_its_owner_is_named(self, tree: Tree) -> None:
-        tree.write({"/proc/net/udp": UDP_USERS, "/proc/42/comm": "orchestra\n"})
-        folder = tree.root / "proc/42/fd"
-        folder.mkdir()
-        (folder / "3").symlink_to("/dev/null")
-        (folder / "4").symlink_to("socket:[4711]")
-        found = link.port_check("", 1000, errno.EADDRINUSE, tree.system()).found
-        assert "orchestra (process 42)" in found
+def test_who_has_the_port_is_named(tree: Tree) -> None:
+    who = Answer(0, 'UNCONN 0 0 0.0.0.0:1000 0.0.0.0:* users:(("orchestra",pid=42,fd=4))\n')
+    found = link.port_check("", 1000, errno.EADDRINUSE, tree.system(ss=who)).found
+    assert "orchestra (process 42)" in found
 
-    def test_it_is_tried(self) -> None:
-        assert link.try_port("127.0.0.1", 0) == 0
-        assert link.try_port("192.0.2.77", 0) == errno.EADDRNOTAVAIL
+
+def test_a_port_is_tried() -> None:
+    assert link.try_port("127.0.0.1", 0) == 0
+    assert link.try_port("192.0.2.77", 0) == errno.EADDRNOTAVAIL
