@@ -1,10 +1,7 @@
 """The one screen of a run: what is shown of it, the keys of its person, and plain lines elsewhere.
 
-What it looks like is a pure function of what is known and how much room there is (`lines`). Eighty
-columns and twenty-four lines hold everything of a six-joint arm; with less room, bars get shorter,
-then go; the last events go before the drift curve, that before the joints. It is drawn by a thread
-of its own: a terminal that takes nothing more (a connection that broke, a pipe that is full) delays
-neither the motion nor a stop.
+What it looks like is a pure function of what is known and how much room there is (`lines`). It is
+shown by a thread of its own: a terminal that takes nothing more delays neither motion nor stop.
 """
 
 from __future__ import annotations
@@ -23,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final, Literal, TextIO
 
 import numpy as np
@@ -40,10 +38,8 @@ from hil.terminal_text import plural, printable
 # --- keys
 
 STEP: Final = 0.1
-"""Of override, per key."""
-LEAST: Final = 0.1
-"""Override that keys go down to; to rest, there is the hold."""
-LONGEST_TYPED: Final = 3
+"""Of override, per key, and the least of it; to rest, there is the hold."""
+_LONGEST_TYPED: Final = 3
 """Keys that come at once from a person; more of them are pasted, and make nothing faster."""
 HELP: Final = "h hold   space resume   s stop   + - override   1…9: 10…90 %   0: 100 %"
 SHORT_HELP: Final = "h hold  r resume  s stop  + - 1…0 %"
@@ -75,23 +71,17 @@ def typed(chunk: str) -> str:
     keys = _AFTER_ESCAPE.sub(
         lambda found: found[1] if urgent(found[1]) else "\x1b", _SEQUENCES.sub("", chunk)
     )
-    return keys if len(keys) <= LONGEST_TYPED else "".join(filter(urgent, keys))
+    return keys if len(keys) <= _LONGEST_TYPED else "".join(filter(urgent, keys))
 
 
 def after(request: OperatorRequest, key: str, override: float) -> OperatorRequest:
-    """The request after a key.
-
-    Args:
-        request: before it.
-        key: one character.
-        override: of the motion that is going on; it may be below what is requested.
-    """
+    """The request after a key; the `override` of a motion may be below what is requested."""
     action = _ACTIONS.get(key)
     if action in ("hold", "resume"):
         return replace(request, held=action == "hold")
     if key in "+=-_":
         tenths = round((override + (STEP if key in "+=" else -STEP)) / STEP)
-        return replace(request, override=min(1.0, max(LEAST, tenths * STEP)))
+        return replace(request, override=min(1.0, max(STEP, tenths * STEP)))
     if key.isascii() and key.isdigit():
         return replace(request, override=(int(key) or 10) * STEP)
     return request
@@ -128,7 +118,7 @@ def single_keys(fd: int) -> Iterator[None]:
 
 
 class Keyboard:
-    """Reads keys of the terminal in a thread of its own; a context manager.
+    """Reads keys of the terminal in a thread of its own.
 
     Attributes:
         attached: whether keys are read; not where standard input is no terminal.
@@ -137,29 +127,32 @@ class Keyboard:
 
     def __init__(self, take: Callable[[str], None]) -> None:
         self._take = take
-        self._undo = contextlib.ExitStack()
-        self._over = threading.Event()
+        self.over = threading.Event()
         self.attached = False
         self.failure: Exception | None = None
 
-    def __enter__(self) -> Keyboard:
-        if can_read(sys.stdin):
-            fd = sys.stdin.fileno()
-            self._undo.enter_context(single_keys(fd))
-            thread = threading.Thread(target=self._read, args=(fd,), daemon=True)
-            self._undo.callback(thread.join)
-            self._undo.callback(self._over.set)
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read meanwhile, where somebody can type."""
+        if not can_read(sys.stdin):
+            yield
+            return
+        fd = sys.stdin.fileno()
+        thread = threading.Thread(target=self.read, args=(fd,), daemon=True)
+        with single_keys(fd):
             self.attached = True
             thread.start()
-        return self
+            try:
+                yield
+            finally:
+                self.over.set()
+                thread.join()
+                self.attached = False
 
-    def __exit__(self, *_: object) -> None:
-        self._undo.close()
-        self.attached = False
-
-    def _read(self, fd: int) -> None:
+    def read(self, fd: int) -> None:
+        """Pass on what is typed until it is over, or the terminal is gone."""
         try:
-            while not self._over.is_set():
+            while not self.over.is_set():
                 if select.select([fd], [], [], _LOOK)[0]:
                     for key in typed(_chunk(fd).decode(errors="replace")):
                         self._take(key)
@@ -168,11 +161,7 @@ class Keyboard:
 
 
 def _chunk(fd: int) -> bytes:
-    """What a terminal sent at once.
-
-    Raises:
-        EOFError: it is gone.
-    """
+    """What a terminal sent at once. Raises EOFError where it is gone."""
     chunk = os.read(fd, _CHUNK)
     if not chunk:
         raise EOFError("the terminal is gone")
@@ -191,11 +180,8 @@ WIDE: Final = 64
 STALE: Final = 1.0
 """s without news after which the screen says so."""
 SIMULATED: Final = "SIMULATED"
-"""What the first line says where nothing but a simulated arm can move."""
-_LEAST_TITLE: Final = 8
-"""Columns of the title that stay whatever stands behind it."""
-_NUMBERS: Final = 28
-"""Columns of a joint's numbers beside its name and bars."""
+_LEAST_TITLE: Final = 8  # columns
+_NUMBERS: Final = 28  # columns of a joint beside its name and bars
 _HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 WARNING: Final = 0.8
 """Share of a limit from which on it is coloured."""
@@ -259,7 +245,7 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
     left = room - len(body) - 1
     if left > 0 and rows:
         body += [Text(), *(Text(row, style="dim") for row in rows[-left:])]
-    keys = next((text for text in (HELP, SHORT_HELP) if len(text) <= width), "h ␣ s + - 1…0")
+    keys = HELP if len(HELP) <= width else SHORT_HELP
     help_ = Text((keys if shown.keys else "Ctrl-C stops on the path").ljust(width), style="reverse")
     screen = [*head, *body, *[Text()] * max(0, room - len(body)), help_][:height]
     for line in screen:
@@ -283,20 +269,15 @@ def status_line(status: RunStatus, left: str = "") -> str:
             parts.append(f"{motion.untaken} not accepted")
         if motion.latency is not None:
             parts.append(f"latency {duration(motion.latency.p99)} (99 %)")
-        if motion.following_share is not None:
-            parts.append(
-                f"following error {100.0 * motion.following_share.max():.0f} % of its limit"
-            )
-        if motion.current_share is not None:
-            parts.append(f"current {100.0 * motion.current_share.max():.0f} % of its limit")
-    drift = status.drift
-    if drift is not None and len(drift.change) > 1:
-        parts.append(
-            f"friction changed by {100.0 * drift.change[-1]:.1f} % "
-            f"(warm below {100.0 * drift.threshold:g} %)"
-        )
-    parts.append(left or f"{clock(status.time_left)} left")
-    return ", ".join(parts)
+        shares = {"following error": motion.following_share, "current": motion.current_share}
+        parts += [
+            f"{what} {100.0 * share.max():.0f} % of its limit"
+            for what, share in shares.items()
+            if share is not None
+        ]
+    if status.drift is not None and len(status.drift.change) > 1:
+        parts.append(_drift_words(status.drift))
+    return ", ".join([*parts, left or f"{clock(status.time_left)} left"])
 
 
 def _heading(shown: Shown, width: int) -> Text:
@@ -319,7 +300,6 @@ def _heading(shown: Shown, width: int) -> Text:
 
 
 def _bar_of_motion(motion: MotionProgress | None, width: int) -> Text:
-    """How far the motion is."""
     if motion is None:
         return Text("nothing moves", style="dim")
     if motion.motion_time is None or not motion.duration:
@@ -329,12 +309,11 @@ def _bar_of_motion(motion: MotionProgress | None, width: int) -> Text:
     if room < 10:
         return Text(times)
     filled = round(room * min(1.0, motion.motion_time / motion.duration))
-    text = Text("━" * filled, style="cyan").append("─" * (room - filled), style="dim")
-    return Text().append_text(text).append(f" {times}")
+    parts = ("━" * filled, "cyan"), ("─" * (room - filled), "dim"), f" {times}"
+    return Text.assemble(*parts)
 
 
 def _state(shown: Shown, motion: MotionProgress | None, width: int) -> Text:
-    """Whether it moves, and how fast."""
     text = Text()
     if shown.stopping:
         text.append(" STOPPING ", style="bold red reverse").append("  ")
@@ -353,11 +332,9 @@ def _state(shown: Shown, motion: MotionProgress | None, width: int) -> Text:
 
 
 def _health(motion: MotionProgress | None, width: int) -> Text:
-    """Regularity of the cycle."""
-    text = Text().append("cycles ", style="bold")
     if motion is None:
-        return text.append("-", style="dim")
-    text.append(f"{motion.cycles}")
+        return Text.assemble(("cycles ", "bold"), ("-", "dim"))
+    text = Text.assemble(("cycles ", "bold"), f"{motion.cycles}")
     for count, what in (
         (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not accepted")
     ):  # fmt: skip
@@ -398,15 +375,17 @@ def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> 
 
 
 def _drift(drift: DriftCurve, width: int) -> Text:
-    """Friction from motion to motion while the joints warm up."""
     known = [float(value) for value in drift.change if np.isfinite(value)]
-    text = Text("warm-up: friction changed by ")
     if not known:
-        return text.append("… (one motion so far)")
+        return Text("warm-up: one motion so far")
     style = "green" if known[-1] < drift.threshold else "yellow"
-    text.append(f"{100.0 * known[-1]:.1f} %", style=style)
-    text.append(f", warm below {100.0 * drift.threshold:g} %  ")
+    text = Text.assemble("warm-up: ", (_drift_words(drift), style), "  ")
     return text.append(curve(known, max(0, width - text.cell_len)), style="cyan")
+
+
+def _drift_words(drift: DriftCurve) -> str:
+    change, threshold = 100.0 * drift.change[-1], 100.0 * drift.threshold
+    return f"friction changed by {change:.1f} % (warm below {threshold:g} %)"
 
 
 def bar(share: float, width: int) -> Text:
@@ -467,13 +446,7 @@ _BETWEEN: Final = 0.6
 
 
 class Pace:
-    """Waiting time per second of motion, and between two motions.
-
-    Between two motions the drives go off and on, an archive is closed and a repetition judged.
-
-    Args:
-        virtual: whether the controller's time is virtual; else a second of motion takes one.
-    """
+    """Waiting time per second of motion, which is one unless time is virtual, and between two."""
 
     def __init__(self, *, virtual: bool) -> None:
         self._virtual = virtual
@@ -521,9 +494,6 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
     """Show what was measured and wait for an answer; only "yes" accepts.
 
     Where torques contradict the model, only the names of the joints concerned do.
-
-    A stop asked for meanwhile is a refusal. It is looked for while nothing is typed, so that the
-    heartbeat of a real link goes on and Ctrl-C needs no answer.
     """
     table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
     table.add_column("joint")
@@ -556,7 +526,10 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
 
 
 def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
-    """Ask, and wait for an answer: whether it is the word. A stop asked for is a refusal."""
+    """Ask, and wait for an answer: whether it is the word. A stop asked for is a refusal.
+
+    It is looked for while nothing is typed: the heartbeat of a real link goes on meanwhile.
+    """
     console.print(question, end="", markup=False, highlight=False)
     sys.stdout.flush()
     with contextlib.suppress(termios.error):  # what was typed before the question is no answer
@@ -570,16 +543,11 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 
 # --- the screen
 
-REFRESH_PERIOD: Final = 0.1
-"""s between two pictures."""
-LINE_EVERY: Final = 5.0
-"""s between two lines where there is no terminal."""
-FAREWELL: Final = 0.5
-"""s that a terminal may take for the last picture."""
-NEWEST: Final = 8
-"""Of the lines said meanwhile that are shown."""
-REMEMBERED: Final = 200
-"""Lines said meanwhile that are left on the terminal at the end."""
+REFRESH_PERIOD: Final = 0.1  # s between two pictures
+LINE_EVERY: Final = 5.0  # s between two lines where there is no terminal
+FAREWELL: Final = 0.5  # s that a terminal may take for the last picture
+NEWEST, REMEMBERED = 8, 200
+"""Lines said meanwhile that are shown, and that are left on the terminal at the end."""
 
 
 def far_end_of(cell: Cell) -> str:
@@ -590,46 +558,6 @@ def far_end_of(cell: Cell) -> str:
     if table.transport == "can" and table.can is not None:
         return f"{table.can.interface}:{table.can.channel}"
     return table.host
-
-
-class _LinesDisplay:
-    """A line now and then, and one for whatever begins."""
-
-    def __init__(self, console: Console, unsaid: deque[str]) -> None:
-        self._console, self._unsaid = console, unsaid
-        self._due = 0.0
-        self._at: tuple[str, int] | None = None
-
-    def draw(self, shown: Shown) -> None:
-        """Print what is new."""
-        self.close()
-        status = shown.status
-        if status is None or shown.age > LINE_EVERY:
-            return
-        at = (status.phase, status.number)
-        if at != self._at or time.monotonic() >= self._due:
-            self._at, self._due = at, time.monotonic() + LINE_EVERY
-            put(self._console, status_line(status, shown.left))
-
-    def close(self) -> None:
-        """Print what was said last."""
-        while self._unsaid:
-            put(self._console, self._unsaid.popleft())
-
-
-class _PageDisplay:
-    """A terminal's other page, so that the shell's own lines come back at the end."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, screen=True, auto_refresh=False)
-        self._live.start()
-        self.close = self._live.stop
-
-    def draw(self, shown: Shown) -> None:
-        """Show it at the size the terminal has now."""
-        width, height = self._console.size
-        self._live.update(Group(*lines(shown, width, height)), refresh=True)
 
 
 class ScreenError(RuntimeError):
@@ -675,6 +603,8 @@ class Screen:
         self._slow_phase = False
         self._keyboard: Keyboard | None = None
         self._undrawn: Exception | None = None
+        self._line_of: tuple[str, int] | None = None
+        self._line_due = 0.0
 
     @classmethod
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
@@ -795,19 +725,23 @@ class Screen:
         self._undrawn = self._keyboard = None
         if self._quiet:
             return
-        display: _PageDisplay | _LinesDisplay = _LinesDisplay(self._console, self._said)
+        display, end = self._print_line, self._print_said
         if self._full:
-            self._keyboard = self._undo.enter_context(Keyboard(self.press))
-            display = _PageDisplay(self._console)
+            self._keyboard = Keyboard(self.press)
+            self._undo.enter_context(self._keyboard.reading())
+            # A terminal's other page, so that the shell's own lines come back at the end.
+            live = Live(console=self._console, screen=True, auto_refresh=False)
+            live.start()
+            display, end = partial(self._draw_page, live), live.stop
 
         def draw() -> None:
             try:
                 while not over.wait(REFRESH_PERIOD):
-                    display.draw(self.shown())
+                    display(self.shown())
             except Exception as error:  # it shows nothing more, and `show` says why
                 self._undrawn = error
             with contextlib.suppress(Exception):
-                display.close()
+                end()
 
         thread = threading.Thread(target=draw, name="screen", daemon=True)
         thread.start()
@@ -818,6 +752,24 @@ class Screen:
             self._stuck = thread.is_alive()
 
         self._undo.callback(close)
+
+    def _draw_page(self, live: Live, shown: Shown) -> None:
+        live.update(Group(*lines(shown, *self._console.size)), refresh=True)
+
+    def _print_line(self, shown: Shown) -> None:
+        """Print what is new: a line now and then, and one for whatever begins."""
+        self._print_said()
+        status = shown.status
+        if status is None or shown.age > LINE_EVERY:
+            return
+        at = (status.phase, status.number)
+        if at != self._line_of or time.monotonic() >= self._line_due:
+            self._line_of, self._line_due = at, time.monotonic() + LINE_EVERY
+            put(self._console, status_line(status, shown.left))
+
+    def _print_said(self) -> None:
+        while self._said:
+            put(self._console, self._said.popleft())
 
     def _leave_what_was_said(self) -> None:
         """Print it on the shell's page, unless the terminal takes nothing any more."""

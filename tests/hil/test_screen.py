@@ -95,7 +95,7 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
     for words in (
         "ns16-october", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
         "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not accepted",
-        "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 %", "warm below 2 %",
+        "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 % (warm below 2 %)",
         "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
         "h hold", "space resume", "s stop", "+ - override",
     ):  # fmt: skip
@@ -459,7 +459,7 @@ def test_keys_that_are_cut_in_two_are_put_together(monkeypatch: pytest.MonkeyPat
     near, far = pty.openpty()
     pressed: list[str] = []
     keyboard = Keyboard(pressed.append)
-    reader = threading.Thread(target=keyboard._read, args=(far,))
+    reader = threading.Thread(target=keyboard.read, args=(far,))
     before = termios.tcgetattr(far)
     with single_keys(far):
         reader.start()
@@ -469,7 +469,7 @@ def test_keys_that_are_cut_in_two_are_put_together(monkeypatch: pytest.MonkeyPat
         until = time.monotonic() + 5.0
         while "s" not in pressed and time.monotonic() < until:
             time.sleep(0.01)
-        keyboard._over.set()
+        keyboard.over.set()
         reader.join()
     assert pressed == ["s"]
     assert termios.tcgetattr(far) == before
@@ -486,7 +486,7 @@ def test_keys_that_are_not_read_any_more_are_reported(what: str) -> None:
     if what == "a key that fails":
         os.write(far, b"h")
     os.close(far)
-    keyboard._read(near)
+    keyboard.read(near)
     os.close(near)
     assert not keyboard.attached
     with pytest.raises(ScreenError, match=r"no key|terminal is gone"):
