@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -45,6 +47,35 @@ ConventionOption = Annotated[
         "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
     ),
 ]
+
+
+Command = Callable[..., None]
+
+
+def with_options(
+    group: Callable[..., Any], to: str, *, but: Sequence[str] = ()
+) -> Callable[[Command], Command]:
+    """Give a command the fields of a dataclass as options, `but` some; it receives them as `to`."""
+    options = {**inspect.signature(group, eval_str=True).parameters}
+    for name in but:
+        del options[name]
+
+    def decorate(command: Command) -> Command:
+        parameters: dict[str, inspect.Parameter] = {}
+        for name, one in inspect.signature(command, eval_str=True).parameters.items():
+            parameters |= options if name == to else {name: one}
+
+        @wraps(command)
+        def run(**given: Any) -> None:
+            typed = {name: given.pop(name) for name in options}
+            command(**given, **{to: group(**typed)})
+
+        keyword = [one.replace(kind=one.KEYWORD_ONLY) for one in parameters.values()]
+        run.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
+        run.__annotations__ = {name: one.annotation for name, one in parameters.items()}
+        return run
+
+    return decorate
 
 
 def at_most_one(**given: object) -> None:

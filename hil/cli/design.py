@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import os
 import shlex
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Literal
 
 import typer
@@ -306,12 +304,6 @@ def _campaign(
 @contextmanager
 def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
     """Turn Ctrl-C and SIGTERM into a request to stop; a second one leaves with a sentence."""
-
-    def terminated(signum: int, frame: FrameType | None) -> None:
-        del signum, frame
-        signal.raise_signal(signal.SIGINT)
-
-    previous = signal.signal(signal.SIGTERM, terminated)
     try:
         with stop_on_interrupt() as stop:
             yield stop
@@ -319,5 +311,3 @@ def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
         raise OperatorStopError(
             f"left at once; what was scored is in {folder.journal}; go on with --resume"
         ) from None
-    finally:
-        signal.signal(signal.SIGTERM, previous)

@@ -7,8 +7,14 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, print_json
-from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
+from hil.cli.arguments import (
+    ArchivesArgument,
+    JsonOption,
+    QuietOption,
+    print_json,
+    with_options,
+)
+from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.cli.verdict import NOT_GOOD
 from hil.exporting import FormatName, default_output, export_model
 from hil.identify import identify_sources
@@ -16,6 +22,7 @@ from hil.progress import reporter as make_reporter
 from hil.progress import say
 
 
+@with_options(Identifying, "how", but=FEW)
 def export(
     archives: ArchivesArgument,
     to: Annotated[FormatName, typer.Option()],
@@ -23,8 +30,8 @@ def export(
     ensemble: Annotated[int, typer.Option(min=0, max=10000)] = 0,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     estimator: EstimatorOption = "auto",
-    friction: FrictionOption = "auto",
-    delay: DelayOption = None,
+    *,
+    how: Identifying,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -45,8 +52,7 @@ def export(
         seed: Of the variants.
     """
     reporter = make_reporter(quiet=quiet or json)
-    options = options_from(estimator=estimator, friction=friction, delay=delay)
-    found = identify_sources(archives, reporter, options)
+    found = identify_sources(archives, reporter, how.options(estimator=estimator))
     target = output or default_output(archives, to)
     exported = export_model(found, target, to, ensemble=ensemble, seed=seed)
     if json:

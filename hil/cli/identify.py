@@ -8,17 +8,8 @@ from typing import Annotated
 import typer
 
 from hil.annotating import annotate as write_annotated
-from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption
-from hil.cli.identify_options import (
-    BandwidthOption,
-    DelayOption,
-    EstimatorOption,
-    FrictionOption,
-    StandstillOption,
-    TorqueBandwidthOption,
-    VelocityOption,
-    options_from,
-)
+from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, with_options
+from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.verdict import finish
 from hil.errors import InputError
 from hil.files import make_folder
@@ -27,6 +18,7 @@ from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 
 
+@with_options(Identifying, "how")
 def identify(
     archives: ArchivesArgument,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
@@ -35,12 +27,8 @@ def identify(
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     in_sample: bool = False,
     estimator: EstimatorOption = "auto",
-    bandwidth: BandwidthOption = "auto",
-    velocity: VelocityOption = "auto",
-    friction: FrictionOption = "auto",
-    standstill: StandstillOption = "auto",
-    delay: DelayOption = None,
-    torque_bandwidth: TorqueBandwidthOption = "auto",
+    *,
+    how: Identifying,
     annotate: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -64,18 +52,8 @@ def identify(
             third JointState channel, into the folder annotated of OUTPUT.
     """
     reporter = make_reporter(quiet=quiet or json)
-    options = options_from(
-        method="paper" if paper else "default",
-        split=split,
-        delay=delay,
-        torque_bandwidth=torque_bandwidth,
-        estimator=estimator,
-        bandwidth=bandwidth,
-        velocity=velocity,
-        friction=friction,
-        standstill=standstill,
-        in_sample=in_sample,
-    )
+    method = "paper" if paper else "default"
+    options = how.options(method=method, split=split, in_sample=in_sample, estimator=estimator)
     if len(archives) == 1 and archives[0].is_dir():
         output = output or (archives[0] / "paper" if paper else archives[0])
     if output is not None:

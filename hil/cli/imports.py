@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -16,13 +18,13 @@ from hil.cli.arguments import (
     exactly_one,
     figures,
     print_json,
+    with_options,
 )
 from hil.errors import InputError
 from hil.identify.options import FRICTION_TERMS, friction_from
 from hil.importers import (
     STANDARD_GRAVITY,
     ColumnMap,
-    Convention,
     Effort,
     Robot,
     Use,
@@ -35,8 +37,6 @@ from hil.progress import say
 from hil.terminal_text import printable
 from identification import FrictionLaw
 
-FRICTION = "coulomb,viscous,offset"
-
 app = typer.Typer(
     help="Turn other people's recordings into archives that `hil identify` reads.",
     no_args_is_help=True,
@@ -44,40 +44,6 @@ app = typer.Typer(
 
 Source = Annotated[Path, typer.Argument(help="The recording.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="The archive to write (*.mcap).")]
-Urdf = Annotated[Path | None, typer.Option(help="URDF of the robot.")]
-CellFile = Annotated[
-    Path | None, typer.Option(help="A cell file instead of --urdf and --friction.")
-]
-Gravity = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(
-        metavar="X Y Z",
-        help="Gravity in the robot's base frame, m/s², for an arm on a wall, a ceiling or a slope: "
-        "0 0 9.81 for one that hangs upside down; 0 0 0 if the torques are without gravity "
-        "already. As of an upright arm, or as the cell says, if left out.",
-    ),
-]
-Friction = Annotated[
-    str, typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them.")
-]
-Standstill = Annotated[
-    float, typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted.")
-]
-Locked = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), held "
-        "there (at 0); may be repeated."
-    ),
-]
-LockOthers = Annotated[
-    bool,
-    typer.Option(
-        help="Lock every joint of the URDF that was not recorded, at 0 or at the middle of a "
-        "range without 0; the command says which. A log names those that were recorded in `joints` "
-        "of its map."
-    ),
-]
 Held = Annotated[
     list[str] | None,
     typer.Option(help="A joint known to have stood still; may be repeated."),
@@ -91,22 +57,88 @@ Kind = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class Described:
+    """What describes the robot of a recording, as it is typed."""
+
+    urdf: Annotated[Path | None, typer.Option(help="URDF of the robot.")] = None
+    cell: Annotated[
+        Path | None, typer.Option(help="A cell file instead of --urdf and --friction.")
+    ] = None
+    dh: DhOption = None
+    convention: ConventionOption = None
+    gravity: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="Gravity in the robot's base frame, m/s², for an arm on a wall, a ceiling or a "
+            "slope: 0 0 9.81 for one that hangs upside down; 0 0 0 if the torques are without "
+            "gravity already. As of an upright arm, or as the cell says, if left out.",
+        ),
+    ] = None
+    friction: Annotated[
+        str,
+        typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them."),
+    ] = "coulomb,viscous,offset"
+    standstill: Annotated[
+        float, typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted.")
+    ] = 0.01
+    locked: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), "
+            "held there (at 0); may be repeated."
+        ),
+    ] = None
+    lock_others: Annotated[
+        bool,
+        typer.Option(
+            help="Lock every joint of the URDF that was not recorded, at 0 or at the middle of a "
+            "range without 0; the command says which. A log names those that were recorded in "
+            "`joints` of its map."
+        ),
+    ] = False
+
+    def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
+        """The robot of a cell file, a URDF or a DH table; `recorded` gives joints of a recording.
+
+        Raises:
+            InputError: not exactly one of these was named, or a figure cannot be used.
+        """
+        exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
+        if self.gravity is not None and not all(map(math.isfinite, self.gravity)):
+            problem, remedy = f"{self.gravity} is no vector", "give m/s², as in 0 0 -9.81"
+            raise InputError(None, problem, field="--gravity", remedy=remedy)
+        if not math.isfinite(self.standstill):
+            problem, remedy = f"{self.standstill} is no speed", "give rad/s, as in 0.01"
+            raise InputError(None, problem, field="--standstill", remedy=remedy)
+        at = figures(self.locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
+        joints = recorded() if self.lock_others else None
+        if self.cell is not None:
+            return Robot.from_cell(self.cell, gravity=self.gravity, locked=at, recorded=joints)
+        path = self.urdf or self.dh
+        assert path is not None
+        law = {**friction_from(self.friction), "standstill": self.standstill}
+        return Robot.from_urdf(
+            path,
+            convention=None if self.dh is None else convention_of(self.convention),
+            friction=FrictionLaw.from_table(law),
+            gravity=self.gravity or STANDARD_GRAVITY,
+            locked=at,
+            recorded=joints,
+        )
+
+
 @app.command("rosbag2")
+@with_options(Described, "arm")
 def rosbag2(
     source: Source,
     output: Output,
-    urdf: Urdf = None,
-    cell: CellFile = None,
-    dh: DhOption = None,
-    convention: ConventionOption = None,
-    gravity: Gravity = None,
-    friction: Friction = FRICTION,
-    standstill: Standstill = 0.01,
+    *,
+    arm: Described,
     topic: str | None = None,
     effort: Effort = "torque",
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
-    locked: Locked = None,
-    lock_others: LockOthers = False,
     held: Held = None,
     kind: Kind = "excitation",
     json: JsonOption = False,
@@ -124,14 +156,11 @@ def rosbag2(
         effort: What the effort field holds: torque (N·m), motor_current (A) or ignore.
         rename: A joint that the bag calls by another name than the URDF; may be repeated.
     """
-    exactly_one(urdf=urdf, cell=cell, dh=dh)
     names = _names(rename or [])
-    recorded = recorded_joints(source, topic, names) if lock_others else None
-    table = None if dh is None else convention_of(convention)
     path = import_rosbag2(
         source,
         output,
-        robot=_robot(urdf or dh, cell, table, gravity, friction, standstill, locked, recorded),
+        robot=arm.robot(lambda: recorded_joints(source, topic, names)),
         topic=topic,
         effort=effort,
         joint_names=names,
@@ -141,19 +170,13 @@ def rosbag2(
     _tell(path, json=json)
 
 
+@with_options(Described, "arm")
 def log(
     source: Source,
     output: Output,
     columns: Annotated[Path, typer.Option("--map")],
-    urdf: Urdf = None,
-    cell: CellFile = None,
-    dh: DhOption = None,
-    convention: ConventionOption = None,
-    gravity: Gravity = None,
-    friction: Friction = FRICTION,
-    standstill: Standstill = 0.01,
-    locked: Locked = None,
-    lock_others: LockOthers = False,
+    *,
+    arm: Described,
     held: Held = None,
     kind: Kind = "excitation",
     uncoupled: bool = False,
@@ -173,21 +196,22 @@ def log(
         uncoupled: Leave the inertias and the friction of coupled motors out of the model, to see
             what they explain; angles and torques stay those of the map.
     """
-    exactly_one(urdf=urdf, cell=cell, dh=dh)
     found = ColumnMap.load(columns)
-    if lock_others and found.joints is None:
-        raise InputError(
-            columns,
-            "does not say which joints were recorded",
-            field="joints",
-            remedy="--lock-others needs joints = [...], the URDF's joint of each column",
-        )
-    recorded = found.joints if lock_others else None
-    table = None if dh is None else convention_of(convention)
+
+    def recorded() -> tuple[str, ...]:
+        if found.joints is None:
+            raise InputError(
+                columns,
+                "does not say which joints were recorded",
+                field="joints",
+                remedy="--lock-others needs joints = [...], the URDF's joint of each column",
+            )
+        return found.joints
+
     path = import_log(
         source,
         output,
-        robot=_robot(urdf or dh, cell, table, gravity, friction, standstill, locked, recorded),
+        robot=arm.robot(recorded),
         columns=found,
         held_joints=held or (),
         use=kind,
@@ -215,40 +239,6 @@ def _tell(path: Path, *, json: bool) -> None:
     for warning in found.warnings:
         typer.secho(printable(f"warning: {warning}"), fg=typer.colors.YELLOW)
     say(f"wrote {path}")
-
-
-def _robot(
-    path: Path | None,
-    cell: Path | None,
-    convention: Convention | None,
-    gravity: tuple[float, float, float] | None,
-    friction: str,
-    standstill: float,
-    locked: list[str] | None,
-    recorded: tuple[str, ...] | None,
-) -> Robot:
-    """The robot of a cell file, else of `path`: a URDF, or with a convention a DH table."""
-    if gravity is not None and not all(map(math.isfinite, gravity)):
-        raise InputError(
-            None, f"{gravity} is no vector", field="--gravity", remedy="give m/s², as in 0 0 -9.81"
-        )
-    if not math.isfinite(standstill):
-        raise InputError(
-            None, f"{standstill} is no speed", field="--standstill", remedy="give rad/s, as in 0.01"
-        )
-    at = figures(locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
-    law = FrictionLaw.from_table({**friction_from(friction), "standstill": standstill})
-    if cell is not None:
-        return Robot.from_cell(cell, gravity=gravity, locked=at, recorded=recorded)
-    assert path is not None
-    return Robot.from_urdf(
-        path,
-        convention=convention,
-        friction=law,
-        gravity=STANDARD_GRAVITY if gravity is None else gravity,
-        locked=at,
-        recorded=recorded,
-    )
 
 
 def _names(renamed: list[str]) -> dict[str, str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from json import dumps as json_text
-from math import isfinite, radians
+from math import isfinite, nan, radians
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -88,8 +89,7 @@ def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
     """Return what a planning function returns, called where the solver may crash.
 
     Raises:
-        InputError: it crashed, or did not come to an end.
-        Exception: whatever the function itself raised.
+        InputError: it crashed, or did not come to an end; else whatever the function raised.
     """
     try:
         return in_child(function, *args, **kwargs)
@@ -110,48 +110,32 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     Raises:
         InputError: a row is not one finite number per joint.
     """
-    points: list[list[float]] = []
-    first = True
     # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
-    text = named_text(path).removeprefix("\ufeff")
-    for number, line in enumerate(text.splitlines(), 1):
-        cells = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if not cells:
-            continue
-        numbers = [_number(cell) for cell in cells]
-        names, first = first and not any(value is not None for value in numbers), False
-        if names:
-            continue
-        row = [value for value in numbers if value is not None and isfinite(value)]
-        for place, value in enumerate(numbers, 1):
-            if value is None or not isfinite(value):
-                raise InputError(
-                    path,
-                    f"{cells[place - 1]!r} is no finite number",
-                    field=f"line {number}, cell {place}",
-                    remedy="write an angle in degrees",
-                )
-        if len(row) != frame.sign.size:
-            raise InputError(
-                path,
-                f"{len(row)} values",
-                field=f"line {number}",
-                remedy=f"write one angle in degrees for each of the {frame.sign.size} joints",
-            )
-        points.append(row)
-    if len(points) < 2:
-        raise InputError(
-            path, f"{len(points)} via points", remedy="a motion needs a start and a target"
-        )
-    return frame.urdf(np.array(points))
+    lines = enumerate(named_text(path).removeprefix("\ufeff").splitlines(), 1)
+    rows = [(k, re.split(r"[\s,;]+", line.split("#")[0].strip(" \t,;"))) for k, line in lines]
+    rows = [(number, cells) for number, cells in rows if cells != [""]]
+    if rows and not any(map(isfinite, map(_number, rows[0][1]))):
+        del rows[0]
+    remedy = f"write one angle in degrees for each of the {frame.sign.size} joints"
+    for number, cells in rows:
+        for place, cell in enumerate(cells, 1):
+            if not isfinite(_number(cell)):
+                field = f"line {number}, cell {place}"
+                raise InputError(path, f"{cell!r} is no finite number", field=field, remedy=remedy)
+        if len(cells) != frame.sign.size:
+            raise InputError(path, f"{len(cells)} values", field=f"line {number}", remedy=remedy)
+    if len(rows) < 2:
+        remedy = "a motion needs a start and a target"
+        raise InputError(path, f"{len(rows)} via points", remedy=remedy)
+    return frame.urdf(np.array([[*map(_number, cells)] for _, cells in rows]))
 
 
-def _number(cell: str) -> float | None:
-    """The number in a cell, or None; Python's own `1_000` is no number of a table."""
+def _number(cell: str) -> float:
+    """The number in a cell, or NaN; Python's own `1_000` is no number of a table."""
     try:
-        return None if "_" in cell else float(cell)
+        return nan if "_" in cell else float(cell)
     except ValueError:
-        return None
+        return nan
 
 
 _RATES = ("velocity", "acceleration", "jerk")
@@ -279,27 +263,24 @@ def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:
 def _table(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> str:
     width = max(9, *(len(name) + 1 for name in cell.joint_names))
     heads = "".join(f"{name:>{width}}" for name in cell.joint_names)
+    degrees = f"{'deg':>{width}}" * len(cell.joint_names)
     lines = [
         f"{'target':>6}{heads}{'time':>9}{'distance':>10}  passed",
-        f"{'':6}{''.join(f'{unit:>{width}}' for unit in ['deg'] * len(cell.joint_names))}"
-        f"{'s':>9}{'deg':>10}",
+        f"{'':6}{degrees}{'s':>9}{'deg':>10}",
     ]
-    rows = [(plan.start, 0.0, 0.0, "start")] + [
-        (
-            move.target,
-            target.time,
-            float(np.degrees(target.distance)),
-            target.how if target.how == "stopped" else f"{target.how}, fly {target.fly:.0%}",
-        )
-        for move, target in zip(plan.moves, plan.targets, strict=True)
-    ]
-    for number, (q, time, distance, how) in enumerate(rows):
+
+    def row(number: int, q: Array, time: float, distance: float, how: str) -> str:
         angles = "".join(f"{angle:{width}.2f}" for angle in frame.shown(np.asarray(q)))
-        lines.append(f"{number:6d}{angles}{time:9.3f}{distance:10.3f}  {how}")
+        return f"{number:6d}{angles}{time:9.3f}{np.degrees(distance):10.3f}  {how}"
+
+    lines.append(row(0, plan.start, 0.0, 0.0, "start"))
+    for number, (move, target) in enumerate(zip(plan.moves, plan.targets, strict=True), 1):
+        fly = "" if target.how == "stopped" else f", fly {target.fly:.0%}"
+        lines.append(row(number, move.target, target.time, target.distance, target.how + fly))
     ratio, quantity, joint = _worst(plan)
-    saved = f"; {plan.duration_with_stops:.3f} s with a stop at every target"
     lines += [
-        f"{plan.duration:.3f} s{saved}; {plan.reduced_corners} corners rounded less than asked, "
+        f"{plan.duration:.3f} s; {plan.duration_with_stops:.3f} s with a stop at every target; "
+        f"{plan.reduced_corners} corners rounded less than asked, "
         f"{plan.stopped_corners} not at all",
         f"nearest to its limit: {quantity} of {cell.joint_names[joint]}, {ratio:.6f} of it "
         f"({frame.name} angles; floor, walls, currents and the arm itself were not checked)",

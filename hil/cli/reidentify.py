@@ -18,16 +18,8 @@ from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
 from hil.batch.types import BatchEstimator, BatchResult, Broken, LevelEstimate
 from hil.batch.workers import LocalWorkers, Workers
-from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.cli.identify_options import (
-    BandwidthOption,
-    DelayOption,
-    FrictionOption,
-    StandstillOption,
-    TorqueBandwidthOption,
-    VelocityOption,
-    options_from,
-)
+from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
+from hil.cli.identify_options import Identifying
 from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
 from hil.files import make_folder, write_atomically, writing_to
 from hil.progress import reporter as make_reporter
@@ -40,6 +32,7 @@ _MOST_LINES: Final = 20
 _WIDTH: Final = 42
 
 
+@with_options(Identifying, "how")
 def reidentify(
     places: Annotated[list[str], typer.Argument(metavar="FOLDER...")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
@@ -47,12 +40,8 @@ def reidentify(
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
-    bandwidth: BandwidthOption = "auto",
-    velocity: VelocityOption = "auto",
-    friction: FrictionOption = "auto",
-    standstill: StandstillOption = "auto",
-    delay: DelayOption = None,
-    torque_bandwidth: TorqueBandwidthOption = "auto",
+    *,
+    how: Identifying,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -77,16 +66,7 @@ def reidentify(
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
-    options = options_from(
-        delay=delay,
-        torque_bandwidth=torque_bandwidth,
-        estimator=estimator,
-        bandwidth=bandwidth,
-        velocity=velocity,
-        friction=friction,
-        standstill=standstill,
-    )
-    keep = cache != "none"
+    options, keep = how.options(estimator=estimator), cache != "none"
     where = Where(str(Path(cache).resolve()) if keep and cache else None, keep)
     with _workers(dask, workers, places) as hands:
         result = run.reidentify(places, options, hands, reporter, where=where)

@@ -7,8 +7,14 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, print_json
-from hil.cli.identify_options import DelayOption, EstimatorOption, FrictionOption, options_from
+from hil.cli.arguments import (
+    ArchivesArgument,
+    JsonOption,
+    QuietOption,
+    print_json,
+    with_options,
+)
+from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.cli.verdict import NOT_GOOD
 from hil.files import make_folder
 from hil.identify import identify_sources
@@ -19,13 +25,14 @@ from hil.progress import say
 from hil.replaying import ENSEMBLE, replay_motions
 
 
+@with_options(Identifying, "how", but=FEW)
 def replay(
     archives: ArchivesArgument,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     ensemble: Annotated[int, typer.Option(min=0, max=1000)] = ENSEMBLE,
     estimator: EstimatorOption = "auto",
-    friction: FrictionOption = "auto",
-    delay: DelayOption = None,
+    *,
+    how: Identifying,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -49,8 +56,7 @@ def replay(
     folder = archives[0] if archives[0].is_dir() else Path()
     target = output or folder / "replay.png"
     check_format(target)
-    options = options_from(estimator=estimator, friction=friction, delay=delay)
-    found = identify_sources(archives, reporter, options)
+    found = identify_sources(archives, reporter, how.options(estimator=estimator))
     replayed = replay_motions(found, reporter, ensemble)
     make_folder(target.parent)
     save(replayed.figure(), target)

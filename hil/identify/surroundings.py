@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -11,10 +10,10 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.cell import Cell
+from hil.cell.text import urdf_limits
 from identification.estimators.prior import NOMINAL_SHARE
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.factor import Estimate
-from identification.model.urdf_text import urdf_tree
 from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
@@ -252,14 +251,6 @@ def torque_limits(cell: Cell) -> Array | None:
         drives = cell.drive_train
         gear = np.abs(np.diag(drives.motor_from_joint))
         return np.asarray(gear * drives.torque_constant * drives.current_limit)
-    efforts = {
-        joint.get("name"): limit.get("effort", "")
-        for joint in urdf_tree(cell.urdf).iter("joint")
-        for limit in joint.iter("limit")
-    }
-    limits = np.full(len(cell.joint_names), np.nan)
-    for j, name in enumerate(cell.joint_names):
-        with suppress(ValueError):
-            limits[j] = float(efforts.get(name, ""))
-    limits[~((limits > 0.0) & (limits < np.inf))] = np.nan
+    effort = urdf_limits(cell.urdf, cell.joint_names).effort
+    limits = np.where((effort > 0.0) & (effort < np.inf), effort, np.nan)
     return None if np.isnan(limits).all() else limits
