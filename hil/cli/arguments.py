@@ -66,9 +66,9 @@ def with_options(
             parameters |= options if name == to else {name: one}
 
         @wraps(command)
-        def run(**given: Any) -> None:
-            typed = {name: given.pop(name) for name in options}
-            command(**given, **{to: group(**typed)})
+        def run(*own: Any, **given: Any) -> None:
+            typed = {name: given.pop(name) for name in [*given] if name in options}
+            command(*own, **given, **{to: group(**typed)})
 
         keyword = [one.replace(kind=one.KEYWORD_ONLY) for one in parameters.values()]
         run.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
