@@ -16,8 +16,8 @@ from hil.cell.text import urdf_limits
 from hil.errors import InputError
 from hil.files import make_folder, write_together
 from hil.identify import Identification
-from hil.identify.exports import provenance_of
 from hil.identify.surroundings import torque_limits
+from hil.outcome import provenance_of
 from identification.estimators.consistent import (
     ConsistentEstimate,
     Ensemble,

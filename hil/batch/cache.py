@@ -33,10 +33,9 @@ import drivers
 import hil
 import identification
 from hil.cell import Cell
-from hil.files import replacing
+from hil.files import digest, json_digest, replacing
 from hil.identify.options import Options
 from hil.identify.settings import Settings
-from hil.io import digest, json_digest
 from hil.reading import opened
 from identification.estimators.consistent import Shrinkage
 from identification.factor.factor import Estimate

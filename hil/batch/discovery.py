@@ -21,8 +21,8 @@ from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
+from hil.files import digest, json_digest
 from hil.identify.settings import stated_delay
-from hil.io import digest, json_digest
 from hil.progress import Reporter, Silent
 
 from .cache import BESIDE, Where, arm_digest, code_digest

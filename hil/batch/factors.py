@@ -18,11 +18,19 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.errors import ArchiveError, HilError
-from hil.identify.deciding import MOST_READ, carried_over, decide, with_noise
+from hil.files import file_digest
 from hil.identify.options import Options
-from hil.identify.settings import Settings, judged_samples, samples_of, signals_of
+from hil.identify.settings import (
+    MOST_READ,
+    Settings,
+    carried_over,
+    decide,
+    judged_samples,
+    samples_of,
+    signals_of,
+    with_noise,
+)
 from hil.identify.sources import Source, all_fitted, known_warnings, source_of
-from hil.io import file_digest
 from hil.progress import Silent
 from identification import IdentificationError
 from identification.estimators.covariance import block_covariance

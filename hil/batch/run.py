@@ -11,9 +11,9 @@ from typing import Any, Final, TypeVar, cast
 
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.files import json_digest
 from hil.identify.options import Options
 from hil.identify.settings import Settings
-from hil.io import json_digest
 from hil.progress import Reporter
 from hil.terminal_text import plural
 from identification import IdentificationError

@@ -19,8 +19,15 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from hil.archive import ArchiveName
-from hil.files import write_atomically, write_or_tell
-from hil.io import digest, file_digest, is_locked, json_digest, locked
+from hil.files import (
+    digest,
+    file_digest,
+    is_locked,
+    json_digest,
+    locked,
+    write_atomically,
+    write_or_tell,
+)
 from hil.reading import is_no_file, json_of, lies_there, opened, text_of, toml_of
 from identification.errors import ModelError
 from identification.model.urdf_text import urdf_tree

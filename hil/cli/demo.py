@@ -28,8 +28,7 @@ from hil.cli.verdict import finish
 from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.design import DesignResult
 from hil.errors import ControllerFault, InputError, OperatorStopError
-from hil.identify.exports import FILES
-from hil.outcome import REPORT, RESULTS, SERIES
+from hil.outcome import FILES, REPORT, RESULTS, SERIES
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.simulation import simulated_link, simulated_provenance

@@ -19,12 +19,12 @@ from hil.archive import open_archive
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
+from hil.files import file_digest
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.settings import samples_of
 from hil.identify.sources import cell_of, gather_sources
-from hil.io import file_digest
 from hil.progress import Reporter
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor

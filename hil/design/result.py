@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.files import write_atomically
-from hil.io import digest, json_digest
+from hil.files import digest, json_digest, write_atomically
 from hil.reading import text_of
 from hil.version import software
 from identification.excitation import (

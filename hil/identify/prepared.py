@@ -18,9 +18,8 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Samples, smooth
 from planner.checked_data import numbers
 
-from .deciding import decide, with_noise
 from .options import Options
-from .settings import Settings, judged_samples, samples_of, signals_of
+from .settings import Settings, decide, judged_samples, samples_of, signals_of, with_noise
 from .sources import Sources
 
 Array = NDArray[np.float64]

@@ -1,27 +1,36 @@
-"""Settings of an identification, and sources made samples under them.
+"""Settings of an identification: decided from sources, and applied to make samples of them.
 
-What is decided (:mod:`hil.identify.deciding`) stands apart from what applies it: the same settings
-make the same samples of an archive wherever it is read.
+The same settings make the same samples of an archive wherever it is read. To decide them only what
+is fitted is looked at, and of very many recordings the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
+from hil.cell.robot import ripples
+from hil.progress import Reporter
+from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage
-from identification.estimators.delay import compensate
+from identification.estimators.delay import DelayEstimate, compensate, estimate_delays
+from identification.estimators.torque_channel import possible_low_passes
+from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.selection.inner_prediction import Choice
+from identification.selection.inner_prediction import Choice, Question, choose_settings
+from identification.selection.inner_prediction import Settings as Candidate
+from identification.signals.noise import repetition_noise
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
+from identification.validation.finding import Thresholds
 
 from .options import Options
-from .sources import Source
+from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
@@ -143,3 +152,249 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 def _current_limit(cell: Cell) -> Array | None:
     """Largest current of each motor (n,) [A]; None where no drive train is known."""
     return None if cell.file.drive_train is None else np.array(cell.drive_table.current_limit)
+
+
+MOST_READ: Final = 32
+"""Recordings that settings are decided on: more say the same again."""
+# Repetitions of one motion that settings are chosen on.
+_REPETITIONS: Final = 1
+# Where the delay is stated it is looked for all the same, to be reported: in so many samples.
+_DELAY_SAMPLES: Final = 8000
+RIPPLE: Final = ((1,), (2,), (1, 2))
+"""Periods per motor turn of a torque ripple: a rotor out of centre, a wave generator, both."""
+
+
+class Decided(NamedTuple):
+    """Settings, and what was found on the way.
+
+    Attributes:
+        settings: to be applied.
+        delays: of the torque behind the position, as the longest of the recordings has them; None
+            where that cannot be determined.
+        notes: about them, in sentences.
+    """
+
+    settings: Settings
+    delays: DelayEstimate | None
+    notes: tuple[str, ...]
+
+
+def with_noise(sources: Sources) -> tuple[Sources, str]:
+    """Noise of the positions from repetitions, where no standstill was recorded; and in words."""
+    recordings = [source.recording for source in sources.training[:MOST_READ]]
+    if sources.noise_variance is not None:
+        return sources, "the noise of the positions was measured at standstill"
+    if sources.same_motion and len(recordings) > 1:
+        with suppress(IdentificationError):  # no two that could be compared
+            noise = repetition_noise(recordings)
+            return (
+                replace(sources, noise_variance=noise.position, torque_variance=noise.torque),
+                "no standstill was recorded: the noise of the positions was measured on what "
+                f"differs between {len(recordings)} repetitions at equal times",
+            )
+    return sources, "the noise of the positions was estimated from their own fast part"
+
+
+def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+    """Decide on everything that options leave open, from sources with torques and measured noise.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+        IdentificationError: a delay was asked for and there is not one usable row.
+    """
+    sources = replace(sources, training=sources.training[:MOST_READ])
+    stated = _with_noise_of(stated_settings(sources.cell, options), sources)
+    sources = replace(sources, cell=stated.law(sources.cell))
+    notes: list[str] = []
+    settings, found = stated, _delays(sources, stated, options, reporter)
+    suggested: tuple[float, ...] = ()
+    if found is not None and options.delay == "auto":
+        settings, notes = _compensated(stated, found)
+    elif found is not None and options.delay is None and _other(sources, found):
+        notes = _described(found)
+        suggested = (found.common,) if found.significant else ()
+    assumed = settings.preprocessing.torque_delay
+    chosen = _chosen(sources, settings, suggested, options, reporter)
+    how = chosen.preprocessing
+    lags = how.torque_bandwidth is not None and how.torque_shape.causal
+    compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
+    unchanged = f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied"
+    if found is not None and lags:
+        # It was found without the low-pass, and may be nothing but the lag of that.
+        found, notes = None, [f"{unchanged} beside the low-pass of the torque"]
+    elif how.torque_delay in suggested:
+        notes.append(compensated)
+    elif how.torque_delay != assumed:
+        found, notes = None, [compensated]
+    elif found is not None and suggested:
+        found, notes = None, [f"{notes[0]}: it predicts worse, and was not applied"]
+    variance = found.variance if found is not None and notes else 0.0
+    return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
+
+
+def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
+    """Settings for another campaign of the arm that they were decided on.
+
+    Its noise is its own, and so is the delay that its cell states.
+    """
+    own = _with_noise_of(settings, sources)
+    if isinstance(options.delay, float):
+        return own
+    stated = stated_delay(sources.cell)
+    delay = settings.preprocessing.torque_delay + (stated - settings.stated_delay)
+    return replace(own, stated_delay=stated).preprocessed(torque_delay=delay)
+
+
+def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
+    position, torque = (
+        None if values is None else tuple(values.tolist())
+        for values in (sources.noise_variance, sources.torque_variance)
+    )
+    return replace(settings, noise_variance=position, torque_variance=torque)
+
+
+def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:
+    """What inner prediction has to decide."""
+    recorded = [source.recording for source in sources.training]
+    asked: dict[Question, bool] = {
+        "delay": bool(suggested),
+        "bandwidth": options.bandwidth == "auto",
+        "velocity": options.velocity == "auto"
+        and all(one.velocity is not None for one in recorded),
+        "presliding": options.friction == "auto",
+        "rows": options.standstill == "auto",
+        # A cell file with a drive train says which terms are wanted.
+        "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
+        "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
+        # A controller's own currents come through no low-pass.
+        "low-pass": options.torque_bandwidth == "auto"
+        and options.method == "default"
+        and recorded[0].motor_current is None,
+        "estimator": options.estimator == "auto",
+    }
+    return {question for question, wanted in asked.items() if wanted}
+
+
+def _chosen(
+    sources: Sources,
+    settings: Settings,
+    suggested: Sequence[float],
+    options: Options,
+    reporter: Reporter,
+) -> Settings:
+    """Choose what is automatic by inner prediction, with some delays of the torque tried [s]."""
+    cell, questions = sources.cell, _questions(sources, options, suggested)
+    if not questions:
+        return settings
+    # Repetitions of one motion say the same again.
+    read = sources.training[:_REPETITIONS] if sources.same_motion else sources.training
+    read = tuple(signals_of(source, settings) for source in read)
+
+    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        trial = replace(settings, preprocessing=how)
+        return [samples_of(source, cell, trial, model) for source in read]
+
+    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(
+            read[0].recording,
+            model,
+            noise_variance=sources.noise_variance,
+            options=how,
+            undelayed=settings.preprocessing.torque_delay,
+        )
+
+    start = Candidate(cell.model, settings.preprocessing)
+    with reporter.task("choosing settings by inner prediction", 1) as task:
+        best, choices = choose_settings(
+            ready, start, questions, low_passes, suggested, _ripples(cell)
+        )
+        task.advance(1)
+    law, friction = best.model.friction.laws[0], dict(settings.friction)
+    if "presliding" in questions:
+        friction |= {"presliding": law.presliding}
+    if "friction" in questions:
+        friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
+    if "ripple" in questions and best.ripple:
+        friction |= {"ripple": [*best.ripple]}
+    return replace(
+        settings,
+        preprocessing=best.preprocessing,
+        friction=friction,
+        shrinkage=best.shrinkage,
+        choices=choices,
+    )
+
+
+def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
+    """Torque ripple that the cell's gears may have; none where it has some, or no gear is known."""
+    if cell.file.drive_train is None or cell.file.robot.friction.ripple:
+        return []
+    motors = cell.drive_train.motor_from_joint
+    return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
+
+
+def _delays(
+    sources: Sources, stated: Settings, options: Options, reporter: Reporter
+) -> DelayEstimate | None:
+    """Delays in the longest of the fitted recordings, or in its beginning if nobody asked.
+
+    Raises:
+        IdentificationError: they were asked for, and there is not one usable row.
+    """
+    if options.delay == "stated":
+        return None
+    recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
+    wanted = options.delay == "auto"
+    if not wanted:
+        recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+    with reporter.task("looking for a delay", 1) as task:
+        try:
+            found = estimate_delays(
+                recording,
+                sources.cell.model,
+                noise_variance=sources.noise_variance,
+                options=replace(stated.preprocessing, smooth_torque=False),
+            )
+        except IdentificationError:
+            if wanted:
+                raise
+            return None
+        task.advance(1)
+    return found
+
+
+def _described(found: DelayEstimate) -> list[str]:
+    """What was found, in words."""
+    notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
+    if not found.significant:
+        notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
+    return notes
+
+
+def _compensated(stated: Settings, found: DelayEstimate) -> tuple[Settings, list[str]]:
+    """Settings that compensate the delays that somebody asked for, and words.
+
+    One delay of all axes moves the time at which the motion is read; delays axis by axis move the
+    torques.
+    """
+    notes = _described(found)
+    if not found.significant:
+        return stated, notes
+    if found.agree:
+        notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
+        return stated.preprocessed(torque_delay=found.common), notes
+    notes.append("each axis was compensated by its own delay")
+    applied = tuple(found.applied.tolist())
+    return replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0), notes
+
+
+def _other(sources: Sources, found: DelayEstimate) -> bool:
+    """Whether a delay that was found replaces the cell's.
+
+    That of a controller is known: only what is well determined and differs by more than the
+    estimate errs in closed loop is another one.
+    """
+    if sources.cell.file.controller is None:
+        return True
+    apart = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+    return apart and bool(found.determined.all())

@@ -19,7 +19,7 @@ from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
-from hil.io import file_digest
+from hil.files import file_digest
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.noise import standstill_variance

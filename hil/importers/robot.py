@@ -19,9 +19,9 @@ from hil.archive import Samples, write_samples
 from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
+from hil.files import file_digest
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import check_clock, examine, limits_of
-from hil.io import file_digest
 from hil.reading import named_text
 from identification import FrictionLaw
 from identification.errors import ModelError

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from hil.batch.workers import LocalWorkers
 from hil.campaign import CampaignFolder
-from hil.files import make_folder, write_or_tell
+from hil.files import json_digest, make_folder, write_or_tell
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
-from hil.io import json_digest
 from hil.progress import Reporter, Silent
 from hil.reading import text_of
 from hil.results import Frozen

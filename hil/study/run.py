@@ -13,7 +13,7 @@ from typing import Final
 from hil.batch.workers import LocalWorkers
 from hil.cell import Cell
 from hil.design import preset
-from hil.io import digest
+from hil.files import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from identification.excitation import Excitation

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.files import write_together
-from hil.identify.exports import Exports, exports_of
 from hil.identify.run import consistency_of
+from hil.outcome import Exports, exports_of
 from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights

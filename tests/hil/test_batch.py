@@ -37,11 +37,10 @@ from hil.cli.reidentify import alarm_lines, skipped_line
 from hil.compare.trend import Trends
 from hil.errors import InputError
 from hil.identify import Options, identify_campaign
-from hil.identify.deciding import Decided, decide
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
-from hil.identify.settings import Settings
+from hil.identify.settings import Decided, Settings, decide
 from hil.identify.sources import Sources, gather_sources
 from hil.progress import Reporter, Silent
 from identification.estimators.consistent import Shrinkage

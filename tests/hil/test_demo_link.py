@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.cli import demo as demo_module
 from hil.demo_link import SimulatorProcess
 from hil.design import preset
-from hil.identify.exports import FILES
+from hil.outcome import FILES
 from identification.excitation import Criteria, Excitation
 from planner import FourierSeries
 from sim_fixtures.ns16 import CELL_PATH

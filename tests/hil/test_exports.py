@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from hil.identify.exports import FILES, Exports, provenance_of
+from hil.outcome import FILES, Exports, provenance_of
 from hil.results import Results, VerdictResult
 from identification.export.parameters import parameters_json
 from identification.export.urdf import not_in_urdf

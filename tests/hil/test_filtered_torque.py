@@ -85,6 +85,6 @@ class TestFixedOptions:
             raise AssertionError("something was asked")
 
         for name in ("choose_settings", "estimate_delays", "possible_low_passes"):
-            monkeypatch.setattr(f"hil.identify.deciding.{name}", never)
+            monkeypatch.setattr(f"hil.identify.settings.{name}", never)
         found = prepared(tmp_path, 2, causal=True, options=FIXED)
         assert found.settings == stated_settings(found.sources.cell, FIXED)
