@@ -248,7 +248,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     fit, effect = _fit(model, samples, phase) if fitted else (None, 1.0)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
-        warnings.append(source.merged_words)
+        warnings.append(source.merged)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append("it was repaired, and something is lost")
     return Summary(

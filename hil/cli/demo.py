@@ -157,23 +157,15 @@ def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
 
 
 def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
-    """The motion of a design; what it was searched without is said before it runs."""
+    """The motion of a design; says what it was searched without."""
     result = DesignResult.load(path)
     result.require_cell(cell, path)
-    constraints = result.settings.constraints
-    lacking = [
-        words
-        for had, words in (
-            (constraints.collision, "contacts were not looked at (collision = false)"),
-            (constraints.current, "currents were not looked at (current = false)"),
-            (result.complete, "it was stopped before its end (complete = false)"),
-        )
-        if not had
-    ]
+    lacking = [f"{what} not looked at" for what in result.settings.unchecked]
+    lacking += [] if result.complete else ["stopped before its end"]
     if lacking:
         reporter.say(
-            f"note: in the search for {path} {' and '.join(lacking)}; the motion itself is checked "
-            "against the whole cell before it runs"
+            f"note: search for {path}: {', '.join(lacking)}; the motion itself is checked against "
+            "the whole cell before it runs"
         )
     return result.excitation
 

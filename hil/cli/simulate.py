@@ -52,15 +52,9 @@ class Status:
     """One line for each change of phase and, on a terminal, one that is written over.
 
     Where open mode is lost again and again, one line for the 2nd, 4th, 8th ... time. A line is
-    written only if the terminal or pipe can take it at once; a reader that has stopped reading
-    loses lines, the PC program loses nothing.
-
-    Args:
-        place: where the PC program is expected.
-        settings: of the controller.
-        quiet: say nothing.
-        stretch: s by which a cycle may be made longer to wait for its answer.
-        descriptor: file descriptor to write to.
+    written only if the terminal or pipe can take it at once: a reader that has stopped reading
+    loses lines, the PC program loses nothing. `stretch` are the seconds by which a cycle may be
+    made longer to wait for its answer.
     """
 
     def __init__(
@@ -82,12 +76,11 @@ class Status:
     def introduce(self, name: str) -> None:
         """Say what this is, and what it is not."""
         settings = self._settings
-        missed = settings.missed_replies
         self.say(
             f"{name}: a SIMULATED controller for {self._place}; nothing moves.\n"
             f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, "
-            f"{'cold' if settings.cold_start else 'warm'} start, open mode ends after {missed} "
-            f"missing {'reply' if missed == 1 else 'replies'}, process {os.getpid()}"
+            f"{'cold' if settings.cold_start else 'warm'} start, missing replies that end open "
+            f"mode: {settings.missed_replies}, process {os.getpid()}"
         )
         if self._stretch:
             self.say(
@@ -303,8 +296,8 @@ def _figures(served: Served) -> dict[str, object]:
     summary = served.summary
     times = {"stretch_max_us": summary.stretch_max}
     for name, each in (("answer", summary.answer), ("cost", summary.cost)):
-        for part, seconds in zip(("p50", "p99", "max"), _parts(each), strict=True):
-            times[f"{name}_{part}_us"] = seconds
+        parts = (f"{name}_{part}_us" for part in ("p50", "p99", "max"))
+        times |= zip(parts, _parts(each), strict=True)
     return {
         **{name: count for name, count in vars(summary).items() if isinstance(count, int)},
         "foreign": served.foreign,

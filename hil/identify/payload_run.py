@@ -45,15 +45,16 @@ class PayloadFound:
 
     Attributes:
         estimate: of the body.
+        body: as it was found.
         frame: link of the robot description in whose frame it is.
         box: edges of the reference body [m]; None for a point.
         gravity: magnitude [m/s²].
-        bare: names of the archives without it.
-        loaded: names of the archives with it.
+        bare, loaded: names of the archives without it and with it.
         warnings: what a reader must know.
     """
 
     estimate: PayloadEstimate
+    body: Body
     frame: str
     box: tuple[float, float, float] | None
     gravity: float
@@ -63,25 +64,8 @@ class PayloadFound:
 
     @property
     def figures(self) -> Array:
-        """Those of the body (10,), as `NAMES`.
-
-        Raises:
-            InputError: there is no payload.
-        """
-        return figures_of(self._body)
-
-    @property
-    def _body(self) -> Body:
-        if self.estimate.body is None:
-            low, high = self.estimate.intervals[0]
-            raise InputError(
-                None,
-                f"the loaded archives show no payload: its mass is between {low:.3g} and"
-                f" {high:.3g} kg",
-                field="--loaded",
-                remedy="name recordings that were made with it",
-            )
-        return self.estimate.body
+        """Those of the body (10,), as `NAMES`."""
+        return figures_of(self.body)
 
     @property
     def wrist_torque(self) -> tuple[float, float, float]:
@@ -115,14 +99,9 @@ class PayloadFound:
 
     @property
     def sentences(self) -> list[str]:
-        """What was found, in words.
-
-        Raises:
-            InputError: there is no payload.
-        """
-        body, estimate = self._body, self.estimate
+        """What was found, in words."""
+        body, estimate, torque = self.body, self.estimate, self.wrist_torque
         low, high = estimate.intervals[0]
-        torque = self.wrist_torque
         centre = ", ".join(f"{1e3 * part:.1f}" for part in body.centre)
         lines = [
             f"The payload weighs {body.mass:.4g} kg (95 %: {low:.4g} to"
@@ -147,18 +126,13 @@ class PayloadFound:
     @property
     def table(self) -> list[tuple[str, float, float, float, str]]:
         """Rows of name, value, interval and unit."""
-        intervals = self.estimate.intervals.tolist()
-        return [
-            (name, value, low, high, _UNITS[name])
-            for name, value, (low, high) in zip(
-                NAMES, self.figures.tolist(), intervals, strict=True
-            )
-        ]
+        rows = zip(NAMES, self.figures.tolist(), self.estimate.intervals.tolist(), strict=True)
+        return [(name, value, low, high, _UNITS[name]) for name, value, (low, high) in rows]
 
     @property
     def controllers(self) -> dict[str, str]:
         """By controller, the figures as they are typed; units and frames stand in the manual."""
-        mass, centre = f"{self._body.mass:.3f}", self._body.centre
+        mass, centre = f"{self.body.mass:.3f}", self.body.centre
         millimetres = ", ".join(f"{1e3 * part:.2f}" for part in centre)
         metres = ", ".join(f"{part:.5f}" for part in centre)
         xx, xy, xz, yy, yz, zz = (f"{part:.5f}" for part in self.figures[4:])
@@ -177,7 +151,7 @@ class PayloadFound:
     @property
     def urdf(self) -> str:
         """A description with the frame's link and the payload fixed to it."""
-        xyz = " ".join(repr(float(part)) for part in self._body.centre)
+        xyz = " ".join(repr(float(part)) for part in self.body.centre)
         names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         tensor = " ".join(
             f'{name}="{float(part)!r}"' for name, part in zip(names, self.figures[4:], strict=True)
@@ -192,7 +166,7 @@ class PayloadFound:
   <link name="payload">
     <inertial>
       <origin xyz="{xyz}" rpy="0 0 0"/>
-      <mass value="{float(self._body.mass)!r}"/>
+      <mass value="{float(self.body.mass)!r}"/>
       <inertia {tensor}/>
     </inertial>
   </link>
@@ -242,13 +216,12 @@ def find_payload(
         bare: archives or folders of them, or campaign folders, without it.
         loaded: the same with it.
         reporter: of progress.
-        frame: link of the URDF in whose frame it is; by default `tool0` or `flange` where one is
-            fixed to the last joint, else the link of that joint.
+        frame: link of the URDF in whose frame it is; see `flange_of` if left out.
         box: edges [m] of the reference body along the frame's axes; None for a point.
         options: how recordings become samples.
 
     Raises:
-        InputError: archives cannot be used, are of two arms or carry two payloads.
+        InputError: archives cannot be used, are of two arms, carry two payloads or none.
         IdentificationError: the recordings do not determine the mass.
     """
     sides = {False: list(_archives(bare)), True: list(_archives(loaded))}
@@ -265,7 +238,8 @@ def find_payload(
     }
     _refuse_other_arm(found[False].cell, found[True].cell, sides[True][0])
     paths = {path.name: path for path in (*sides[False], *sides[True])}
-    for source in (*found[False].training, *found[True].training):
+    training = (*found[False].training, *found[True].training)
+    for source in training:
         if source.recording.torque is None:
             raise ArchiveError(
                 source.path,
@@ -274,7 +248,6 @@ def find_payload(
                 remedy="give drive.torque_constant in the column map",
             )
     cell = found[False].cell.without_payload()
-    training = (*found[False].training, *found[True].training)
     if found[False].plan is None and found[True].plan is None:
         training, _ = aligned(training)
     first, last = training[: len(found[False].training)], training[len(found[False].training) :]
@@ -298,8 +271,17 @@ def find_payload(
         estimate = identify_payload(cell.model, runs, box)
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
+    if estimate.body is None:
+        low, high = estimate.intervals[0]
+        raise InputError(
+            None,
+            f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
+            field="--loaded",
+            remedy="name recordings that were made with it",
+        )
     return PayloadFound(
         estimate=estimate,
+        body=estimate.body,
         frame=frame,
         box=box,
         gravity=float(np.linalg.norm(cell.model.gravity)),
@@ -341,16 +323,15 @@ def _archives(paths: Sequence[Path]) -> Iterator[Path]:
 
 def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
     """One arm with one drive train; only what it carries may differ."""
-    differing = [
-        name
-        for name, mine, other in (
-            ("robot.urdf", bare.urdf, loaded.urdf),
-            ("[robot]", bare.without_payload().file.robot, loaded.without_payload().file.robot),
-            ("[drive_train]", bare.file.drive_train, loaded.file.drive_train),
-        )
-        if mine != other
-    ]
-    if differing:
+    mine, other = (
+        {
+            "robot.urdf": cell.urdf,
+            "[robot]": cell.without_payload().file.robot,
+            "[drive_train]": cell.file.drive_train,
+        }
+        for cell in (bare, loaded)
+    )
+    if differing := [name for name in mine if mine[name] != other[name]]:
         raise ArchiveError(
             path,
             f"is of another arm than {bare.path}: {' and '.join(differing)} differ",
@@ -361,18 +342,10 @@ def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
 
 def _mixed(found: Difference, path: Path) -> InputError:
     """That not all bare recordings carry the same, or not all loaded ones."""
-    run, other = found.run, found.reference
-    amount = f"{abs(found.mass):.3g} kg {'more' if found.mass > 0.0 else 'less'} than {other.name}"
-    if run.loaded:
-        return InputError(
-            path,
-            f"carries another payload: {amount}, though both are named as loaded",
-            field="--loaded",
-            remedy="weigh each payload by itself",
-        )
-    return InputError(
-        path,
-        f"was recorded with another tool mounted: it carries {amount}, though both are named as"
-        " bare",
-        remedy="name it with --loaded, or leave it out",
-    )
+    more = "more" if found.mass > 0.0 else "less"
+    amount = f"{abs(found.mass):.3g} kg {more} than {found.reference.name}, though both are named"
+    if found.run.loaded:
+        problem, remedy = "carries another payload", "weigh each payload by itself"
+        return InputError(path, f"{problem}: {amount} as loaded", field="--loaded", remedy=remedy)
+    problem = f"was recorded with another tool mounted: it carries {amount} as bare"
+    return InputError(path, problem, remedy="name it with --loaded, or leave it out")

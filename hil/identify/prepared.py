@@ -115,9 +115,7 @@ def _time_bases(sources: Sources) -> list[str]:
     """A sentence for each recording whose clock is not as even as a filter would like it."""
     notes = []
     for source in (*sources.training, *sources.held_out):
-        if source.merged:
-            notes.append(f"{source.name}: {source.merged_words}")
-        notes += [f"{source.name}: {line}" for line in source.clock]
+        notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
             notes.append(f"{source.name}: {'; '.join(base.describe())}")

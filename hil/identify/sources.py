@@ -45,7 +45,7 @@ class Source:
         name: file name.
         recording: joints in the order of the model.
         origin: time of the first set-point [s].
-        merged: samples that had the time stamp of the one before, and were averaged with it.
+        merged: what was done about repeated time stamps, in words; nothing for none.
         clock: what was decided about its time stamps, in sentences.
         retimed: whether other times than the stamps were used.
         context: the motion of a longer recording that this is a part of, and where it begins in
@@ -56,17 +56,10 @@ class Source:
     name: str
     recording: Recording
     origin: float
-    merged: int = 0
+    merged: str = ""
     clock: tuple[str, ...] = ()
     retimed: bool = False
     context: tuple[Recording, int] | None = None
-
-    @property
-    def merged_words(self) -> str:
-        """What was done about repeated time stamps."""
-        return (
-            f"{self.merged} samples had the time stamp of the one before and were averaged with it"
-        )
 
     def changed(self, change: Callable[[Recording], Recording]) -> Source:
         """The source with its recording, and the context of it, changed alike row by row."""
@@ -340,6 +333,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     merged, timed = recording.n_samples - single.n_samples, single
+    averaged = f"{merged} samples had the time stamp of the one before and were averaged with it"
     words: tuple[str, ...] = ()
     if archive.kind == "imported":  # a controller counts its own cycles
         timed, words = true_times(single)
@@ -348,7 +342,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         archive.path.name,
         timed,
         float(timed.time[0]),
-        merged,
+        averaged if merged else "",
         words,
         retimed=timed is not single,
     )
