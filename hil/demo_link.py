@@ -75,12 +75,7 @@ class SimulatorProcess:
         return (errors or said or [f"exit status {self.process.returncode}"])[-1]
 
     def end(self) -> dict[str, Any]:
-        """Wait for its end; kill it if it does not come.
-
-        Returns:
-            what it counted, see `docs/simulate.md`: cycles, replies, missed, late, intervals, …;
-            nothing if it had to be killed.
-        """
+        """Wait for its end, or kill it; what it counted (`docs/simulate.md`), nothing if killed."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(END_TIMEOUT)
         if self.running:
@@ -107,14 +102,9 @@ def loopback_link(
 ) -> Iterator[LiveLink]:
     """A `LiveLink` to a simulated controller of `cell` that runs beside this program.
 
-    Over the cell's own transport, but always within this computer: UDP takes a free port of the
-    loopback device, CAN the bus that the cell names.
-
-    Args:
-        cell: with transport "udp" or "can".
-        simulated_by: cell file for the controller, if not the cell's own.
-        options: further options of `hil simulate`.
-        live: lets viewers look at what is recorded.
+    Over the cell's own transport, "udp" or "can", but always within this computer: UDP takes a
+    free port of the loopback device, CAN the bus that the cell names. `simulated_by` is a cell
+    file for the controller, if not the cell's own, `options` are further ones of `hil simulate`.
     """
     spec: TransportSpec
     if cell.controller.can is not None and cell.controller.transport == "can":

@@ -39,12 +39,8 @@ def make_folder(path: Path) -> None:
 def exclusive_folder(root: Path, work: str, option: str) -> Iterator[None]:
     """Make a folder, and keep every other process with the same work out of it until this is left.
 
-    The lock is on the folder itself, which nobody removes, and goes with this process.
-
-    Args:
-        root: the folder.
-        work: what is done in it, a noun.
-        option: of the command line that names another folder.
+    The lock is on the folder itself, which nobody removes, and goes with this process. `work` is a
+    noun for it, `option` the one of the command line that names another folder.
 
     Raises:
         InputError: another one is at work in it, it cannot be made, or not be locked.
@@ -73,12 +69,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replacing(path: Path, temporary: Path | None = None) -> Iterator[Path]:
-    """Replace `path` by what is written to the yielded name beside it; keep it if that fails.
-
-    Args:
-        path: its folder exists.
-        temporary: the name to write to; by default one that nobody else has.
-    """
+    """Replace `path` by what is written to the yielded name beside it; keep it if that fails."""
     temporary = temporary or path.with_name(f".{path.name[:200]}.{token_hex(4)}.tmp")
     try:
         yield temporary

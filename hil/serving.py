@@ -7,7 +7,6 @@ import gc
 import os
 import signal
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -39,11 +38,8 @@ def open_far_end(
 ) -> FarEnd:
     """The controller's end of the link a person names.
 
-    Args:
-        udp: "HOST:PORT" of the PC program.
-        can: "INTERFACE:CHANNEL", ":fd" or ":classic" behind it.
-        settings: of the controller; a bus is asked whether it can carry its cycle and mode.
-        n_axes: axes of the robot.
+    `udp` is "HOST:PORT" of the PC program, `can` "INTERFACE:CHANNEL", ":fd" or ":classic" behind
+    it; a bus is asked whether it can carry the controller's cycle and mode.
 
     Raises:
         InputError: neither or both, or not of that form.
@@ -169,11 +165,9 @@ def undisturbed(priority: int | None) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Served:
-    """How a session on a real link came out.
+    """How a session on a real link came out: controller and counts are of the last start.
 
     Attributes:
-        controller: that of the last start.
-        summary: counts and times of the last start and what followed it.
         intervals: how often all axes have been open.
         starts: how often the start was begun.
         foreign: datagrams from elsewhere; 0 where the link cannot tell.
@@ -215,18 +209,15 @@ def serve_session(
     while True:
         starts += 1
         controller = build()
-        entered: Counter[Phase] = Counter()
-        phase = controller.phase
+        phases = [controller.phase]
 
         def observe(
             tally: Tally,
             controller: SimulatedController = controller,
-            entered: Counter[Phase] = entered,
+            phases: list[Phase] = phases,
         ) -> None:
-            nonlocal phase
-            if controller.phase is not phase:
-                phase = controller.phase
-                entered[phase] += 1
+            if controller.phase is not phases[-1]:
+                phases.append(controller.phase)
             pressed.pass_on(controller)
             watch(controller, tally)
 
@@ -239,9 +230,10 @@ def serve_session(
             raise InputError(None, str(error)) from error
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
-        if entered[Phase.DRIVE_OFF] or not summary.ended or pressed.request() is not Request.GO_ON:
-            foreign = getattr(far_end, "foreign", 0)
-            return Served(controller, summary, entered[Phase.OPEN], starts, foreign)
+        begun = Phase.DRIVE_OFF in phases[1:]
+        if begun or not summary.ended or pressed.request() is not Request.GO_ON:
+            opened, foreign = phases[1:].count(Phase.OPEN), getattr(far_end, "foreign", 0)
+            return Served(controller, summary, opened, starts, foreign)
         until = time.monotonic() + KNOCK_INTERVAL
         while time.monotonic() < until and pressed.request() is Request.GO_ON:
             time.sleep(0.05)

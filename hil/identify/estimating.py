@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,15 +130,11 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             pooled = with_uncertain_delay(result.pooled, result.factor, products, variance)
             result = replace(result, pooled=pooled)
         task.advance(1, "prior")
-        posterior: PosteriorEstimate | str
+        posterior: PosteriorEstimate | str = ""
         try:
-            posterior = (
-                prior
-                if isinstance(prior, str)
-                else fit_with_prior(model, fitted, prior, phase=result.phase)
-            )
-        except IdentificationError as error:
-            posterior = str(error)
+            posterior = fit_with_prior(model, fitted, required(prior), phase=result.phase)
+        except (IdentificationError, InputError) as error:
+            posterior = prior if isinstance(prior, str) else str(error)
         if name == "prior" and isinstance(posterior, PosteriorEstimate):
             warnings += _surprises(model, posterior)
         task.advance(1, "held-out motion")
@@ -159,23 +155,18 @@ def _beside(
             f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR:"
             " the motion separates some parameters poorly"
         )
-    endogeneity: EndogeneityTest | str
     if isinstance(instrumental, str):
-        endogeneity = (
-            "Whether noise in the positions biases least squares could not be tested:"
-            f" {instrumental}."
+        words = "Whether noise in the positions biases least squares could not be tested"
+        return f"{words}: {instrumental}.", warnings
+    test = instrumental.test
+    # What the motion does not determine differs by any amount.
+    if name != "iv" and test.matters and not instrumental.pooled.estimate.undetermined:
+        warnings.append(
+            "noise in the measured positions biases least squares: instrumental variables differ"
+            f" from it by up to {float(np.max(test.predicted)):.1%} of an axis's torque; compare"
+            " with --estimator iv, or measure positions with less noise"
         )
-    else:
-        endogeneity = instrumental.test
-        # What the motion does not determine differs by any amount.
-        if name != "iv" and endogeneity.matters and not instrumental.pooled.estimate.undetermined:
-            moved = float(np.max(endogeneity.predicted))
-            warnings.append(
-                "noise in the measured positions biases least squares: instrumental variables"
-                f" differ from it by up to {moved:.1%} of an axis's torque; compare with"
-                " --estimator iv, or measure positions with less noise"
-            )
-    return endogeneity, warnings
+    return test, warnings
 
 
 # What is believed before any data
@@ -184,9 +175,8 @@ def _beside(
 def cad_prior(cell: Cell) -> GaussianPrior | str:
     """Prior of a cell from its URDF and `[nominal]`; in words why it has none.
 
-    The URDF's inertias are believed to `[nominal] uncertainty` (10 % without that table), rotor
-    inertias of the table likewise, its friction to `FRICTION_SHARE`. Of what neither gives
-    nothing is believed.
+    Standard deviations are `[nominal] uncertainty` of inertias (10 % without that table) and
+    `FRICTION_SHARE` of friction.
     """
     model, table = cell.model, cell.file.nominal
     known: dict[str, tuple[float, float]] = {}  # mean and standard deviation
@@ -330,15 +320,8 @@ def _first(names: Sequence[str]) -> str:
 # Instruments
 
 
-@dataclass(frozen=True, eq=False)
-class InstrumentalFit:
-    """Instrumental variables of all recordings, and of each.
-
-    Attributes:
-        pooled: from all.
-        each: per recording.
-        test: whether least squares was biased by noise in the regressor.
-    """
+class InstrumentalFit(NamedTuple):
+    """Instrumental variables of all recordings, and of each; and whether they were needed."""
 
     pooled: InstrumentalEstimate
     each: tuple[Estimate, ...]

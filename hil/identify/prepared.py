@@ -124,14 +124,14 @@ def _time_bases(sources: Sources) -> list[str]:
 
 def _left_out(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: int) -> list[str]:
     """What was left out in all, and why."""
-    everything = rows * len(sources.cell.joint_names)
-    left_out = {reason: int(counts.sum()) for reason, counts in masked.items() if counts.any()}
-    if not left_out:
+    total = rows * len(sources.cell.joint_names)
+    shares = {why: int(counts.sum()) / total for why, counts in masked.items() if counts.any()}
+    if not shares:
         return []
-    parts = ", ".join(f"{count / everything:.2%} {reason}" for reason, count in left_out.items())
+    parts = ", ".join(f"{share:.2%} {reason}" for reason, share in shares.items())
     return [
-        f"of {everything} rows (one joint at one instant) "
-        f"{1.0 - sum(left_out.values()) / everything:.1%} were fitted; left out: {parts}"
+        f"of {total} rows (one joint at one instant) {1.0 - sum(shares.values()):.1%} were fitted; "
+        f"left out: {parts}"
     ]
 
 

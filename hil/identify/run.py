@@ -91,10 +91,7 @@ def consistency_of(
     training: PhaseFactor,
     held_out: Factor,
 ) -> ConsistencyCheck | str:
-    """Weighted least squares with the inequalities of a machine and without.
-
-    In words why there is none. It says what the inequalities cost whatever the estimator was.
-    """
+    """Weighted least squares with the inequalities of a machine and without; or why not."""
     total = training.total
     try:
         weights = joint_weights(total)
@@ -273,14 +270,9 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
     both = np.column_stack([example.torque, example.torque - predicted])
     frequency, density = spectrum(time, both, example.segments)
     speed, torque = _friction_data(model, values, fitted)
+    slowest, fastest = (end(speed, axis=0, initial=0.0) for end in (np.nanmin, np.nanmax))
     curves = [
-        friction_curve(
-            model,
-            values,
-            joint,
-            float(np.nanmin(speed[:, joint], initial=0.0)),
-            float(np.nanmax(speed[:, joint], initial=0.0)),
-        )
+        friction_curve(model, values, joint, float(slowest[joint]), float(fastest[joint]))
         for joint in range(model.n_joints)
     ]
     return ReportSeries(

@@ -120,15 +120,10 @@ def gather_sources(
 ) -> Sources:
     """Open archives and sort them into what is fitted and what is predicted.
 
-    Excitations and imported recordings are fitted, validation runs predicted, and imported ones
-    used as they were declared. Where there is nothing to predict, the last part of a single
-    recording, or the last of several, is held out.
-
-    Args:
-        paths: the archives.
-        split: see :class:`hil.identify.options.Options`.
-        predict: archives that are predicted and not fitted, whatever their kind.
-        in_sample: fit whatever moves, validation runs too, and hold nothing out.
+    Excitations are fitted and validation runs predicted; imported recordings are what they were
+    declared; those of `predict` are predicted in any case. Where there is nothing to predict, the
+    last part of a single recording (see `Options.split`), or the last of several, is held out;
+    `in_sample` fits whatever moves.
 
     Raises:
         InputError: there is nothing to fit, an archive is named twice, or something is to be
@@ -297,19 +292,16 @@ def _not_judged(archive: Archive) -> str | None:
 
 def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     """What is known beforehand to stand between the numbers and the truth, in sentences."""
-    warnings = []
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
-    if assumed and not archive.header.only_simulated:
-        warnings.append(
-            "the torque constants are assumed: predictions are as good as they look, but every "
-            "parameter is in their units"
-        )
-    if any("friction drift" in effect for effect in archive.header.effects):
-        warnings.append(
-            "friction drift is switched on: the planted friction is that of a half-warm joint, "
-            "and a short run is colder, so friction estimates differ from it"
-        )
-    return warnings
+    known = {
+        "the torque constants are assumed: predictions are as good as they look, but every "
+        "parameter is in their units": assumed and not archive.header.only_simulated,
+        "friction drift is switched on: the planted friction is that of a half-warm joint, "
+        "and a short run is colder, so friction estimates differ from it": any(
+            "friction drift" in effect for effect in archive.header.effects
+        ),
+    }
+    return [words for words, true in known.items() if true]
 
 
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:

@@ -84,7 +84,7 @@ def summarise(
 ) -> Results:
     """Everything that was found, as it goes into `results.json`.
 
-    `nominal` is what the nominal model is, in words; the last two say in words why there are none.
+    `nominal` is what the nominal model is, in words.
 
     Raises:
         InputError: the plan in the archives cannot be read.
@@ -434,13 +434,9 @@ def _delays(prepared: Prepared) -> DelaysResult | None:
 def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
     """Of the parameters that the data determine and whose truth is known."""
     determined = np.isfinite(std) & np.isfinite(truth)
-    distance = np.abs(values - truth)[determined]
-    std = std[determined]
-    return CoverageResult(
-        within_2=int((distance <= 2.0 * std).sum()),
-        within_3=int((distance <= 3.0 * std).sum()),
-        total=int(determined.sum()),
-    )
+    distance, std = np.abs(values - truth)[determined], std[determined]
+    within_2, within_3 = (int((distance <= limit * std).sum()) for limit in (2.0, 3.0))
+    return CoverageResult(within_2=within_2, within_3=within_3, total=len(std))
 
 
 def _judgement(

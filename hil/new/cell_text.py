@@ -62,20 +62,12 @@ _OF_MOVING_JOINTS: Final = (
 
 
 def mimics(urdf: str) -> dict[str, tuple[str, float]]:
-    """Joints that follow another one, by name: which, and their offset [rad or m] from it.
-
-    An offset that is no number counts as 0.
-    """
-    found = {}
-    for joint in urdf_tree(urdf).findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            try:
-                offset = float(mimic.get("offset", "0"))
-            except ValueError:
-                offset = 0.0
-            found[joint.get("name", "")] = mimic.get("joint", "?"), offset
-    return found
+    """Joints that follow another one, by name: which, and their offset [rad or m] from it."""
+    return {
+        joint.get("name", ""): (mimic.get("joint", "?"), float(mimic.get("offset", "0")))
+        for joint in urdf_tree(urdf).findall("joint")
+        for mimic in joint.findall("mimic")
+    }
 
 
 def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:
@@ -261,11 +253,6 @@ class NewCell:
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
     """What a table of DH parameters alone says of a cell: geometry; its URDF has to be written.
 
-    Args:
-        path: of the table.
-        convention: of its rows.
-        fixed: as for `cell_of_urdf`.
-
     Raises:
         InputError: it cannot be read, is no such table, or has no such joint.
     """
@@ -278,13 +265,9 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     """What a URDF alone says of a cell.
 
-    Joints that slide cannot be moved by this software: they are fixed at zero (the nearest
-    position in their range). Joints that follow another one have no motor of their own, and a
-    model without closed loops cannot say what moves them: they are fixed too. Notes say so.
-
-    Args:
-        path: of the URDF.
-        fixed: positions [rad or m] of joints that are to be fixed, by name.
+    Joints in `fixed` are held at positions [rad or m]; those that slide, which this software does
+    not move, at zero (the nearest position in their range); and those that follow another one,
+    which no model of an open chain describes, at their offset. Notes say so.
 
     Raises:
         InputError: it cannot be read, or is no URDF of an open chain.

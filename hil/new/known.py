@@ -75,24 +75,20 @@ class Known:
 
 
 def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
-    """Limits that a URDF states; angles in degrees, in its own frame.
+    """Limits that a URDF states, in degrees, in its own frame; `"?"` where it states none.
 
-    A joint without a stated range or speed gets `"?"` there. Torques are used only if every joint
-    has one: a list of torque limits has no gaps.
+    Torques are used only if every joint has one: a list of torque limits has no gaps.
     """
     limits = urdf_limits(urdf, joint_names)
     nowhere = limits.lower >= limits.upper
-    lower = np.where(nowhere, -math.inf, limits.lower)
-    upper = np.where(nowhere, math.inf, limits.upper)
-    efforts = limits.effort.tolist()
     values: dict[str, Any] = {
         "limits.frame": "urdf",
-        "limits.lower_deg": _degrees(lower),
-        "limits.upper_deg": _degrees(upper),
+        "limits.lower_deg": _degrees(np.where(nowhere, math.inf, limits.lower)),
+        "limits.upper_deg": _degrees(np.where(nowhere, math.inf, limits.upper)),
         "limits.velocity_deg": _degrees(limits.velocity),
     }
-    if all(0.0 < effort < math.inf for effort in efforts):
-        values["limits.torque"] = efforts
+    if np.all((limits.effort > 0.0) & np.isfinite(limits.effort)):
+        values["limits.torque"] = limits.effort.tolist()
     return Known.said_by("from the URDF", values)
 
 
@@ -244,14 +240,8 @@ def read_init(
 
     The process that answers has no arm: a drive train of ones, which no controller announces,
     so that its session is unusable for motion, and no archive, without which none is accepted.
-    After the init packet answers go on until the axes are closed.
-
-    Args:
-        spec: the link.
-        n_joints: axes that are expected.
-        arm: of the controller, from 1.
-        wait: s that the controller is waited for.
-        stop: ends the waiting.
+    After the init packet answers go on until the axes are closed. It is waited for `wait` seconds;
+    `arm` counts from 1.
 
     Raises:
         ControllerFault: the link cannot be opened, or no controller began a session in time.

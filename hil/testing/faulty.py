@@ -39,8 +39,7 @@ def shortened(cell: Cell) -> Cell:
 def run_campaign(root: Path, cell: Cell) -> Campaign:
     """Design and run a campaign of a simulated cell in a new folder, in virtual time.
 
-    Its motion is found in a second and tells little: the folder is whole, an estimate from it is
-    not one to rely on.
+    Its motion is found in a second: no estimate from it is one to rely on.
 
     Raises:
         CampaignFolderError: the folder holds something already.
@@ -52,12 +51,9 @@ def run_campaign(root: Path, cell: Cell) -> Campaign:
 
 
 def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
-    """A fresh simulated controller of a cell, with the faults that are its own.
+    """A fresh simulated controller of a cell with a table [simulation], with faults of its own.
 
-    Args:
-        cell: has a table [simulation].
-        lines: what goes wrong, as `hil simulate --fault` takes it; faults of the link are read
-            and left to the link.
+    `lines` say what goes wrong as `hil simulate --fault` takes it; faults of the link are ignored.
 
     Raises:
         FaultScriptError: a line describes no fault.
@@ -69,10 +65,7 @@ def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
 def faulty_link(cell: Cell, *lines: str, controller: SimulatedController | None = None) -> Link:
     """A link in virtual time to a simulated controller, not yet connected.
 
-    Args:
-        cell: has a table [simulation].
-        lines: what goes wrong with link and controller.
-        controller: `faulty_controller` of the same lines, where it is at hand.
+    `controller` is `faulty_controller` of the same lines, where it is at hand.
 
     Raises:
         FaultScriptError: a line describes no fault.
@@ -115,14 +108,7 @@ class UdpController:
         faults: Sequence[str] = (),
         options: Sequence[str] = (),
     ) -> Iterator[UdpController]:
-        """Start one for a cell; it is ended when this is left.
-
-        Args:
-            cell: has a table [simulation].
-            folder: where its cell file is written.
-            faults: lines as `hil simulate --fault` takes them.
-            options: further options of `hil simulate`.
-        """
+        """Start one, its cell file in `folder`, with faults and options of `hil simulate`."""
         port = free_port()
         path = folder / "udp_cell.toml"
         linked = cell.with_link(transport="udp", host=LOOPBACK, port=port, bind=LOOPBACK)
@@ -153,11 +139,10 @@ class UdpController:
         self._simulator.process.send_signal(signal.SIGUSR2)
 
     def finish(self) -> dict[str, Any]:
-        """End the session (the arm stands, the drive goes off, then mode 504).
+        """End the session: the arm stands, the drive goes off, then mode 504.
 
         Returns:
-            what it counted, see `docs/simulate.md`: cycles, replies, missed, late, intervals, …;
-            nothing if it had to be killed.
+            what it counted, see `docs/simulate.md`; nothing if it had to be killed.
         """
         if self._summary is None:
             self._simulator.finish()
