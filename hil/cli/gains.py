@@ -13,6 +13,7 @@ from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
 from hil.identify.gain_run import GainsFound, find_gains
+from hil.identify.sources import archives_in
 from hil.progress import reporter as make_reporter
 from identification.model.payload import Payload
 
@@ -34,9 +35,9 @@ def gains(
     the data cannot determine is named, and gets "nan", which neither accepts: exit status 5.
 
     Options:
-        archives: Archives with motor currents (*.mcap). One whose cell has a [robot.payload] was
-            recorded with it, the others without load.
-        loaded: Archive recorded with the payload of --mass; may be repeated.
+        archives: Archives with motor currents (*.mcap), or folders of them. One whose cell has a
+            [robot.payload] was recorded with it, the others without load.
+        loaded: Archive or folder recorded with the payload of --mass; may be repeated.
         mass: Mass of that payload in kg.
         centre: Its centre of mass in the frame, x,y,z in m.
         inertia: Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of the
@@ -44,17 +45,18 @@ def gains(
         frame: Link of the URDF whose frame that is; the last joint's if left out.
         delay: Time in s by which currents lag positions; the cell's if left out.
     """
-    twice = {path.resolve() for path in archives} & {path.resolve() for path in loaded or []}
+    bare, full = [*archives_in(archives)], [*archives_in(loaded or [])]
+    twice = {path.resolve() for path in bare} & {path.resolve() for path in full}
     if twice:
         raise InputError(twice.pop(), "is named with load and without", remedy="name it once")
     if mass is not None and not loaded:
         raise _refusal("--mass", "which recording was made with it?", "add --loaded")
     payload = _payload(mass, centre, inertia, frame) if loaded else None
-    carried = {path: payload for path in loaded or [] if payload is not None}
+    carried = {path: payload for path in full if payload is not None}
     lag = delay_from(delay)
     if lag == "auto":
         raise _refusal("--delay", "cannot be found from currents", "give seconds")
-    found = find_gains(archives, carried, make_reporter(quiet=quiet or json), delay=lag)
+    found = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
     if json:
         print_json(as_dict(found))
     else:

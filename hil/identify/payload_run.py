@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -10,11 +10,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
-from hil.reading import lies_there
 from identification.estimators.payload import (
     NAMES,
     Difference,
@@ -30,7 +28,7 @@ from identification.model.robot import RobotModel
 from .options import Options
 from .prepared import prepare_sources
 from .settings import samples_of, signals_of
-from .sources import aligned, gather_sources, refuse_duplicates
+from .sources import aligned, archives_in, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
 
@@ -224,7 +222,7 @@ def find_payload(
         InputError: archives cannot be used, are of two arms, carry two payloads or none.
         IdentificationError: the recordings do not determine the mass.
     """
-    sides = {False: list(_archives(bare)), True: list(_archives(loaded))}
+    sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
     if not sides[False] or not sides[True]:
         raise InputError(
             None,
@@ -298,27 +296,6 @@ def flange_of(model: RobotModel) -> str:
     }
     named = next((name for name in _FLANGES if name in last), None)
     return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))
-
-
-def _archives(paths: Sequence[Path]) -> Iterator[Path]:
-    """Archives, and those of folders."""
-    for path in paths:
-        if not path.is_dir():
-            yield path
-            continue
-        folder = CampaignFolder(path)
-        if lies_there(path / "manifest.json"):
-            kinds = ("excitation", "validation", "standstill")
-            inside = [archive for kind in kinds for archive in folder.completed(kind)]
-        else:
-            inside = sorted(path.glob("*.mcap"))
-        if not inside:
-            raise InputError(
-                path,
-                "holds no whole archive",
-                remedy="name archives (*.mcap) or the folder of a campaign that was run",
-            )
-        yield from inside
 
 
 def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import file_digest
+from hil.reading import lies_there
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.noise import standstill_variance
@@ -248,6 +249,31 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
         replace(source, origin=float(latest + offset))
         for source, offset in zip(sources, offsets, strict=True)
     ), True
+
+
+def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
+    """Archives, and those of folders, of campaigns the whole ones.
+
+    Raises:
+        InputError: a folder has none.
+    """
+    for path in paths:
+        if not path.is_dir():
+            yield path
+            continue
+        folder = CampaignFolder(path)
+        if lies_there(path / "manifest.json"):
+            kinds = ("excitation", "validation", "standstill")
+            inside = [archive for kind in kinds for archive in folder.completed(kind)]
+        else:
+            inside = sorted(path.glob("*.mcap"))
+        if not inside:
+            raise InputError(
+                path,
+                "holds no whole archive",
+                remedy="name archives (*.mcap) or the folder of a campaign that was run",
+            )
+        yield from inside
 
 
 def refuse_duplicates(paths: Sequence[Path]) -> None:

@@ -122,6 +122,14 @@ def test_what_cannot_be_used_is_refused(
         run(folder, *arguments)
 
 
+def test_a_folder_stands_for_its_archives(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no whole archive; name archives"):
+        run(folder, str(tmp_path))
+    (tmp_path / "empty.mcap").symlink_to(folder / "empty.mcap")
+    _, text = run(folder, str(tmp_path), *BOTH, "--json")
+    assert json.loads(text)["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
+
+
 def test_without_any_payload_nothing_is_determined(folder: Path) -> None:
     with pytest.raises(Exception, match="no recording has a known payload"):
         run(folder, "empty.mcap")
