@@ -571,9 +571,9 @@ class Screen:
         joint_names: of the n joints.
         stop: set by the keys s and q.
         title: of the run.
-        far_end: what is moved, for the first line: `SIMULATED`, or the controller's address.
+        far_end: what is moved: `SIMULATED`, or the controller's address.
         virtual: whether the controller's time is; the time left is that of waiting all the same.
-        quiet: show nothing; keys are not read either.
+        quiet: show nothing and read no keys.
         console: written to; standard output if left out.
     """
 

@@ -197,8 +197,8 @@ def serve_session(
         far_end: its link.
         pressed: the buttons.
         faults: what the link does to packets, counted from each start.
-        patience: seconds that the arm may take to come to rest at the end.
-        stretch: seconds by which a cycle may be made longer to wait for its answer.
+        patience: for the arm to come to rest at the end [s].
+        stretch: by which a cycle may be made longer to wait for its answer [s].
         watch: called every cycle with the counts so far.
 
     Raises:

@@ -47,14 +47,9 @@ _GEARED: Final = 10.0  # turns of the motor per turn of the joint
 def robot_model(
     path: Path, urdf_name: str, urdf: str, robot: RobotTable, drive_train: Callable[[], Array]
 ) -> RobotModel:
-    """Build the model of a cell.
+    """Build the model of a cell, of a file `path` that calls the URDF `urdf_name`.
 
-    Args:
-        path: of the cell file, for errors.
-        urdf_name: of the robot description, as the file names it.
-        urdf: its text.
-        robot: the table.
-        drive_train: gives the motor angles per joint angle (n, n) of `[drive_train]`.
+    `drive_train` gives the motor angles per joint angle (n, n) of `[drive_train]`.
 
     Raises:
         CellError: names the field that is to blame.

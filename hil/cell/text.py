@@ -50,11 +50,9 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
 
 
 def with_values(text: str, values: Mapping[str, Any]) -> str:
-    """The TOML `text` with other values, by dotted name; a table that is not there is added.
+    """The TOML `text` with other values, such as ``{"campaign.repetitions": 3}``; None keeps one.
 
-    Args:
-        text: of a cell file; its comments and order stay.
-        values: such as ``{"campaign.repetitions": 3}``; None keeps what stands there.
+    Comments and order stay; a table that is not there is added.
 
     Raises:
         NoTableError: a table is there, and not written as one.

@@ -136,6 +136,7 @@ def _check_lines(found: Check) -> list[str]:
 
 
 def _check_dict(found: Check) -> dict[str, Any]:
+    faults = {aspect: list(found.faults.get(aspect, ())) for aspect in ASPECTS}
     return {
         "file": str(found.path),
         "archive": True,
@@ -143,13 +144,7 @@ def _check_dict(found: Check) -> dict[str, Any]:
         "version": found.version,
         "samples": found.samples,
         "repaired": found.repaired,
-        "aspects": {
-            aspect: {
-                "keeps": aspect not in found.faults,
-                "faults": list(found.faults.get(aspect, ())),
-            }
-            for aspect in ASPECTS
-        },
+        "aspects": {name: {"keeps": not some, "faults": some} for name, some in faults.items()},
     }
 
 

@@ -114,13 +114,7 @@ def print_json(document: object) -> None:
 def figures(
     texts: Sequence[str], option: str, example: str, *, bare: bool = True
 ) -> dict[str, float]:
-    """Numbers by name, from texts NAME=NUMBER.
-
-    Args:
-        texts: as typed.
-        option: that they were typed behind.
-        example: of one that can be used.
-        bare: whether a NAME alone stands for NAME=0.
+    """Numbers by name, from texts NAME=NUMBER behind an option; NAME alone is 0 where `bare`.
 
     Raises:
         InputError: what stands behind the = is no number.

@@ -60,9 +60,6 @@ def read_plan_file(path: Path) -> PlanFile:
 def planned_again(path: Path, cell: Cell) -> MotionPlan:
     """Plan the moves of a file for the limits of a cell.
 
-    A motion that the file holds is first checked against its own moves and limits, so that
-    moves which were edited never stand beside a motion that is not theirs.
-
     Raises:
         InputError: the file cannot be read, is for another arm, or holds a motion that breaks
             its limits or is not what its moves plan to.
@@ -183,12 +180,8 @@ def plan(
         picture: Draw the plan (*.png, *.svg, *.pdf).
     """
     if output is not None and output.suffix.lower() not in PLAN_FILES:
-        raise InputError(
-            output,
-            f"{output.suffix!r} is no plan file",
-            field="--output",
-            remedy=f"use {' or '.join(PLAN_FILES)}",
-        )
+        problem, remedy = f"{output.suffix!r} is no plan file", f"use {' or '.join(PLAN_FILES)}"
+        raise InputError(output, problem, field="--output", remedy=remedy)
     if picture is not None:
         check_format(picture)
     if rate is not None and not (isfinite(rate) and rate > 0.0):
@@ -216,13 +209,9 @@ def plan(
     if rate is None:
         rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
     if csv is not None and planned.duration * rate > _MOST_ROWS:
-        raise InputError(
-            None,
-            f"{rate:g} rows a second of a motion of {planned.duration:.3f} s are too many for a "
-            "table",
-            field="--rate",
-            remedy=f"give a lower rate; at most {_MOST_ROWS} rows are written",
-        )
+        problem = f"{rate:g} rows a second of {planned.duration:.3f} s are too many for a table"
+        remedy = f"give a lower rate; at most {_MOST_ROWS} rows are written"
+        raise InputError(None, problem, field="--rate", remedy=remedy)
     if json:
         print_json(_summary(planned, loaded, frame))
     else:

@@ -173,11 +173,9 @@ def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[
 
 def _above(folders: Sequence[str]) -> str:
     """The folder that all of them are in, with its slash; "" if there is none or only one."""
-    if len(set(folders)) < 2:
-        return ""
     parts = zip(*(folder.split("/")[:-1] for folder in folders), strict=False)
     shared = [same[0] for same in takewhile(lambda same: len(set(same)) == 1, parts)]
-    return "/".join([*shared, ""]) if shared else ""
+    return "/".join([*shared, ""]) if shared and len(set(folders)) > 1 else ""
 
 
 def unused_lines(broken: Sequence[Broken]) -> Iterator[str]:

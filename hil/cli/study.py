@@ -7,9 +7,9 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -19,8 +19,6 @@ from hil.errors import OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.study import run_study, study_settings
 from hil.study.results import summary_of
-
-_DEFAULT: Final = signal.SIG_DFL
 
 
 def study(
@@ -77,14 +75,10 @@ def study(
 @contextmanager
 def _ended_like_ctrl_c() -> Iterator[None]:
     """A terminal that is closed, or `kill`, ends the study's own processes with it."""
-    if threading.current_thread() is not threading.main_thread():
+    in_main = threading.current_thread() is threading.main_thread()
+    with ExitStack() as undo:
+        for one in (signal.SIGTERM, signal.SIGHUP) if in_main else ():
+            if signal.getsignal(one) is signal.SIG_DFL:  # nohup ignores the second on purpose
+                undo.callback(signal.signal, one, signal.SIG_DFL)
+                signal.signal(one, signal.default_int_handler)
         yield
-        return
-    endings = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is _DEFAULT]
-    for one in endings:  # nohup ignores the second on purpose
-        signal.signal(one, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for one in endings:
-            signal.signal(one, _DEFAULT)

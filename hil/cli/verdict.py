@@ -22,21 +22,20 @@ _LEVELS: Final = {"wrong": "WRONG", "doubtful": "note", "information": "info", "
 def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
     """Print what was found to stderr and the verdict last; exit 5 if the model is not good.
 
-    Args:
-        results: of the identification.
-        json: print verdict, findings and figures as one JSON object instead.
-        quiet: print only the verdict and its warnings.
+    With `json` verdict, findings and figures are one JSON object; with `quiet` only the verdict and
+    its warnings are printed.
     """
     if json:
         typer.echo(as_json(results))
     else:
+        lines = sentences(results, quiet=quiet)
+        if results.calibration is not None and not quiet:
+            lines.insert(0, results.calibration.words(results.joint_names))
+        if results.fitted is not None and not quiet:
+            lines.insert(0, results.fitted.words)
         for line in [] if quiet else table(results):
             typer.echo(line, err=True)
-        if results.fitted is not None and not quiet:
-            say(results.fitted.words, err=True)
-        if results.calibration is not None and not quiet:
-            say(results.calibration.words(results.joint_names), err=True)
-        for line in sentences(results, quiet=quiet):
+        for line in lines:
             say(line, err=True)
         say(results.verdict.line)
     if not results.verdict.good:

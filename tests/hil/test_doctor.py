@@ -39,7 +39,6 @@ from hil.doctor.diagnosis import (
     as_json,
     disk_trial,
     examine,
-    histogram,
     judge,
     measure,
     obtained,
@@ -64,21 +63,6 @@ def test_a_stall_costs_as_many_cycles_as_it_is_long() -> None:
     assert stall.late_cycles(1e-3) == 8
     assert stall.late_cycles(2e-3) == 4
     assert latency(1e-3 - 2 * RESERVE).late_cycles(1e-3) == 0
-
-
-@given(samples)
-def test_every_sample_is_in_one_bar(values: list[float]) -> None:
-    measured = latency(*values)
-    assert sum(measured.histogram().values()) == len(values)
-
-
-@given(samples, st.floats(0.1, 99.9))
-def test_a_percentile_is_a_sample_that_so_many_do_not_exceed(
-    values: list[float], percent: float
-) -> None:
-    found = latency(*values).percentile(percent)
-    assert found in values
-    assert np.mean(np.array(values) <= found) >= percent / 100 - 1e-12
 
 
 @given(samples, st.floats(0.0, 0.01))
@@ -200,11 +184,6 @@ def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit() -> None:
     assert "use 2 ms" in page(two=True)
     assert "Neither 1 ms nor 2 ms is fit." in page(two=False)
     assert "use 2 ms" not in page(two=False)
-
-
-def test_one_stall_among_many_still_has_a_bar() -> None:
-    lines = list(histogram(latency(*np.full(60_000, 30e-6), 8e-3)))
-    assert "█" in lines[-1]
 
 
 def test_the_json_says_what_the_page_says() -> None:
