@@ -103,11 +103,9 @@ def writing_to(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(
-            folder,
-            f"cannot be written to ({os.strerror(error.errno) if error.errno else error})",
-            remedy="make room, or name another folder",
-        ) from error
+        problem = f"cannot be written to ({os.strerror(error.errno) if error.errno else error})"
+        remedy = "make room, or name another folder"
+        raise InputError(folder, problem, remedy=remedy) from error
 
 
 def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:

@@ -73,11 +73,9 @@ def rewrite_report(folder: Path) -> Results:
         page = report_bytes(results, series)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         # What was written by us can be drawn; what somebody wrote has lists of any length.
-        raise InputError(
-            folder / RESULTS,
-            f"holds what no page can be drawn from ({error})",
-            remedy="identify again from the archives (`hil identify`)",
-        ) from error
+        problem = f"holds what no page can be drawn from ({error})"
+        remedy = "identify again from the archives (`hil identify`)"
+        raise InputError(folder / RESULTS, problem, remedy=remedy) from error
     write_together(folder, {REPORT: page})
     return results
 
@@ -121,11 +119,9 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
         series = ReportSeries(**(arrays | words))
         return series.checked_for(n_joints)
     except Exception as error:  # a forged archive makes its readers raise anything
-        raise InputError(
-            path,
-            f"does not hold the series of a report ({error})",
-            remedy="identify again from the archives (`hil identify`)",
-        ) from error
+        problem = f"does not hold the series of a report ({error})"
+        remedy = "identify again from the archives (`hil identify`)"
+        raise InputError(path, problem, remedy=remedy) from error
 
 
 def _require_bounded(stream: BinaryIO) -> None:

@@ -46,19 +46,15 @@ def open_far_end(
         FarEndError: impossible to open, or unfit for the session.
     """
     if (udp is None) == (can is None):
-        raise InputError(
-            None, "a link has to be named, one of them", remedy="give --udp or --can, not both"
-        )
+        remedy = "give --udp or --can, not both"
+        raise InputError(None, "a link has to be named, one of them", remedy=remedy)
     if can is not None:
         return _bus(can, settings, n_axes)
     host, _, port_text = (udp or "").rpartition(":")
     port = port_number(port_text)
     if not host or port is None:
-        raise InputError(
-            None,
-            f"--udp {udp!r} is not an address",
-            remedy="write HOST:PORT, for instance 127.0.0.1:2001",
-        )
+        remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
+        raise InputError(None, f"--udp {udp!r} is not an address", remedy=remedy)
     return UdpFarEnd(host, port)
 
 
@@ -66,17 +62,14 @@ def _bus(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
     if profile not in ("fd", "classic"):
-        raise InputError(
-            None,
-            f"--can {text!r} ends in {profile!r}, which is neither of the profiles fd and classic",
-            remedy="end it with :fd or :classic (a channel with a colon in it needs one of them)",
+        problem = (
+            f"--can {text!r} ends in {profile!r}, which is neither of the profiles fd and classic"
         )
+        remedy = "end it with :fd or :classic (a channel with a colon in it needs one of them)"
+        raise InputError(None, problem, remedy=remedy)
     if not (interface and channel):
-        raise InputError(
-            None,
-            f"--can {text!r} is not a bus",
-            remedy="write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic",
-        )
+        remedy = "write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic"
+        raise InputError(None, f"--can {text!r} is not a bus", remedy=remedy)
     from sim_fixtures import can_end  # python-can is slow to load
 
     moved_by_pc = settings.corrected or not settings.own_motion
@@ -146,11 +139,9 @@ def undisturbed(priority: int | None) -> Iterator[None]:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         except OSError as error:
-            raise InputError(
-                None,
-                f"the system refuses a real-time priority of {priority} ({error.strerror})",
-                remedy="leave --priority out, or raise the limit (ulimit -r) or run as root",
-            ) from error
+            problem = f"the system refuses a real-time priority of {priority} ({error.strerror})"
+            remedy = "leave --priority out, or raise the limit (ulimit -r) or run as root"
+            raise InputError(None, problem, remedy=remedy) from error
     with suppress(OSError, AttributeError):  # else timers are batched with others, 50 µs
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.collect()

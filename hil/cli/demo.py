@@ -78,11 +78,9 @@ def demo(
     reporter = make_reporter(quiet=quiet or json)
     if resume:
         if excitation is not None:
-            raise InputError(
-                excitation,
-                "cannot be run in a campaign that has an excitation already",
-                remedy="leave out --excitation, or name another folder",
-            )
+            problem = "cannot be run in a campaign that has an excitation already"
+            remedy = "leave out --excitation, or name another folder"
+            raise InputError(excitation, problem, remedy=remedy)
         campaign = Campaign.open(output)
     else:
         _refuse_what_is_not_ours(output, force=force)

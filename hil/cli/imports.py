@@ -200,12 +200,9 @@ def log(
 
     def recorded() -> tuple[str, ...]:
         if found.joints is None:
-            raise InputError(
-                columns,
-                "does not say which joints were recorded",
-                field="joints",
-                remedy="--lock-others needs joints = [...], the URDF's joint of each column",
-            )
+            problem = "does not say which joints were recorded"
+            remedy = "--lock-others needs joints = [...], the URDF's joint of each column"
+            raise InputError(columns, problem, field="joints", remedy=remedy)
         return found.joints
 
     path = import_log(

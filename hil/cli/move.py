@@ -70,9 +70,8 @@ def move(
             others have to stay closed.
     """
     if (to is None) == (joint is None) or (joint is None) != (by is None):
-        raise InputError(
-            None, "where is the arm to go?", remedy="give either --to, or --joint and --by"
-        )
+        remedy = "give either --to, or --joint and --by"
+        raise InputError(None, "where is the arm to go?", remedy=remedy)
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
     axis = axis_alone(cell, joint) if only_axis else None
@@ -113,11 +112,9 @@ def move(
         else:
             make_folder(own.archives)
             path = own.archives / own.next_name("move", 0).filename
-        reporter = make_reporter(quiet=json)
-        with stop_on_interrupt() as stop, reporter.task("moving (s)", way.duration) as task:
-            durable = cell.controller.transport != "simulated"
-            watch = _Shown(task)
-            ended = send(way, cell, link, path, stop=stop, watch=watch, durable=durable)
+        bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
+        with stop_on_interrupt() as stop, bar.task("moving (s)", way.duration) as task:
+            ended = send(way, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
             stopped = stop.requested
         if own is not None:
             own.add(path.name, ended.outcome)
@@ -147,20 +144,17 @@ def move(
 
 
 class _Shown:
-    """Moves the bar on with the arm; only Ctrl-C stops the motion."""
+    """Moves the bar on with the arm; only Ctrl-C stops the motion, which is run as planned."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._done = task, 0.0
+        self.request = OperatorRequest
 
     def show(self, progress: MotionProgress) -> None:
         """Look at the motion."""
         done = max(self._done, progress.motion_time or 0.0)
         self._task.advance(done - self._done)
         self._done = done
-
-    def request(self) -> OperatorRequest:
-        """The motion as it was planned."""
-        return OperatorRequest()
 
 
 @contextmanager

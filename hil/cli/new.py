@@ -112,13 +112,8 @@ def new(
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
     if json:
-        summary = {
-            "cell": str(output),
-            "joints": list(made.joint_names),
-            "unknown": list(unknown),
-            "notes": list(known.notes),
-        }
-        print_json(summary)
+        found = {"joints": made.joint_names, "unknown": unknown, "notes": known.notes}
+        print_json({"cell": str(output), **found})
         return
     for note in known.notes:
         say(f"note: {note}")
@@ -138,9 +133,8 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     host, _, port_text = address.partition(":")
     port = port_number(port_text or str(PORT))
     if not host or port is None:
-        raise InputError(
-            None, f"{address!r} is no HOST or HOST:PORT", remedy="e.g. 10.2.12.150:1000"
-        )
+        remedy = "e.g. 10.2.12.150:1000"
+        raise InputError(None, f"{address!r} is no HOST or HOST:PORT", remedy=remedy)
     if not quiet:
         typer.echo(
             f"listening on {bind}:{port}; now start the controller's Open program at {host} "
@@ -157,8 +151,7 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
 def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:
     """Refuse to replace a file that is there, and the URDF that is read in any case."""
     if own is not None and path.resolve() == own.resolve():
-        raise InputError(
-            path, "is the URDF itself, of which a copy is needed", remedy="name another --output"
-        )
+        problem = "is the URDF itself, of which a copy is needed"
+        raise InputError(path, problem, remedy="name another --output")
     if path.exists() and not force:
         raise InputError(path, "exists already", remedy="name another --output, or add --force")

@@ -89,10 +89,7 @@ def _box(shape: tuple[str, float, float, float] | None) -> tuple[float, float, f
         return None
     kind, x, y, z = shape
     if kind != "box" or not all(math.isfinite(edge) and edge > 0.0 for edge in (x, y, z)):
-        raise InputError(
-            None,
-            f"{kind} {x:g} {y:g} {z:g} is no shape",
-            field="--shape",
-            remedy="give box and three edges above 0 m, such as box 0.2 0.1 0.1",
-        )
+        problem = f"{kind} {x:g} {y:g} {z:g} is no shape"
+        remedy = "give box and three edges above 0 m, such as box 0.2 0.1 0.1"
+        raise InputError(None, problem, field="--shape", remedy=remedy)
     return x, y, z

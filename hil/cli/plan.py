@@ -67,12 +67,9 @@ def planned_again(path: Path, cell: Cell) -> MotionPlan:
     """
     file = read_plan_file(path)
     if file.joint_names != cell.joint_names:
-        raise InputError(
-            path,
-            f"is for the joints {', '.join(file.joint_names)}",
-            field="joints",
-            remedy=f"those of the cell are {', '.join(cell.joint_names)}",
-        )
+        problem = f"is for the joints {', '.join(file.joint_names)}"
+        remedy = f"those of the cell are {', '.join(cell.joint_names)}"
+        raise InputError(path, problem, field="joints", remedy=remedy)
     if file.trajectory is not None:
         own = file if file.limits is not None else replace(file, limits=cell.joint_limits)
         try:
@@ -91,11 +88,8 @@ def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
     try:
         return in_child(function, *args, **kwargs)
     except (PlannerCrashed, PlanningTimedOut) as error:
-        raise InputError(
-            None,
-            f"this motion cannot be planned: {error}",
-            remedy="move a via point a little, plan fewer, or ask for another fly or speed",
-        ) from error
+        remedy = "move a via point a little, plan fewer, or ask for another fly or speed"
+        raise InputError(None, f"this motion cannot be planned: {error}", remedy=remedy) from error
 
 
 def read_via_points(path: Path, frame: AngleFrame) -> Array:

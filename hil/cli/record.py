@@ -97,12 +97,11 @@ def record(
 
 def _early_end(path: Path, done: Recorded, duration: float | None) -> HilError | None:
     """What to say of a recording that is not what was asked for."""
+    if done.outcome == "completed" and (duration is None or done.seconds >= duration):
+        return None
     if done.outcome == "completed":
-        if duration is None or done.seconds >= duration:
-            return None
-        return ControllerFault(
-            f"{done.reason} after {done.seconds:.1f} s of {duration:g} s; {path} is whole."
-        )
+        reached = f"after {done.seconds:.1f} s of {duration:g} s"
+        return ControllerFault(f"{done.reason} {reached}; {path} is whole.")
     if done.outcome == "stopped" and done.reason == "ended by the operator":
         return OperatorStopError(f"the recording was ended early; {path} is whole.")
     return ControllerFault(f"{done.reason}; {path} is whole up to there.")
@@ -124,8 +123,8 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
 
 
 def _report(path: Path, done: Recorded, cell: Cell) -> None:
-    lost = f", {done.records_lost} records LOST" if done.records_lost else ""
-    lost += f", {done.events_lost} events LOST" if done.events_lost else ""
+    losses = {"records": done.records_lost, "events": done.events_lost}
+    lost = "".join(f", {count} {what} LOST" for what, count in losses.items() if count)
     say(
         f"{path}: {done.records * cell.period:.1f} s in {done.records} cycles, {done.missed} "
         f"packets missed, {done.late} answers late, {done.untaken} not accepted{lost}; "
@@ -182,10 +181,10 @@ class View:
         if not progress.heard:
             table = self._cell.controller
             who = table.host if table.transport == "udp" else "the controller"
-            elsewhere = f"({progress.foreign} packets from elsewhere)"
+            what = f"nothing heard from {who}"
             if progress.not_understood:
-                return f"{who}: {progress.not_understood} {elsewhere}"
-            return f"nothing heard from {who} {elsewhere}"
+                what = f"{who}: {progress.not_understood}"
+            return f"{what} ({progress.foreign} packets from elsewhere)"
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",

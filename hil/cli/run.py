@@ -69,18 +69,12 @@ def run(
         live: Let Foxglove look at the run as it goes on; on 127.0.0.1 unless a HOST is named.
     """
     if dry_run and accept_dry_run:
-        raise InputError(
-            None,
-            "--dry-run and --accept-dry-run together",
-            remedy="run the one, look at the arm, then the other",
-        )
+        remedy = "run the one, look at the arm, then the other"
+        raise InputError(None, "--dry-run and --accept-dry-run together", remedy=remedy)
     if payload is not None and (dry_run or no_identify):
-        raise InputError(
-            None,
-            "does its own dry runs, and weighs what it records",
-            field="--payload",
-            remedy="leave out --dry-run and --no-identify",
-        )
+        problem = "does its own dry runs, and weighs what it records"
+        remedy = "leave out --dry-run and --no-identify"
+        raise InputError(None, problem, field="--payload", remedy=remedy)
     opened = Campaign.open(campaign)
     if rehearse:
         with stop_on_interrupt() as stop:
@@ -101,24 +95,16 @@ def run(
 
 
 def _weigh(
-    campaign: Campaign,
-    name: str,
-    choices: Mapping[str, Any],
-    *,
-    live: str | None,
-    quiet: bool,
+    campaign: Campaign, name: str, choices: Mapping[str, Any], live: str | None, quiet: bool,
     json: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Record pairs and weigh; a simulated arm mounts by itself."""
     silent = quiet or json
     simulated = campaign.cell.controller.transport == "simulated"
     if not simulated and (silent or not can_read(sys.stdin)):
-        raise InputError(
-            None,
-            "needs somebody at a terminal who mounts the payload",
-            field="--payload",
-            remedy="record both by `hil run` or `hil record`: `hil payload BARE --loaded LOADED`",
-        )
+        problem = "needs somebody at a terminal who mounts the payload"
+        remedy = "record both by `hil run` or `hil record`: `hil payload BARE --loaded LOADED`"
+        raise InputError(None, problem, field="--payload", remedy=remedy)
 
     def mount(load: bool) -> bool:
         deed = f"Mount {name}" if load else f"Take {name} off"
@@ -190,16 +176,11 @@ def _tell(result: RunResult, *, json: bool) -> None:
     for note in result.notes:
         say(note)
     for one in result.rejected:
-        say(f"{_both(one.archive)}: {one.reason}")
+        name = ArchiveName.parse(one.archive)
+        what = one.archive if name is None else f"{name.motion} ({one.archive})"
+        say(f"{what}: {one.reason}")
     if result.dry_run == "to be accepted":
         known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
-        right = (
-            "you know why, and the motions looked right" if known else "the motions looked right"
-        )
-        say(f"if {right}, go on with `hil run {result.campaign} --accept-dry-run{known}`")
-
-
-def _both(archive: str) -> str:
-    """What a person calls the motion, and its archive."""
-    name = ArchiveName.parse(archive)
-    return archive if name is None else f"{name.motion} ({archive})"
+        why = "you know why, and " if known else ""
+        command = f"`hil run {result.campaign} --accept-dry-run{known}`"
+        say(f"if {why}the motions looked right, go on with {command}")

@@ -282,12 +282,9 @@ def simulate(
 def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     postures = own_postures(cell)
     if not postures:
-        raise InputError(
-            cell.path,
-            "no posture about its home can be reached clear of floor, walls and the arm itself",
-            field="campaign.home_deg",
-            remedy="leave --own-motion out, or give the arm more room",
-        )
+        problem = "no posture about it can be reached clear of floor, walls and the arm itself"
+        remedy = "leave --own-motion out, or give the arm more room"
+        raise InputError(cell.path, problem, field="campaign.home_deg", remedy=remedy)
     return postures
 
 

@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -31,7 +31,7 @@ from hil.progress import Reporter
 from hil.terminal_text import printable
 
 from . import machine
-from .check import Check, Status, System, bad
+from .check import Check, Status, System, bad, named
 from .link import link_checks
 from .machine import DiskTrial, disk_checks
 
@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from hil.cell.schema import ControllerTable
 
 RESERVE: Final = 100e-6
-"""s of a cycle reserved for what a bare measurement leaves out: session and guard (20 µs, at most
-40),
-the packet on the wire both ways (25 µs each at 100 Mbit/s), the card's interrupt."""
+"""s of a cycle for what a bare measurement leaves out: session and guard (20 µs, at most 40), the
+packet on the wire both ways (25 µs each at 100 Mbit/s), the card's interrupt."""
 EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]) * 1e-6
 """s, bounds of the histogram's bars."""
 
@@ -94,17 +93,12 @@ _CONFIDENCE: Final = 0.95
 
 @dataclass(frozen=True)
 class Fitness:
-    """The verdict on one cycle.
+    """The verdict on one cycle by `CRITERIA`; figures are None if nothing was measured.
 
     Attributes:
-        cycle_ms: the controller's cycle.
-        fit: by `CRITERIA`.
-        late_cycles: in the measurement.
-        share_used: largest 99.9 % latency plus reserve, as a share of the cycle; None if nothing
-            was measured.
+        share_used: largest 99.9 % latency plus reserve, as a share of the cycle.
         late_per_hour_upper_95: upper bound of the rate with 95 % confidence, one-sided, for late
             cycles that come independently of each other (Poisson). Those of one long stall do not.
-        reason: in words.
     """
 
     cycle_ms: int
@@ -185,12 +179,11 @@ def run_probe(
     )
     began, shown, output = time.monotonic(), 0.0, ""
     try:
-        while (passed := time.monotonic() - began) < seconds + _GRACE:
+        while not output and (passed := time.monotonic() - began) < seconds + _GRACE:
             advance(min(passed, seconds) - shown)
             shown = min(passed, seconds)
             with suppress(subprocess.TimeoutExpired):
-                output = probe.communicate(timeout=0.2)[0]
-                break
+                output = probe.communicate(timeout=0.2)[0] or "null"
         advance(seconds - shown)
     finally:
         probe.kill()
@@ -198,23 +191,15 @@ def run_probe(
             probe.wait(timeout=1.0)
         if probe.stdout is not None:
             probe.stdout.close()
-    if not output or probe.returncode:
-        return None
-    answer: dict[str, Any] = json.loads(output.splitlines()[-1])
+    answer: dict[str, Any] | None = None
+    if output and not probe.returncode:
+        answer = json.loads(output.splitlines()[-1])
     return answer
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
-
-    Attributes:
-        checks: in the order of a reader's interest.
-        latencies: measured; an empty tuple if no probe ran.
-        cycles: verdicts on 1 and 2 ms.
-        cycle_ms: the cycle that has to be fit.
-        seconds: length of each measurement.
-    """
+    """What was found: verdicts on 1 and 2 ms, of which `cycle_ms` has to be fit."""
 
     checks: tuple[Check, ...]
     latencies: tuple[Latency, ...]
@@ -245,12 +230,9 @@ class Diagnosis:
     def line(self) -> str:
         """The verdict in one or two sentences."""
         one, two = (verdict.fit for verdict in self.cycles)
-        words = {
-            (True, True): "1 ms is fit, and so is 2 ms.",
-            (True, False): "1 ms is fit.",
-            (False, True): "2 ms is fit; 1 ms is not.",
-            (False, False): "Neither 1 ms nor 2 ms is fit.",
-        }[one, two]
+        words = "2 ms is fit; 1 ms is not." if two else "Neither 1 ms nor 2 ms is fit."
+        if one:  # and then 2 ms is
+            words = "1 ms is fit, and so is 2 ms."
         if self.fit:
             words += f" This PC can answer a controller at {self.cycle_ms} ms."
         elif self.cycle_fit:
@@ -269,14 +251,9 @@ def examine(
     place: Path,
     reporter: Reporter,
 ) -> Diagnosis:
-    """Look at this PC and measure it for twice `seconds`.
+    """Look at this PC and measure it for twice `seconds`; archives will be written to `place`.
 
-    Args:
-        controller: of the cell; None without one.
-        cycle_ms: the cycle that has to be fit; the wake-up timer runs at it.
-        seconds: length of each measurement.
-        place: where archives will be written.
-        reporter: shows progress.
+    The wake-up timer runs at `cycle_ms`, the cycle that has to be fit.
     """
     system = System()
     reporter.say("looking at this PC; no packet is sent to the controller")
@@ -292,16 +269,18 @@ def examine(
     periods = {"wake-up": cycle_ms / 1000, "turnaround": TURNAROUND_PERIOD}
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     checks.append(machine.stolen(before, system.text("/proc/stat") or ""))
-    look = "python -m hil.doctor.probe permissions   # says why"
-    failed = replace(bad("the probe gave no figures", look), why="without it nothing is known")
-    checks += [
-        replace(failed, name=f"{name} latency")
-        for name, latency in measured.items()
-        if latency is None
-    ]
+    checks += [_unmeasured(name) for name, latency in measured.items() if latency is None]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
     one, two = (judge(latencies, cycle) for cycle in CYCLES_MS)
     return Diagnosis(tuple(checks), latencies, (one, two), cycle_ms, seconds)
+
+
+@named("{0} latency")
+def _unmeasured(name: str) -> Check:
+    """Without it nothing is known."""
+    del name
+    look = "python -m hil.doctor.probe permissions   # says why"
+    return bad("the probe gave no figures", look)
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
@@ -342,10 +321,9 @@ def histogram(latency: Latency) -> Iterator[str]:
         f"{latency.name}: p50 {p50:.0f}  p99 {p99:.0f}  p99.9 {p999:.0f}  max {worst:.0f} µs, "
         f"{len(latency.samples)} samples in {latency.seconds:g} s"
     )
-    most = math.log1p(len(latency.samples))
     for bounds, count in latency.histogram().items():
-        bar = "█" * math.ceil(_BAR * math.log1p(count) / most)
-        yield f"  {bounds:>10} µs {count:>8} {bar}"
+        share = math.log1p(count) / math.log1p(len(latency.samples))
+        yield f"  {bounds:>10} µs {count:>8} {'█' * math.ceil(_BAR * share)}"
 
 
 def remedies(checks: Sequence[Check]) -> Iterator[str]:

@@ -100,13 +100,9 @@ _MOVE = "# or put the campaign folder on another, local disk"
 
 @dataclass(frozen=True)
 class DiskTrial:
-    """What came of writing to the place of the archives.
+    """What came of writing to the place of the archives: free bytes, seconds of each write.
 
-    Attributes:
-        folder: where it was tried.
-        free: bytes.
-        seconds: of each write, empty if writing failed.
-        error: why it failed.
+    Of none if writing failed; `error` says why.
     """
 
     folder: str
@@ -117,8 +113,7 @@ class DiskTrial:
 
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     """Room and write time; None stands for a disk that gave no answer in time."""
-    space = [] if trial is None else [disk_space(trial)]
-    return [*space, disk_write(place, trial)]
+    return [*([] if trial is None else [disk_space(trial)]), disk_write(place, trial)]
 
 
 @named("disk space")
@@ -184,7 +179,7 @@ def clock_source(system: System) -> Check:
 def governor(system: System) -> Check:
     """A processor that clocks down answers its first packet late."""
     found = {system.text(f"{_CPU}/{cpu}/cpufreq/scaling_governor") for cpu in cpus(system)}
-    names = sorted(name for name in found if name)
+    names = sorted(filter(None, found))
     if names in ([], ["performance"]):
         return ok("".join(names) or "no frequency scaling on this machine")
     setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
@@ -255,21 +250,19 @@ def preemption(system: System) -> Check:
 
 def _preemption_model(system: System) -> str | None:
     """From the scheduler's own file (root), the command line, or how the kernel was built."""
-    for pattern, name in (
-        (r"\((\w+)\)", "/sys/kernel/debug/sched/preempt"),
-        (r"\bpreempt=(\w+)", "/proc/cmdline"),
-    ):
-        if stated := re.search(pattern, system.text(name) or ""):
-            return stated[1]
+    release = system.text("/proc/sys/kernel/osrelease") or ""
     try:
         with gzip.open(system.path("/proc/config.gz"), "rt", errors="replace") as file:
             config = file.read()
     except (OSError, EOFError):
-        release = system.text("/proc/sys/kernel/osrelease") or ""
         config = system.text(f"/boot/config-{release}") or ""
-    for option in ("_NONE", "_VOLUNTARY", "_LAZY", ""):
-        if re.search(rf"^CONFIG_PREEMPT{option}=y$", config, re.MULTILINE):
-            return option[1:].lower() or "full"
+    for pattern, text in (
+        (r"\((\w+)\)", system.text("/sys/kernel/debug/sched/preempt") or ""),
+        (r"\bpreempt=(\w+)", system.text("/proc/cmdline") or ""),
+        (r"^CONFIG_PREEMPT(?:_(NONE|VOLUNTARY|LAZY))?=y$", config),
+    ):
+        if stated := re.search(pattern, text, re.MULTILINE):
+            return (stated[1] or "full").lower()
     return None
 
 

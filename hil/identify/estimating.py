@@ -206,12 +206,9 @@ def required(prior: GaussianPrior | str) -> GaussianPrior:
         InputError: there is none.
     """
     if isinstance(prior, str):
-        raise InputError(
-            None,
-            f"there is no prior to be had: {prior}",
-            field="--estimator prior",
-            remedy="give inertias in the URDF, or use --estimator wls",
-        )
+        problem = f"there is no prior to be had: {prior}"
+        remedy = "give inertias in the URDF, or use --estimator wls"
+        raise InputError(None, problem, field="--estimator prior", remedy=remedy)
     return prior
 
 
@@ -269,12 +266,9 @@ def _by_factor(
     except IdentificationError as error:
         if name != "consistent":
             raise
-        raise InputError(
-            None,
-            f"no physically consistent parameters were found: {error}",
-            field="--estimator consistent",
-            remedy="use --estimator wls and read what its verdict says about consistency",
-        ) from error
+        problem = f"no physically consistent parameters were found: {error}"
+        remedy = "use --estimator wls and read what its verdict says about consistency"
+        raise InputError(None, problem, field="--estimator consistent", remedy=remedy) from error
 
 
 _LOSSES: Final[dict[str, Loss]] = {"huber": Huber(), "tukey": Tukey()}
@@ -369,12 +363,9 @@ def _instrumental(
     model: RobotModel, fitted: Sequence[Samples], found: InstrumentalFit | str
 ) -> tuple[RepeatedEstimate, list[str]]:
     if isinstance(found, str):
-        raise InputError(
-            None,
-            f"there are no instruments: {found}",
-            field="--estimator iv",
-            remedy="record the commanded positions as well, or use --estimator wls",
-        )
+        problem = f"there are no instruments: {found}"
+        remedy = "record the commanded positions as well, or use --estimator wls"
+        raise InputError(None, problem, field="--estimator iv", remedy=remedy)
     result = RepeatedEstimate.of(
         model, found.pooled.estimate, found.each, total_phase(model, fitted)
     )

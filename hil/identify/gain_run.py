@@ -81,11 +81,9 @@ def find_gains(
             # One robot with one drive train; only what it carries may differ.
             same = cell.urdf == first.urdf and np.array_equal(turns, own)
             if not same or cell.model.parameter_names != model.parameter_names:
-                raise ArchiveError(
-                    path,
-                    f"is of another robot, friction law or drive train than {first.path}",
-                    remedy="identify the gains of each robot by themselves",
-                )
+                problem = f"is of another robot, friction law or drive train than {first.path}"
+                remedy = "identify the gains of each robot by themselves"
+                raise ArchiveError(path, problem, remedy=remedy)
             # A torque in the log may be of other gains.
             without = replace(source.recording, torque=np.zeros_like(current))
             settings = stated_settings(cell, replace(FIXED, delay=delay))

@@ -94,22 +94,16 @@ def friction_from(text: str) -> Mapping[str, Any]:
             except ValueError:
                 value = math.nan
             if not 0.0 < value < math.inf:
-                raise InputError(
-                    None,
-                    f"{term.strip()!r} has no figure above zero",
-                    field="--friction",
-                    remedy="write for instance presliding=1e-4",
-                )
+                problem = f"{term.strip()!r} has no figure above zero"
+                remedy = "write for instance presliding=1e-4"
+                raise InputError(None, problem, field="--friction", remedy=remedy)
             entries[kind.option if kind else name] = value
         elif kind is not None and not figure and entries[kind.option] == absent[kind.option]:
             entries[kind.option] = kind.label if kind.option in ABSENT else True
         else:
-            raise InputError(
-                None,
-                f"{term.strip()!r} is no term of friction, or excludes another one",
-                field="--friction",
-                remedy=f"use auto, or some of {FRICTION_TERMS}, with commas between them",
-            )
+            problem = f"{term.strip()!r} is no term of friction, or excludes another one"
+            remedy = f"use auto, or some of {FRICTION_TERMS}, with commas between them"
+            raise InputError(None, problem, field="--friction", remedy=remedy)
     return entries
 
 

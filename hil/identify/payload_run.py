@@ -80,12 +80,9 @@ class PayloadFound:
         found = []
         for name, value in wanted.items():
             if name not in NAMES:
-                raise InputError(
-                    None,
-                    f"{name!r} is no figure of a payload",
-                    field="--check",
-                    remedy=f"use some of {', '.join(NAMES)}, such as mass=4.0",
-                )
+                problem = f"{name!r} is no figure of a payload"
+                remedy = f"use some of {', '.join(NAMES)}, such as mass=4.0"
+                raise InputError(None, problem, field="--check", remedy=remedy)
             low, high = self.estimate.intervals[NAMES.index(name)]
             if not low <= value <= high:
                 unit = _UNITS[name]
@@ -224,11 +221,9 @@ def find_payload(
     """
     sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
     if not sides[False] or not sides[True]:
-        raise InputError(
-            None,
-            "a payload is a difference of recordings without it and with it",
-            remedy="name both: hil payload BARE... --loaded LOADED",
-        )
+        problem = "a payload is a difference of recordings without it and with it"
+        remedy = "name both: hil payload BARE... --loaded LOADED"
+        raise InputError(None, problem, remedy=remedy)
     refuse_duplicates([*sides[False], *sides[True]])
     found = {
         kind: gather_sources(paths, Options().split, in_sample=True)
@@ -239,12 +234,9 @@ def find_payload(
     training = (*found[False].training, *found[True].training)
     for source in training:
         if source.recording.torque is None:
-            raise ArchiveError(
-                source.path,
-                "holds no joint torques, and a payload is weighed in their unit",
-                field="torque",
-                remedy="give drive.torque_constant in the column map",
-            )
+            problem = "holds no joint torques, and a payload is weighed in their unit"
+            remedy = "give drive.torque_constant in the column map"
+            raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
     cell = found[False].cell.without_payload()
     if found[False].plan is None and found[True].plan is None:
         training, _ = aligned(training)
@@ -309,12 +301,9 @@ def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
         for cell in (bare, loaded)
     )
     if differing := [name for name in mine if mine[name] != other[name]]:
-        raise ArchiveError(
-            path,
-            f"is of another arm than {bare.path}: {' and '.join(differing)} differ",
-            field="--loaded",
-            remedy="name bare and loaded recordings of one arm",
-        )
+        problem = f"is of another arm than {bare.path}: {' and '.join(differing)} differ"
+        remedy = "name bare and loaded recordings of one arm"
+        raise ArchiveError(path, problem, field="--loaded", remedy=remedy)
 
 
 def _mixed(found: Difference, path: Path) -> InputError:

@@ -166,12 +166,9 @@ def with_torques(sources: Sources) -> Sources:
         why = "their currents do not look like the weight and inertia of the URDF on any axis"
         why = "" if scale.determined.any() else why
     if why:
-        raise ArchiveError(
-            None,
-            f"the recordings hold no torques, and {why}",
-            field="torque",
-            remedy="give drive.torque_constant in the column map, or find it by `hil gains`",
-        )
+        problem = f"the recordings hold no torques, and {why}"
+        remedy = "give drive.torque_constant in the column map, or find it by `hil gains`"
+        raise ArchiveError(None, problem, field="torque", remedy=remedy)
 
     def with_torque(one: Recording) -> Recording:
         if one.torque is not None or one.motor_current is None:

@@ -124,11 +124,8 @@ def identify_sources(
         return identify_campaign(folder, reporter, options, predict=predict)
     loose = sorted(folder.glob("*.mcap"))  # of `hil record`
     if not loose:
-        raise InputError(
-            folder,
-            "holds neither a campaign nor archives",
-            remedy="name the folder of a campaign (`hil design -o`), or archives (*.mcap)",
-        )
+        remedy = "name the folder of a campaign (`hil design -o`), or archives (*.mcap)"
+        raise InputError(folder, "holds neither a campaign nor archives", remedy=remedy)
     return identify_archives(loose, reporter, options, predict=predict)
 
 
@@ -148,11 +145,9 @@ def identify_campaign(
     kinds = ("excitation", "validation")
     paths = [path for kind in kinds for path in folder.completed(kind)]
     if not paths:
-        raise InputError(
-            root,
-            "its manifest.json names no completed excitation that is still whole",
-            remedy="run the campaign, or name the archives themselves",
-        )
+        problem = "its manifest.json names no completed excitation that is still whole"
+        remedy = "run the campaign, or name the archives themselves"
+        raise InputError(root, problem, remedy=remedy)
     found = identify_archives(
         [*paths, *folder.completed("standstill")],
         reporter,

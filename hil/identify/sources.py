@@ -156,11 +156,9 @@ def gather_sources(
     for archive in archives[1:]:
         for name in ("robot.urdf", "cell.toml"):
             if archive.attachments.get(name) != archives[0].attachments.get(name):
-                raise ArchiveError(
-                    archive.path,
-                    f"carries another {name} than {archives[0].path}",
-                    remedy="identify each cell's archives by themselves",
-                )
+                problem = f"carries another {name} than {archives[0].path}"
+                remedy = "identify each cell's archives by themselves"
+                raise ArchiveError(archive.path, problem, remedy=remedy)
     rest = [source_of(archive, cell, to_fit=False) for archive in by_use["standstill"]]
     every = all_fitted(
         cell,
@@ -268,11 +266,8 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
         else:
             inside = sorted(path.glob("*.mcap"))
         if not inside:
-            raise InputError(
-                path,
-                "holds no whole archive",
-                remedy="name archives (*.mcap) or the folder of a campaign that was run",
-            )
+            remedy = "name archives (*.mcap) or the folder of a campaign that was run"
+            raise InputError(path, "holds no whole archive", remedy=remedy)
         yield from inside
 
 
@@ -338,11 +333,9 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
     """
     recording = recording_of(archive)
     if to_fit and recording.torque is None and recording.motor_current is None:
-        raise ArchiveError(
-            archive.path,
-            "holds no joint torques to fit, and no motor currents",
-            remedy="import torques, or motor currents with gear ratios and torque constants",
-        )
+        problem = "holds no joint torques to fit, and no motor currents"
+        remedy = "import torques, or motor currents with gear ratios and torque constants"
+        raise ArchiveError(archive.path, problem, remedy=remedy)
     useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)

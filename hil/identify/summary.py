@@ -308,11 +308,9 @@ def _planned(sources: Sources) -> Excitation | None:
     try:
         return Excitation.from_dict(plan["excitation"]) if "excitation" in plan else None
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            sources.training[0].name,
-            f"its plan.json holds no excitation that can be read ({error!r})",
-            remedy="identify with the version of hil that recorded it",
-        ) from error
+        problem = f"its plan.json holds no excitation that can be read ({error!r})"
+        remedy = "identify with the version of hil that recorded it"
+        raise InputError(sources.training[0].name, problem, remedy=remedy) from error
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:

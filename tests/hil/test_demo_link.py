@@ -91,8 +91,8 @@ def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
     ("constraints", "complete", "words"),
     [
         ({}, True, ()),
-        ({"collision": False}, True, ("contacts were not looked at",)),
-        ({"current": False}, False, ("currents were not looked at", "stopped before its end")),
+        ({"collision": False}, True, ("the arm itself not looked at",)),
+        ({"current": False}, False, ("motor currents not looked at", "stopped before its end")),
     ],
 )
 def test_what_a_design_was_searched_without_is_said(
