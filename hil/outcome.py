@@ -55,7 +55,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
     write_together(folder, files)
     for name, why in exports.withheld.items():
         reporter.say(f"{name} was not written: {why}")
-    reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.written)}")
+    reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
 
@@ -143,26 +143,19 @@ FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_TEXT, FRICTION_SOURCE, STANDA
 
 @dataclass(frozen=True)
 class Exports:
-    """The files for other tools, and what is not among them.
+    """The files for other tools: text by name, and by name why there is none.
 
-    Attributes:
-        contents: text of each file by name, in the order of writing; None for one that is to be
-            removed if it is there: it would be of other parameters than its neighbours.
-        withheld: why there is none, by the name of each such file.
+    A text of None is to be removed: what is there would be of other parameters than its neighbours.
     """
 
     contents: Mapping[str, str | None]
     withheld: Mapping[str, str]
 
     @property
-    def written(self) -> tuple[str, ...]:
-        """Names of the files that there are."""
-        return tuple(name for name, text in self.contents.items() if text is not None)
-
-    @property
     def result(self) -> ExportResult:
         """As it goes into `results.json`."""
-        return ExportResult(written=list(self.written), withheld=dict(self.withheld))
+        written = [name for name, text in self.contents.items() if text is not None]
+        return ExportResult(written=written, withheld=dict(self.withheld))
 
 
 def exports_of(
@@ -173,10 +166,10 @@ def exports_of(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> Exports:
-    """Return the identified model as files for other tools.
+    """The identified model as files for other tools; `provenance` see :func:`provenance_of`.
 
     Without a physically consistent estimate, but the reason, there is no URDF and no full standard
-    parameters. `essential` are names; `provenance` see :func:`provenance_of`.
+    parameters.
 
     Raises:
         IdentificationError: the estimate is not of the cell's model.
@@ -253,9 +246,7 @@ def _urdf(
     unknown = np.array([name in estimate.undetermined for name in names], dtype=np.bool_)
     friction = np.where(unknown, np.nan, consistent.friction)
     lines = ["Inertia and joint friction were identified by hil; everything else is as it was."]
-    if estimate.undetermined:
-        lines.append(
-            f"Not determined by the data, but nominal: {', '.join(estimate.undetermined)}."
-        )
+    if undetermined := ", ".join(estimate.undetermined):
+        lines.append(f"Not determined by the data, but nominal: {undetermined}.")
     lines += [f"{key}: {value}" for key, value in origin.items()]
     return write_urdf(cell.urdf, model, consistent.standard, friction, remarks=lines)

@@ -21,8 +21,7 @@ from rich.text import Text
 
 from hil.terminal_text import printable
 
-# Columns that a bar takes at least.
-_NARROWEST = 8
+_NARROWEST = 8  # columns of a bar
 
 
 def put(console: Console, text: str) -> None:

@@ -107,11 +107,7 @@ class Cell:
         )
 
     def with_friction(self, **changes: Any) -> Cell:
-        """The cell with another friction law of all joints, entries as in `[robot.friction]`.
-
-        Raises:
-            CellError: there is no such law.
-        """
+        """The cell with other entries of `[robot.friction]` for all joints; or CellError."""
         table = self.file.robot.friction
         joints = {
             name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))
@@ -313,10 +309,7 @@ class Cell:
         )
 
     def with_link(self, *, can: CanTable | None = None, **controller: Any) -> Cell:
-        """This cell with other entries of `[controller]` and `[controller.can]`, in its text too.
-
-        None keeps what stands there.
-        """
+        """This cell with another link, in its text too; None keeps an entry."""
         bus = {} if can is None else can.model_dump(exclude_none=True)
         values = {f"controller.{key}": value for key, value in controller.items()}
         return self.with_values(values | {f"controller.can.{k}": v for k, v in bus.items()})
@@ -356,9 +349,8 @@ class Cell:
     ) -> Array:
         """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,).
 
-        Inertias of the links are those of the URDF, or `inertia_scale` (n,) times as large. Springs
-        and balancers have the figures of the file. Everything else, such as coupling inertias, an
-        offset or a Stribeck term, is zero.
+        Links are `inertia_scale` (n,) times as heavy; springs and balancers have the figures of the
+        file; everything else, such as coupling inertias, an offset or a Stribeck term, is zero.
         """
         model = self.model
         standard = model.nominal
@@ -467,9 +459,8 @@ class AngleFrame:
 
     def text_of_angles(self, q: Array | Sequence[float]) -> str:
         """One posture (n,) [rad] of URDF angles in words, as a person would set it."""
-        angles = ", ".join(
-            f"J{joint} {angle:z.1f}" for joint, angle in enumerate(self.shown(np.asarray(q)), 1)
-        )
+        shown = enumerate(self.shown(np.asarray(q)), 1)
+        angles = ", ".join(f"J{joint} {angle:z.1f}" for joint, angle in shown)
         return f"{angles} deg, {self.whose}"
 
     @property
@@ -503,19 +494,12 @@ def _check(cell: Cell) -> None:
     _check_assumed(cell)
     tables = [name for name in _TURNING_ONLY if getattr(file, name) is not None]
     if tables and file.robot.locked:  # a motion is checked with the whole URDF
-        raise cell.error(
-            "robot.locked",
-            ", ".join(file.robot.locked),
-            f"is for arms that are identified from recordings, but there is a table [{tables[0]}]",
-            'fix these joints in the URDF (type = "fixed")',
-        )
-    sliding = [
-        name
-        for name, turns in zip(cell.joint_names, cell.model.chain.revolute, strict=True)
-        if not turns
-    ]
-    if tables and sliding:
-        problem = f"is in degrees and revolutions, but joint {sliding[0]} slides"
+        given, fixed = ", ".join(file.robot.locked), 'fix these joints in the URDF (type = "fixed")'
+        problem = f"is for arms identified from recordings, but there is a table [{tables[0]}]"
+        raise cell.error("robot.locked", given, problem, fixed)
+    if tables and not all(cell.model.chain.revolute):
+        sliding = cell.joint_names[[*cell.model.chain.revolute].index(False)]
+        problem = f"is in degrees and revolutions, but joint {sliding} slides"
         remedy = (
             'fix it in the URDF (type = "fixed"); an arm with sliding joints can be identified '
             "from recordings, but not moved"
@@ -579,15 +563,12 @@ def _check_postures(cell: Cell, table: LimitsTable) -> None:
             f", or correct the limits: no joint may go further than {furthest:.4g}°; are they in "
             "rad? 1 rad is 57.2958°"
         )
-    for field, posture in (
-        ("campaign.home_deg", None if file.campaign is None else cell.home),
-        ("simulation.initial_deg", None if file.simulation is None else cell.initial),
-    ):
-        if posture is not None:
-            outside = ~((posture >= limits.lower) & (posture <= limits.upper))
-            for joint in np.flatnonzero(outside):
-                name = cell.joint_names[joint]
-                raise cell.error(field, None, f"{name} stands outside [limits]", remedy)
+    postures = {} if file.campaign is None else {"campaign.home_deg": cell.home}
+    postures |= {} if file.simulation is None else {"simulation.initial_deg": cell.initial}
+    for field, posture in postures.items():
+        for joint in np.flatnonzero(~((posture >= limits.lower) & (posture <= limits.upper))):
+            problem = f"{cell.joint_names[joint]} stands outside [limits]"
+            raise cell.error(field, None, problem, remedy)
 
 
 def _check_limits(cell: Cell, table: LimitsTable) -> None:
@@ -600,12 +581,9 @@ def _check_limits(cell: Cell, table: LimitsTable) -> None:
     ):
         stated = np.isfinite(radians)
         if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
-            raise cell.error(
-                f"limits.{field}",
-                getattr(table, field),
-                f"is in degrees, and the URDF has these numbers in {unit}",
-                f"multiply them by 57.2958{too}",
-            )
+            problem = f"is in degrees, and the URDF has these numbers in {unit}"
+            remedy = f"multiply them by 57.2958{too}"
+            raise cell.error(f"limits.{field}", getattr(table, field), problem, remedy)
     for field, values, bounds, beyond in (
         ("lower_deg", limits.lower, allowed.lower, -1.0),
         ("upper_deg", limits.upper, allowed.upper, 1.0),
@@ -613,10 +591,9 @@ def _check_limits(cell: Cell, table: LimitsTable) -> None:
     ):
         wider = beyond * (values - bounds) > URDF_ROUNDING * np.maximum(1.0, np.abs(bounds))
         for joint in np.flatnonzero(wider):
-            raise cell.error(
-                f"limits.{field}",
-                None,
-                f"{cell.joint_names[joint]} may go to {np.degrees(values[joint]):.6g}° (URDF angle "
-                f"or speed), beyond the URDF's {np.degrees(bounds[joint]):.6g}°",
-                "narrow it, or correct the URDF",
+            own, theirs = np.degrees([values[joint], bounds[joint]])
+            problem = (
+                f"{cell.joint_names[joint]} may go to {own:.6g}° (URDF angle or speed), beyond the "
+                f"URDF's {theirs:.6g}°"
             )
+            raise cell.error(f"limits.{field}", None, problem, "narrow it, or correct the URDF")

@@ -52,13 +52,7 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
 
 
 class _Place(NamedTuple):
-    """A field of a schema.
-
-    Attributes:
-        name: dotted.
-        description: of the last field on the way that has one.
-        siblings: the fields of its table.
-    """
+    """A field by its dotted name, what it must be, and the fields of its table."""
 
     name: str
     description: str

@@ -114,7 +114,8 @@ def _coupling(
     elif {len(row) for row in given} | {len(given)} == {n}:
         matrix = np.array(given, dtype=np.float64)
     else:
-        remedy = f"give a row for each motor, in it a figure for each of {_list(chain.joint_names)}"
+        joints = ", ".join(chain.joint_names)
+        remedy = f"give a row for each motor, in it a figure for each of {joints}"
         raise CellError(path, field, None, f"is not {n} rows of {n} figures", remedy)
     with _blamed(path, field, None, "correct that matrix"):
         return Coupling(matrix, inertia=table.inertia, friction=table.friction)
@@ -171,12 +172,8 @@ def _built(table: ElementTable) -> Element:
 def _require(path: Path, field: str, named: Iterable[str], joints: Sequence[str]) -> None:
     for name in named:
         if name not in joints:
-            problem, remedy = "is no moving joint of the URDF", f"its joints are {_list(joints)}"
-            raise CellError(path, field, name, problem, remedy)
-
-
-def _list(joints: Sequence[str]) -> str:
-    return ", ".join(joints)
+            remedy = f"its joints are {', '.join(joints)}"
+            raise CellError(path, field, name, "is no moving joint of the URDF", remedy)
 
 
 @contextmanager

@@ -56,9 +56,7 @@ def quiet_libraries() -> Iterator[None]:
         os.close(nowhere)
 
 
-_OF_MOVING_JOINTS: Final = (
-    "axis", "limit", "mimic", "dynamics", "safety_controller", "calibration"
-)  # fmt: skip
+_OF_MOVING: Final = ("axis", "limit", "mimic", "dynamics", "safety_controller", "calibration")
 
 
 def mimics(urdf: str) -> dict[str, tuple[str, float]]:
@@ -98,10 +96,10 @@ def _fix(joint: ET.Element, position: float) -> None:
         else:
             rotation = rotation * Rotation.from_rotvec(along * position)
         for name, values in (("xyz", place), ("rpy", rotation.as_euler("xyz"))):
-            origin.set(name, " ".join(repr(float(value)) for value in values))
+            origin.set(name, " ".join(map(repr, values.tolist())))
     joint.set("type", "fixed")
     for element in [*joint]:
-        if element.tag in _OF_MOVING_JOINTS:
+        if element.tag in _OF_MOVING:
             joint.remove(element)
 
 
@@ -109,13 +107,11 @@ def _three(text: str | None, default: str) -> Array:
     return np.array([float(part) for part in (text or default).split()])
 
 
-_ONE_FOR_ALL: Final = frozenset(
-    (
-        "cell.urdf", "controller.host", "controller.cycle_ms", "workspace.floor", "workspace.walls",
-        "drive_train.k54", "drive_train.k64", "drive_train.k65",
-        "drive_train.encoder_counts_per_revolution",
-    )
-)  # fmt: skip
+_ONE_FOR_ALL: Final = {
+    *("cell.urdf", "controller.host", "controller.cycle_ms", "workspace.floor", "workspace.walls"),
+    *("drive_train.k54", "drive_train.k64", "drive_train.k65"),
+    "drive_train.encoder_counts_per_revolution",
+}
 """Fields without a list that nobody may have said anything of."""
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """What is written though nobody said so."""
@@ -187,7 +183,6 @@ class NewCell:
             trim_blocks=True,
             lstrip_blocks=True,
             autoescape=False,  # a TOML file
-            keep_trailing_newline=True,
         )
         text = environment.get_template("cell.toml.j2").render(
             name=self.name,
@@ -338,8 +333,8 @@ _TURNED: Final = 3
 def with_clear_home(text: str, new: NewCell, path: Path) -> str:
     """The text of a cell file with a home that is clear of floor, walls and the arm itself.
 
-    The posture that stands there, or the first clear one of those with one, two or three joints a
-    right angle away from it. Where none is clear, or the URDF has no shapes, it stays.
+    The first clear posture with none to three joints a right angle away from the home that is
+    there; that stays where none is clear, or the URDF has no shapes.
     """
     urdf = new.urdf if new.urdf is not None else text_of(new.urdf_path)
     cell = Cell.from_texts(text, urdf, path)
@@ -348,13 +343,13 @@ def with_clear_home(text: str, new: NewCell, path: Path) -> str:
     except CellError:
         return text
     limits, home = cell.joint_limits, cell.home
-    for count in range(_TURNED + 1):
-        for joints in combinations(range(len(home)), count):
-            for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=count):
-                posture = home.copy()
-                posture[list(joints)] += turns
-                inside = (posture > limits.lower) & (posture < limits.upper)
-                if inside.all() and clearance(checker, posture[None]) is None:
-                    shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
-                    return with_values(text, {"campaign.home_deg": shown})
+    chosen = (one for n in range(_TURNED + 1) for one in combinations(range(len(home)), n))
+    for joints in chosen:
+        for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=len(joints)):
+            posture = home.copy()
+            posture[list(joints)] += turns
+            inside = (posture > limits.lower) & (posture < limits.upper)
+            if inside.all() and clearance(checker, posture[None]) is None:
+                shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
+                return with_values(text, {"campaign.home_deg": shown})
     return text

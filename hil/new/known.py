@@ -93,11 +93,10 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
 
 
 def assumed_for_design(known: Known, n_joints: int) -> Known:
-    """What a cell needs in which motions are designed and not run, as far as it can be assumed.
+    """What a cell for designs alone needs, as far as it can be assumed.
 
-    Home is zero, or the middle of a range without it; joints that turn on and on have half a turn
-    either way; full speed is reached in 0.3 s and full acceleration in 0.1 s; nothing is known of
-    friction; and there is a floor at the base, and nothing else around.
+    Home is zero, or the middle of a range without it; endless joints have half a turn either way;
+    full speed takes 0.3 s, full acceleration 0.1 s; no friction; a floor at the base.
     """
     lower, upper, speed = (
         known.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
@@ -134,10 +133,7 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
 
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
-    """What a controller's init packet says of the first `n_joints` axes of an arm (from 1).
-
-    What is no number, or 0 where it cannot be, is left unknown.
-    """
+    """What an init packet says of the first `n_joints` axes of an arm (from 1)."""
     row, n = arm - 1, n_joints
     wrist = dict(zip(("k54", "k64", "k65"), init.wrist_coupling(arm), strict=True))
     values: dict[str, Any] = {
@@ -148,20 +144,15 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
         **{f"drive_train.{k}": _wire([v])[0] for k, v in wrist.items() if n >= WRIST_AXES},
         "controller.arm": arm,
     }
-    notes = []
-    if init.sample_time in _CYCLES:
-        values["controller.cycle_ms"] = init.sample_time
+    notes, cycle = [], init.sample_time
+    if cycle in _CYCLES:
+        values["controller.cycle_ms"] = cycle
     else:
-        notes.append(
-            f"the controller's cycle is {init.sample_time} ms; this software knows 1 and 2"
-        )
+        notes.append(f"the controller's cycle is {cycle} ms; this software knows 1 and 2")
     opened = {axis.axis for axis in init.open_axes() if axis.arm == arm}
-    missing = [str(axis + 1) for axis in range(n) if axis not in opened]
-    if missing:
-        notes.append(
-            f"axes {', '.join(missing)} of arm {arm} are not open in the controller; a campaign "
-            "needs all of the arm's"
-        )
+    if missing := ", ".join(str(axis + 1) for axis in range(n) if axis not in opened):
+        closed = f"axes {missing} of arm {arm} are not open in the controller"
+        notes.append(f"{closed}; a campaign needs all of the arm's")
     version = ".".join(map(str, init.version))
     return Known.said_by(f"from the init packet (C4G {version})", values, notes)
 
@@ -269,14 +260,13 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
         if stop.requested:
             raise OperatorStopError("ended before the controller came; no file was written.")
         if time.monotonic() > deadline:
-            status, words = view.status, [f"no init packet came within {wait:g} s"]
+            status, words = view.status, f"no init packet came within {wait:g} s"
             if status.answered or status.malformed or status.stale:
-                words[0] += ", though packets did: a session was running already"
-            words += [view.not_understood] if view.not_understood else []
-            words.append("start this command first, then the controller's Open program")
-            if status.foreign:
-                words[-1] += f" ({status.foreign} packets came from elsewhere)"
-            raise ControllerFault("; ".join(words))
+                words += ", though packets did: a session was running already"
+            words += f"; {view.not_understood}" if view.not_understood else ""
+            words += "; start this command first, then the controller's Open program"
+            words += f" ({status.foreign} packets came from elsewhere)" if status.foreign else ""
+            raise ControllerFault(words)
         time.sleep(_POLL)
     return view.connection.init
 
