@@ -74,12 +74,11 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     sources = with_torques(sources)
     decided = decide(sources, options, reporter)
     settings, cell = decided.settings, decided.settings.law(sources.cell)
-    sources = replace(
-        sources,
-        cell=cell,
-        training=tuple(signals_of(source, settings) for source in sources.training),
-        held_out=tuple(signals_of(source, settings) for source in sources.held_out),
+    read, held = (
+        tuple(signals_of(source, settings) for source in some)
+        for some in (sources.training, sources.held_out)
     )
+    sources = replace(sources, cell=cell, training=read, held_out=held)
     unseen = () if sources.in_sample else sources.held_out
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
         fitted, held_out = [], []
@@ -175,22 +174,19 @@ def with_torques(sources: Sources) -> Sources:
             return one
         return replace(one, torque=(one.motor_current * scale.values) @ turns)
 
-    sources = replace(
-        sources,
-        training=tuple(source.changed(with_torque) for source in sources.training),
-        held_out=tuple(source.changed(with_torque) for source in sources.held_out),
+    training, held_out = (
+        tuple(source.changed(with_torque) for source in some)
+        for some in (sources.training, sources.held_out)
     )
-    for warning in current_warnings(sources.cell.joint_names, scale):
-        sources = sources.with_warning(warning)
-    return sources
+    warnings = (*sources.warnings, *current_warnings(sources.cell.joint_names, scale))
+    return replace(sources, training=training, held_out=held_out, warnings=warnings)
 
 
 def current_warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
     """What a reader must know of torques that were made of currents."""
+    rows = zip(names, scale.values, scale.std, strict=True)
     figures = ", ".join(
-        f"{name} {value:.4g} ± {2.0 * std:.2g}"
-        for name, value, std in zip(names, scale.values, scale.std, strict=True)
-        if np.isfinite(std)
+        f"{n} {value:.4g} ± {2.0 * s:.2g}" for n, value, s in rows if np.isfinite(s)
     )
     warnings = [
         "only currents were recorded and no torque constants given: they were found by comparing "

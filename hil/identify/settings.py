@@ -137,8 +137,6 @@ def samples_of(
 def judged_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
     """Samples of a source, as a verdict reads them: moving, and of the torque as recorded.
 
-    A verdict on smoothed torque would flatter.
-
     Raises:
         RecordingError: the recording cannot be prepared.
     """
@@ -156,8 +154,6 @@ def _current_limit(cell: Cell) -> Array | None:
 
 MOST_READ: Final = 32
 """Recordings that settings are decided on: more say the same again."""
-# Repetitions of one motion that settings are chosen on.
-_REPETITIONS: Final = 1
 # Where the delay is stated it is looked for all the same, to be reported: in so many samples.
 _DELAY_SAMPLES: Final = 8000
 RIPPLE: Final = ((1,), (2,), (1, 2))
@@ -165,13 +161,9 @@ RIPPLE: Final = ((1,), (2,), (1, 2))
 
 
 class Decided(NamedTuple):
-    """Settings, and what was found on the way.
+    """Settings, and what was found of delays on the way, in figures and sentences.
 
-    Attributes:
-        settings: to be applied.
-        delays: of the torque behind the position, as the longest of the recordings has them; None
-            where that cannot be determined.
-        notes: about them, in sentences.
+    The longest of the recordings has these delays; None where that cannot be determined.
     """
 
     settings: Settings
@@ -182,17 +174,16 @@ class Decided(NamedTuple):
 def with_noise(sources: Sources) -> tuple[Sources, str]:
     """Noise of the positions from repetitions, where no standstill was recorded; and in words."""
     recordings = [source.recording for source in sources.training[:MOST_READ]]
+    noise_was = "the noise of the positions was"
     if sources.noise_variance is not None:
-        return sources, "the noise of the positions was measured at standstill"
+        return sources, f"{noise_was} measured at standstill"
     if sources.same_motion and len(recordings) > 1:
         with suppress(IdentificationError):  # no two that could be compared
             noise = repetition_noise(recordings)
-            return (
-                replace(sources, noise_variance=noise.position, torque_variance=noise.torque),
-                "no standstill was recorded: the noise of the positions was measured on what "
-                f"differs between {len(recordings)} repetitions at equal times",
-            )
-    return sources, "the noise of the positions was estimated from their own fast part"
+            known = replace(sources, noise_variance=noise.position, torque_variance=noise.torque)
+            apart = f"what differs between {len(recordings)} repetitions at equal times"
+            return known, f"no standstill was recorded: {noise_was} measured on {apart}"
+    return sources, f"{noise_was} estimated from their own fast part"
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
@@ -287,7 +278,7 @@ def _chosen(
     if not questions:
         return settings
     # Repetitions of one motion say the same again.
-    read = sources.training[:_REPETITIONS] if sources.same_motion else sources.training
+    read = sources.training[:1] if sources.same_motion else sources.training
     read = tuple(signals_of(source, settings) for source in read)
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
@@ -336,11 +327,7 @@ def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
 def _delays(
     sources: Sources, stated: Settings, options: Options, reporter: Reporter
 ) -> DelayEstimate | None:
-    """Delays in the longest of the fitted recordings, or in its beginning if nobody asked.
-
-    Raises:
-        IdentificationError: they were asked for, and there is not one usable row.
-    """
+    """Delays in the longest of the fitted recordings, or in its beginning if nobody asked."""
     if options.delay == "stated":
         return None
     recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
@@ -372,11 +359,7 @@ def _described(found: DelayEstimate) -> list[str]:
 
 
 def _compensated(stated: Settings, found: DelayEstimate) -> tuple[Settings, list[str]]:
-    """Settings that compensate the delays that somebody asked for, and words.
-
-    One delay of all axes moves the time at which the motion is read; delays axis by axis move the
-    torques.
-    """
+    """Settings that compensate delays: one moves the motion, several the torques; and words."""
     notes = _described(found)
     if not found.significant:
         return stated, notes
@@ -394,7 +377,5 @@ def _other(sources: Sources, found: DelayEstimate) -> bool:
     That of a controller is known: only what is well determined and differs by more than the
     estimate errs in closed loop is another one.
     """
-    if sources.cell.file.controller is None:
-        return True
     apart = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
-    return apart and bool(found.determined.all())
+    return sources.cell.file.controller is None or (apart and bool(found.determined.all()))

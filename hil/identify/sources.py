@@ -159,12 +159,9 @@ def gather_sources(
                 problem = f"carries another {name} than {archives[0].path}"
                 remedy = "identify each cell's archives by themselves"
                 raise ArchiveError(archive.path, problem, remedy=remedy)
-    rest = [source_of(archive, cell, to_fit=False) for archive in by_use["standstill"]]
-    every = all_fitted(
-        cell,
-        [(archive, source_of(archive, cell)) for archive in fitted],
-        rest[0].recording if rest else None,
-    )
+    rest = [source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]]
+    own = [(archive, source_of(archive, cell)) for archive in fitted]
+    every = all_fitted(cell, own, rest[0] if rest else None)
     held_out = [source_of(archive, cell) for archive in predicted]
     warnings = [*known_warnings(cell, fitted[0]), *filter(None, map(_incomplete, archives))]
     warnings += [
@@ -239,14 +236,9 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
     offsets = offsets_of_repetitions([source.recording for source in sources])
     if offsets is None:
         return sources, False
-    starts = [
-        source.recording.time[0] - offset for source, offset in zip(sources, offsets, strict=True)
-    ]
-    latest = max(starts)
-    return tuple(
-        replace(source, origin=float(latest + offset))
-        for source, offset in zip(sources, offsets, strict=True)
-    ), True
+    both = list(zip(sources, offsets, strict=True))
+    latest = max(source.recording.time[0] - offset for source, offset in both)
+    return tuple(replace(one, origin=float(latest + offset)) for one, offset in both), True
 
 
 def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
@@ -286,11 +278,9 @@ def refuse_duplicates(paths: Sequence[Path]) -> None:
 
 def _incomplete(archive: Archive) -> str | None:
     """What a reader must know about an archive that did not end as planned."""
-    if archive.missing is not None:
-        return archive.missing
     name, outcome = archive.path.name, archive.outcome
-    if outcome is None or outcome.outcome == "completed":
-        return None
+    if archive.missing is not None or outcome is None or outcome.outcome == "completed":
+        return archive.missing
     if outcome.outcome == REJECTED:
         return f"{name} was rejected and left out: {outcome.reason}"
     return f"{name} ended {outcome.outcome}"
@@ -366,27 +356,26 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     with the drive on: with it off the brakes carry the arm, and no current tells of it.
     """
     if archive.header.controllers_own and "status" in archive.columns:
-        powered = np.flatnonzero(archive.columns["status"] == DRIVE_ON)
-        if not powered.size:
-            raise ArchiveError(archive.path, "the drive was never on in it")
-        return range(int(powered[0]), int(powered[-1]) + 1)
-    if recording.commanded_position is None:
+        useful, never = archive.columns["status"] == DRIVE_ON, "the drive was never on in it"
+    elif recording.commanded_position is not None:
+        useful = ~np.isnan(recording.commanded_position).any(axis=1)
+        never = "the arm was never commanded in it"
+    else:
         return None
-    commanded = np.flatnonzero(~np.isnan(recording.commanded_position).any(axis=1))
-    if not commanded.size:
-        raise ArchiveError(archive.path, "the arm was never commanded in it")
-    return range(int(commanded[0]), int(commanded[-1]) + 1)
+    rows = np.flatnonzero(useful)
+    if not rows.size:
+        raise ArchiveError(archive.path, never)
+    return range(int(rows[0]), int(rows[-1]) + 1)
 
 
 def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
     """The first part of a recording, and the rest; each knows the motion beyond its ends."""
     recording, count = whole.recording, whole.recording.n_samples
-    cut = round(share * count)
+    cut, rows = round(share * count), np.arange(count)[:, None]
 
     def part(words: str, start: int, stop: int) -> Source:
-        inside = (np.arange(count)[:, None] >= start) & (np.arange(count)[:, None] < stop)
         torque, current = (
-            None if values is None else np.where(inside, values, 0.0)
+            None if values is None else np.where((rows >= start) & (rows < stop), values, 0.0)
             for values in (recording.torque, recording.motor_current)
         )
         context = replace(recording, torque=torque, motor_current=current)
@@ -413,12 +402,8 @@ def position_noise(cell: Cell, rest: Recording) -> Array:
         steps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in rest.position.T]
         least = np.where(np.isfinite(steps), steps, 0.0)
         return np.asarray(np.maximum(measured, least**2 / 12.0))
-    drives = cell.drive_train
-    revolutions = drives.motor_revolutions(rest.position)
-    step = np.maximum(
-        1.0 / cell.drive_table.encoder_counts_per_revolution,
-        2.0 * FLOAT32_STEP * np.abs(revolutions).max(axis=0),
-    )
-    joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * step)
+    drives, count = cell.drive_train, 1.0 / cell.drive_table.encoder_counts_per_revolution
+    rounding = 2.0 * FLOAT32_STEP * np.abs(drives.motor_revolutions(rest.position)).max(axis=0)
+    joint_step = np.abs(drives.joint_from_motor) * (2.0 * np.pi * np.maximum(count, rounding))
     resolution = (joint_step**2).sum(axis=1) / 12.0
     return np.asarray(np.maximum(measured, resolution))

@@ -148,10 +148,7 @@ def summarise(
 
 
 def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
-    """Intervals of held-out torque; None without held-out motion, or too little fitted.
-
-    Folds are fitted by least squares where the estimator works on more than factors.
-    """
+    """Intervals of held-out torque; None without held-out motion, or too little fitted."""
     if prepared.sources.in_sample:
         return None
     model, result = prepared.sources.cell.model, estimation.result
@@ -243,8 +240,7 @@ def uncertainty_result(estimation: Estimation) -> UncertaintyResult:
 def planted_in(cell: Cell, header: ArchiveHeader) -> Array | None:
     """What was planted in the simulated arm (p,): as the archive says, or else its cell.
 
-    None where neither says it, and where the archive does not say it of each parameter. That of a
-    torque ripple, whose phase is drawn, is NaN.
+    None where neither says it of each parameter. That of a torque ripple, of random phase, is NaN.
     """
     model, planted = cell.model, header.planted
     if planted is not None:
@@ -314,10 +310,7 @@ def _planned(sources: Sources) -> Excitation | None:
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
-    """Time samples of the motion itself: those of a plan, from where it was asked to move.
-
-    Where no set-points were recorded, from the first to the last in which some joint moves.
-    """
+    """Time samples of the motion: of its set-points, else those in which some joint moves."""
     commanded, time = source.recording.commanded_position, source.recording.time
     if commanded is None:
         return moving_rows(samples)

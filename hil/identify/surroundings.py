@@ -62,19 +62,17 @@ def controller_inertia(
     """
     if cell.file.drive_train is None or estimate.undetermined:
         return None
-    positions, theirs = [], []
+    found = []
     for source in sources:
         recording = source.recording
         few = slice(None, None, max(1, recording.n_samples // _POSTURES))
         inertia = _column_at(source, "diagonal_inertia", recording.time[few])
         if inertia is not None:
-            positions.append(recording.position[few])
-            theirs.append(inertia)
-    if not theirs:
+            found.append((recording.position[few], inertia))
+    if not found:
         return None
-    return inertia_ratio(
-        cell.model, estimate.values, np.concatenate(positions), np.concatenate(theirs)
-    )
+    positions, theirs = map(np.concatenate, zip(*found, strict=True))
+    return inertia_ratio(cell.model, estimate.values, positions, theirs)
 
 
 def _column_at(source: Source, field: str, time: Array) -> Array | None:
@@ -210,19 +208,13 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
 
 
 class Nominal(NamedTuple):
-    """The model that an arm would have by its papers.
-
-    Attributes:
-        values: parameters (p,).
-        words: what it is.
-        rotors_known: whether it has the rotors' inertias.
-        share: relative uncertainty of its torque.
-    """
+    """The model that an arm would have by its papers: parameters (p,), and what they are."""
 
     values: Array
     words: str
     rotors_known: bool
     share: float
+    """Relative uncertainty of its torque."""
 
 
 def nominal_of(cell: Cell) -> Nominal | None:
