@@ -232,14 +232,10 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
     drift = None if status is None else status.drift
     if drift is not None and len(body) + 2 <= room:
         body += [Text(), _drift(drift, width)]
-    news = [
-        *shown.said,
-        *(() if status is None else status.notes),
-        *(() if motion is None else motion.events),
-    ]
+    notes, events = status.notes if status else (), motion.events if motion else ()
     rows = [
         row
-        for line in news
+        for line in (*shown.said, *notes, *events)
         for row in textwrap.wrap(printable(line, keep=""), max(8, width), subsequent_indent="  ")
     ]
     left = room - len(body) - 1
@@ -281,15 +277,12 @@ def status_line(status: RunStatus, left: str = "") -> str:
 
 
 def _heading(shown: Shown, width: int) -> Text:
-    status, where, left = shown.status, Text(), ""
-    if shown.far_end:
-        style = "bold green" if shown.far_end == SIMULATED else "bold yellow"
-        where.append("  ").append(shown.far_end, style=style)
-    if status is None:
-        where.append("  beginning", style="dim")
-    else:
-        where.append(f"  {status.phase} {status.number} of {status.total}", style="bold cyan")
+    status, far = shown.status, "bold green" if shown.far_end == SIMULATED else "bold yellow"
+    at, style, left = "  beginning", "dim", ""
+    if status is not None:
+        at, style = f"  {status.phase} {status.number} of {status.total}", "bold cyan"
         left = shown.left or f"{clock(status.time_left)} left"
+    where = Text.assemble((f"  {shown.far_end}" if shown.far_end else "", far), (at, style))
     room = max(0, width - len(left) - 2)
     text = Text(printable(shown.title), style="bold")
     # The title gives way to what is moved and what it is doing.
@@ -315,10 +308,9 @@ def _bar_of_motion(motion: MotionProgress | None, width: int) -> Text:
 
 def _state(shown: Shown, motion: MotionProgress | None, width: int) -> Text:
     text = Text()
-    if shown.stopping:
-        text.append(" STOPPING ", style="bold red reverse").append("  ")
-    elif shown.request.held:
-        text.append(" HELD ", style="bold yellow reverse").append("  ")
+    if shown.stopping or shown.request.held:
+        word, hue = ("STOPPING", "red") if shown.stopping else ("HELD", "yellow")
+        text.append(f" {word} ", style=f"bold {hue} reverse").append("  ")
     if shown.age > STALE and shown.status is not None:
         text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
     override = shown.request.override if motion is None else motion.override
@@ -496,10 +488,8 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
     Where torques contradict the model, only the names of the joints concerned do.
     """
     table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
-    table.add_column("joint")
-    table.add_column("largest following error", justify="right")
-    table.add_column("largest current", justify="right")
-    table.add_column("torque and weight")
+    for column in ("joint", "largest following error", "largest current", "torque and weight"):
+        table.add_column(column, justify="right" if column.startswith("largest") else "left")
     agree = {name: Text("not seen") for name in found.gravity_not_seen}
     agree |= {name: Text("contradict", style="bold red") for name in found.against_gravity}
     for name, error, share in zip(
@@ -516,13 +506,11 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
     what = "the simulated arm" if found.simulated else "the arm"
     word = " ".join(found.against_gravity) or "yes"
     known = f"If you know why, type {word}" if found.against_gravity else "Type yes"
-    return confirmed(
-        console,
+    question = (
         f"Did {what} move as it should, with nothing in its way at {found.override:.0%} of full "
-        f"speed? {known} to accept; anything else ends the run: ",
-        word,
-        stop,
+        f"speed? {known} to accept; anything else ends the run: "
     )
+    return confirmed(console, question, word, stop)
 
 
 def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:

@@ -69,10 +69,10 @@ def _lines(done: Designed) -> Iterator[str]:
         )
         if scaled > WEAK:
             names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
-            more = "via points" if sines is None else "harmonics"
             yield (
-                f"this motion hardly separates {names}: take more {more}, allow a longer motion, "
-                "search longer, or judge by other parameters ([objective] parameters)"
+                f"this motion hardly separates {names}: take more "
+                f"{'via points' if sines is None else 'harmonics'}, allow a longer motion, search "
+                "longer, or judge by other parameters ([objective] parameters)"
             )
     if design.chosen is None:
         yield f"polished from {criteria_text(design.origin_criteria.measures)}"
@@ -92,13 +92,13 @@ def _draw(
     from hil.plots.design_picture import draw_design  # loads the arm's shapes
 
     design, excitation = done.design, done.result.excitation
-    grown = design.front.measures[design.origin].tolist()
+    grown = tuple(design.front.measures[design.origin].tolist())
     figure = draw_design(
         excitation,
         cell,
         front=design.front,
         chosen=design.chosen,
-        knee=None if design.chosen is not None else tuple(grown),
+        knee=None if design.chosen is not None else grown,
         references=beside,
         unchecked=done.result.settings.unchecked,
         complete=design.complete,
@@ -149,19 +149,16 @@ def design(
     which is the smaller the less the estimates of different parameters get into each other's way.
 
     Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
-    going to do), and a journal to resume from in OUTPUT, and makes OUTPUT a campaign, with copies
-    of the cell file and the URDF and with validation motions: `hil rehearse OUTPUT` comes next, and
-    `hil status OUTPUT` says so. For a cell without [controller] it leaves trajectory files instead:
-    CSV, ROS 2 JointTrajectory, and for six axes URScript and a player. Ctrl-C (or SIGTERM) ends
-    the search with the best motion so far once the generation under way is scored: seconds, a few
-    minutes if a motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the
-    motion.
+    going to do), and a journal to resume from in OUTPUT, and makes OUTPUT a campaign: `hil rehearse
+    OUTPUT` comes next. For a cell without [controller] it leaves trajectory files instead: CSV, ROS
+    2 JointTrajectory, and for six axes URScript and a player. Ctrl-C (or SIGTERM) ends the search
+    with the best motion so far once the generation under way is scored: seconds, a few minutes if a
+    motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
 
     **Examples:**
 
     - `hil design cell.toml -o runs/mine`
     - `hil design --show-settings front > my.toml`, then `hil design cell.toml --settings my.toml`
-    - `hil design cell.toml --method b --kinematic -o runs/b`: the paper's comparison
     - `hil design cell.toml --earlier runs/demo -o runs/second`: adds to what is known
     - `hil design cell.toml --for payload -o runs/load`: a short motion for `hil payload`
 

@@ -44,7 +44,7 @@ WORDS: Final = {
 }
 
 
-_REPEATED: Final = frozenset({Phase.CLOSED, Phase.OPENING, Phase.OPEN})
+_REPEATED: Final = {Phase.CLOSED, Phase.OPENING, Phase.OPEN}
 """Phases that an opening lost again and again goes through."""
 
 
@@ -58,14 +58,9 @@ class Status:
     """
 
     def __init__(
-        self,
-        place: str,
-        settings: ControllerSettings,
-        *,
-        quiet: bool,
-        stretch: float = 0.0,
+        self, place: str, settings: ControllerSettings, *, quiet: bool, stretch: float = 0.0,
         descriptor: int = 1,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._place, self._settings, self._stretch = place, settings, stretch
         self._quiet, self._out = quiet, descriptor
         self._terminal = not quiet and os.isatty(descriptor)
@@ -83,10 +78,8 @@ class Status:
             f"mode: {settings.missed_replies}, process {os.getpid()}"
         )
         if self._stretch:
-            self.say(
-                f"cycles are made longer by up to {self._stretch:g} s to wait for an answer; "
-                "no real controller does that"
-            )
+            how = f"cycles are made longer by up to {self._stretch:g} s to wait for an answer"
+            self.say(f"{how}; no real controller does that")
 
     def watch(self, controller: SimulatedController, tally: Tally) -> None:
         """Show what has changed since the last cycle."""
@@ -112,18 +105,17 @@ class Status:
             self._write("\r\x1b[K")
 
     def _say_change(self, controller: SimulatedController) -> None:
-        lost, seconds = controller.openings_lost, f"{time.monotonic() - self._began:8.3f} s"
-        if lost <= 1 or controller.gave_up or controller.phase not in _REPEATED:
-            text = f"{seconds}  {WORDS[controller.phase]}"
-            if controller.phase is Phase.OPENING:
-                text += f" in mode {self._settings.open_mode}"
-            if controller.reason and controller.reason != self._reason:
-                text += f": {controller.reason}"
-            self._reason = controller.reason
-            self.say(text)
-        elif controller.phase is Phase.CLOSED and lost.bit_count() == 1:
-            again = f"open mode was lost again, {lost} times in a row by now: {controller.reason}"
-            self.say(f"{seconds}  {again}")
+        lost, phase, reason = controller.openings_lost, controller.phase, controller.reason
+        if lost <= 1 or controller.gave_up or phase not in _REPEATED:
+            text = WORDS[phase]
+            text += f" in mode {self._settings.open_mode}" if phase is Phase.OPENING else ""
+            text += f": {reason}" if reason and reason != self._reason else ""
+            self._reason = reason
+        elif phase is Phase.CLOSED and lost.bit_count() == 1:
+            text = f"open mode was lost again, {lost} times in a row by now: {reason}"
+        else:
+            return
+        self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
 
     def _line(self, tally: Tally) -> str:
         if not tally.cycles:
@@ -178,26 +170,18 @@ def simulate(
     Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
     and must do what the real controller asks of it:
 
-    - answer every packet within its cycle, with the number received plus one (32767 is followed
-      by 1);
-
+    - answer every packet within its cycle, with the number received plus one (after 32767: 1);
     - echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
-
     - answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
-
     - once every axis reports the open mode and the status byte is 5 (drive on): start from the
       target received and answer with the next one;
-
     - ask for the end of open mode with status byte 1, then stay in step until 504.
 
     Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
     packet are ignored. A drive that was lost stays off until somebody presses the button.
 
-    **Example**, two terminals on one machine:
-
-        hil simulate cell.toml --udp 127.0.0.1:2001 --cycle 2 --intervals 1
-
-        your_program --listen 2001
+    **Example**, two terminals: `hil simulate cell.toml --udp 127.0.0.1:2001 --intervals 1` and
+    `your_program --listen 2001`.
 
     The order does not matter: the first packet is repeated every second until it is answered.
     Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
