@@ -69,12 +69,9 @@ def _comes_from_below(error: BaseException) -> bool:
 
 
 def as_json(error: BaseException) -> dict[str, Any]:
-    """What a script receives of an error.
+    """What a script receives of an error, and the figures of what was done before.
 
-    Returns:
-        `error`: the sentence; `kind`: name of its class; `exit_code`; of an `InputError` also
-        `path`, `field`, `problem` and `remedy`, null or "" where there is none; and the figures of
-        what was done before.
+    `error` is the sentence, `kind` the name of its class.
     """
     sentence = error.format_message() if hasattr(error, "format_message") else str(error)
     figures = error.figures if isinstance(error, HilError) else {}

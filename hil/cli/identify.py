@@ -59,9 +59,8 @@ def identify(
     if output is not None:
         make_folder(output)
     elif annotate:
-        raise InputError(
-            None, "has no folder to write to", field="--annotate", remedy="name one: -o FOLDER"
-        )
+        problem, remedy = "has no folder to write to", "name one: -o FOLDER"
+        raise InputError(None, problem, field="--annotate", remedy=remedy)
     found = identify_sources(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:

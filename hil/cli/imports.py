@@ -218,7 +218,7 @@ def log(
 
 
 app.command("log")(log)
-# One importer under the names that people look for.
+# Under the names that people look for.
 app.command("mcap", hidden=True)(rosbag2)
 for _name in ("csv", "npz"):
     app.command(_name, hidden=True)(log)
@@ -228,8 +228,7 @@ def _tell(path: Path, *, json: bool) -> None:
     """What was read, as the archive keeps it."""
     found = open_archive(path).header.findings
     if json:
-        summary = {"archive": str(path), "found": found.lines, "warnings": found.warnings}
-        print_json(summary)
+        print_json({"archive": str(path), "found": found.lines, "warnings": found.warnings})
         return
     for line in found.lines:
         say(line)
@@ -240,12 +239,9 @@ def _tell(path: Path, *, json: bool) -> None:
 
 def _names(renamed: list[str]) -> dict[str, str]:
     """Name in the URDF by name in the bag."""
-    names = {}
-    for text in renamed:
-        recorded, _, name = text.partition("=")
+    names = dict(text.partition("=")[::2] for text in renamed)
+    for recorded, name in names.items():
         if not (recorded and name):
-            raise InputError(
-                None, f"{text!r} is no pair", field="--rename", remedy="give RECORDED=URDF"
-            )
-        names[recorded] = name
+            problem = f"{recorded or '=' + name!r} is no pair"
+            raise InputError(None, problem, field="--rename", remedy="give RECORDED=URDF")
     return names

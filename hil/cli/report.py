@@ -36,5 +36,4 @@ def report(
         typer.echo(page)
         return
     verdict = Results.load(opened.folder.results).verdict
-    document = {"report": str(page), "good": verdict.good, "verdict": verdict.line}
-    print_json(document)
+    print_json({"report": str(page), "good": verdict.good, "verdict": verdict.line})
