@@ -25,7 +25,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -103,18 +103,10 @@ def _played(
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "compiled")
     _stage = Stage.set_up(folder, None if defect is None else planted(defect, folder))
     context = multiprocessing.get_context("fork")
-    left = iter(numbers)
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=die_with_parent) as pool:
-        running: set[Future[dict[str, Any]]] = set()
         try:
-            while True:
-                while len(running) < jobs and (number := next(left, None)) is not None:
-                    running.add(pool.submit(_play, number))
-                if not running:
-                    return
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield future.result()
+            for future in as_completed([pool.submit(_play, number) for number in numbers]):
+                yield future.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
