@@ -5,17 +5,19 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import zstandard
 from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
-from mcap.writer import Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from hil.archive import container
 from hil.archive.chunk import ChunkParser
 from hil.archive.container import Record, encoded
+from hil.archive.header import sealed
 from hil.archive.mcap_writer import McapWriter, entries_of
 from hil.archive.schema import CYCLE
 
@@ -90,27 +92,76 @@ def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     return target
 
 
-def rewritten(source: Path, target: Path, *, cycles: int | None = None, **options: Any) -> None:
-    """Another program's copy; where `cycles` is given, no chunk has more of them."""
-    with source.open("rb") as stream, target.open("wb") as copy:
-        reader, writer = make_reader(stream), Writer(copy, **options)
-        writer.start("ros2")
-        first, last = reader.iter_metadata()
-        writer.add_metadata(first.name, first.metadata)
-        for one in reader.iter_attachments():
-            writer.add_attachment(0, 0, one.name, "x/y", one.data)
-        channels: dict[str, int] = {}
-        for kind, channel, message in reader.iter_messages(log_time_order=False):
-            assert kind is not None
-            if channel.topic not in channels:
-                number = writer.register_schema(kind.name, kind.encoding, kind.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-            if cycles and channel.topic == CYCLE and message.sequence % cycles == 0:
-                writer.flush()
-            times = message.log_time, message.data, message.publish_time, message.sequence
-            writer.add_message(channels[channel.topic], *times)
-        writer.add_metadata(last.name, last.metadata)
-        writer.finish()
+@dataclass(frozen=True)
+class Message:
+    topic: str
+    schema: str
+    text: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+@dataclass
+class Content:
+    """What an archive holds, to be changed, and written by the library."""
+
+    messages: list[Message]
+    metadata: dict[str, str]
+    outcome: dict[str, str]
+    attachments: dict[str, bytes]
+    profile: str = "ros2"
+    library: str = "hil"
+    compression: CompressionType = CompressionType.ZSTD
+    indexes: IndexType = IndexType.ALL
+    encoding: str = "cdr"
+    cycles_per_chunk: int = 10
+    chunk_size: int = 1 << 40
+
+    @classmethod
+    def of(cls, path: Path) -> Self:
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            messages = [
+                Message(
+                    channel.topic, kind.name if kind else "", kind.data.decode() if kind else "",
+                    one.log_time, one.publish_time, one.sequence, one.data,
+                )
+                for kind, channel, one in reader.iter_messages(log_time_order=False)
+            ]  # fmt: skip
+            found = [dict(record.metadata) for record in reader.iter_metadata()]
+            attachments = {one.name: one.data for one in reader.iter_attachments()}
+        for entries in found:
+            entries.pop("checksum")
+        return cls(messages, found[0], found[1], attachments)
+
+    def write(self, path: Path) -> Path:
+        with path.open("wb") as stream:
+            writer = Writer(
+                stream, self.chunk_size, compression=self.compression, index_types=self.indexes
+            )
+            writer.start(self.profile, self.library)
+            writer.add_metadata("hil", sealed(self.metadata))
+            for name, data in sorted(self.attachments.items()):
+                writer.add_attachment(0, 0, name, "text/plain", data)
+            channels: dict[str, int] = {}
+            cycles = 0
+            for message in self.messages:
+                if message.topic not in channels:
+                    kind = writer.register_schema(message.schema, "ros2msg", message.text.encode())
+                    channel = writer.register_channel(message.topic, self.encoding, kind)
+                    channels[message.topic] = channel
+                if message.topic == CYCLE:
+                    if cycles and cycles % self.cycles_per_chunk == 0:
+                        writer.flush()
+                    cycles += 1
+                times = message.log_time, message.data, message.publish_time, message.sequence
+                writer.add_message(channels[message.topic], *times)
+            writer.flush()
+            writer.add_metadata("hil.outcome", sealed(self.outcome))
+            writer.finish()
+        return path
 
 
 class Indexed:

@@ -4,7 +4,7 @@ the same bytes of the same calls."""
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -33,7 +33,7 @@ from hil.archive import (
 from hil.archive import schema as profile
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import description_messages
-from tests.hil.mcap_bytes import rewritten
+from tests.hil.mcap_bytes import Content
 
 JOINTS = ("shoulder", "elbow", "a_joint_with_a_long_name", "wrist")
 COUNT = 250
@@ -267,7 +267,8 @@ def test_our_reader_takes_chunks_of_every_compression_and_layout(
 ) -> None:
     """The same records written by the library with chunks that end within a cycle."""
     copy = tmp_path / path.name
-    rewritten(path, copy, chunk_size=40_000, compression=compression)
+    content = replace(Content.of(path), library="mcap", cycles_per_chunk=COUNT)
+    replace(content, chunk_size=40_000, compression=compression).write(copy)
     monkeypatch.setattr("hil.archive.scan._BATCH", 0)
     again = open_archive(copy)
     assert again.complete, again.missing

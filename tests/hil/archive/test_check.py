@@ -7,88 +7,24 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from hil.archive import Samples, container, header, open_archive, schema, write_samples
 from hil.archive.check import ASPECTS, check_archive
 from hil.errors import NotAnArchiveError
-
-
-@dataclass(frozen=True)
-class Message:
-    topic: str
-    schema: str
-    text: str
-    log_time: int
-    publish_time: int
-    sequence: int
-    data: bytes
-
-
-@dataclass
-class Content:
-    """What the library writes."""
-
-    messages: list[Message]
-    metadata: dict[str, str]
-    outcome: dict[str, str]
-    attachments: dict[str, bytes]
-    profile: str = "ros2"
-    library: str = "hil"
-    compression: CompressionType = CompressionType.ZSTD
-    indexes: IndexType = IndexType.ALL
-    encoding: str = "cdr"
-    cycles_per_chunk: int = 10
-
-    def write(self, path: Path) -> Path:
-        with path.open("wb") as stream:
-            writer = Writer(stream, 1 << 40, compression=self.compression, index_types=self.indexes)
-            writer.start(self.profile, self.library)
-            writer.add_metadata("hil", header.sealed(self.metadata))
-            for name, data in sorted(self.attachments.items()):
-                writer.add_attachment(0, 0, name, "text/plain", data)
-            channels: dict[str, int] = {}
-            cycles = 0
-            for message in self.messages:
-                if message.topic not in channels:
-                    kind = writer.register_schema(message.schema, "ros2msg", message.text.encode())
-                    channel = writer.register_channel(message.topic, self.encoding, kind)
-                    channels[message.topic] = channel
-                if message.topic == schema.CYCLE:
-                    if cycles and cycles % self.cycles_per_chunk == 0:
-                        writer.flush()
-                    cycles += 1
-                times = message.log_time, message.data, message.publish_time, message.sequence
-                writer.add_message(channels[message.topic], *times)
-            writer.flush()
-            writer.add_metadata("hil.outcome", header.sealed(self.outcome))
-            writer.finish()
-        return path
+from tests.hil.mcap_bytes import Content
 
 
 @pytest.fixture
 def content(written) -> Content:
-    with written.path.open("rb") as stream:
-        reader = make_reader(stream)
-        messages = [
-            Message(
-                channel.topic, kind.name, kind.data.decode(),
-                one.log_time, one.publish_time, one.sequence, one.data,
-            )
-            for kind, channel, one in reader.iter_messages(log_time_order=False)
-        ]  # fmt: skip
-        metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-    for entries in metadata.values():
-        entries.pop("checksum")
-    del metadata["hil.outcome"][header.CHUNKS]  # of chunks that are changed here
-    return Content(messages, metadata["hil"], metadata["hil.outcome"], dict(written.attachments))
+    found = Content.of(written.path)
+    del found.outcome[header.CHUNKS]  # of chunks that are changed here
+    return found
 
 
 def changed(content: Content, topic: str, nth: int, **changes: Any) -> None:

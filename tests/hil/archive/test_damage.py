@@ -12,13 +12,13 @@ import random
 import stat
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
 from mcap_ros2.decoder import DecoderFactory
 
 from drivers.record import cycle_dtype
@@ -242,7 +242,8 @@ class TestChunksOfAnotherArchive:
 
     def test_another_program_may_cut_the_chunks_anew(self, written, path):
         """It names itself in the header; a repair makes the file ours again, list and all."""
-        mcap_bytes.rewritten(written.path, path, cycles=7, compression=CompressionType.ZSTD)
+        content = mcap_bytes.Content.of(written.path)
+        replace(content, library="mcap", cycles_per_chunk=7).write(path)
         assert open_archive(path).complete
         done = repair(path)
         assert done.losses == ()
