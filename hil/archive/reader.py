@@ -198,9 +198,7 @@ class _Content:
 
     def visit(self, scan: Scan, found: Mapping[str, Messages], offset: int) -> None:
         """Decode messages; nothing of them is held before all are verified."""
-        own = CYCLE in scan.parser.topics
-        usual = (CYCLE, EVENTS) if own else (schema.MEASURED, schema.MOTOR_CURRENT, EVENTS)
-        topics = usual if self._topics is None else self._topics
+        topics = scan.topics
         wanted = [topic for topic in topics if topic in found and topic != EVENTS]
         if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
@@ -321,7 +319,7 @@ def open_archive(
     content = _Content(fields, topics, times)
     try:
         with opened(path) as stream:
-            scan = Scan(stream, content.visit, times=times)
+            scan = Scan(stream, content.visit, topics=topics, times=times)
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error

@@ -131,6 +131,8 @@ class Scan:
         visit: uses verified messages by topic, of the chunk at an offset (and of some behind it
             where damage ends the scan); raises `Damage` where they cannot be used, and then nothing
             of them counts.
+        topics: channels wanted, None for those of the samples and the events; others are verified
+            only past damages.
         times: range of the stamps wanted [ns]; chunks that lie outside, by the index, are not read.
         past_damage: whether to go on behind damages, `faults`, or to end at the first, `damage`.
 
@@ -158,6 +160,7 @@ class Scan:
         stream: BinaryIO,
         visit: Callable[[Scan, Mapping[str, Messages], int], None],
         *,
+        topics: Collection[str] | None = None,
         times: tuple[int, int] = ALWAYS,
         past_damage: bool = False,
     ) -> None:
@@ -175,6 +178,7 @@ class Scan:
         self.damage: Damage | None = None
         self.faults: list[Fault] = []
         self._visit = visit
+        self._topics = topics
         self._past_damage = past_damage
         self._gap = False  # whether chunks were left out, or lost, behind the last one
         self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
@@ -192,6 +196,15 @@ class Scan:
             self._survey(stream, summary)
         else:
             self._read(stream, _outside(summary, times))
+
+    @property
+    def topics(self) -> Collection[str]:
+        """The channels wanted."""
+        if self._topics is not None:
+            return self._topics
+        own = schema.CYCLE in self.parser.topics
+        samples = (schema.CYCLE,) if own else (schema.MEASURED, schema.MOTOR_CURRENT)
+        return (*samples, schema.EVENTS)
 
     @property
     def mixed(self) -> bool:
@@ -379,12 +392,13 @@ class Scan:
         if outcome is None:
             yield "outcome", "the outcome is missing"
             return
-        found = {
-            "samples": (outcome.samples, self.samples),
-            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
-        }
-        if "packets" in outcome.record:
-            found["packets"] = outcome.packets, self.counts.get(schema.PACKETS, 0)
+        found: dict[str, tuple[int | None, int]] = {}
+        counts = {"samples": NUMBERS, "events": (schema.EVENTS,), "packets": (schema.PACKETS,)}
+        for key, topics in counts.items():
+            known = key != "packets" or key in outcome.record
+            if known and (self._past_damage or not set(topics).isdisjoint(self.topics)):
+                count = max(self.counts.get(topic, 0) for topic in topics)
+                found[key] = getattr(outcome, key), count
         if self.expected.chunks is not None:
             found["chunks"] = len(self.expected.chunks), self.chunks
         for key, (stated, count) in found.items():
@@ -426,8 +440,12 @@ class Scan:
             if numbers and self._numbers not in (set(), numbers):
                 reason = "(chunk) has samples in other channels than those before"
                 raise Damage(offset, reason)
-            missing = self._check_sequences(found, offset)
-            newest = self._check_times(found, offset)
+            verified = found
+            if not self._past_damage:
+                wanted = self.topics
+                verified = {topic: one for topic, one in found.items() if topic in wanted}
+            missing = self._check_sequences(verified, offset)
+            newest = self._check_times(verified, offset)
             if missing:
                 self._check_gap(missing, offset)
             self._visit(self, found, offset)
@@ -437,7 +455,7 @@ class Scan:
         self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
-        for topic, messages in found.items():
+        for topic, messages in verified.items():
             self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
 
@@ -451,9 +469,7 @@ class Scan:
             gaps[topic] = (int(sequence[0]) - self._next.get(topic, 0)) % _SEQUENCES
             if gaps[topic] > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages that were before")
-        # Another program may have cut chunks within a cycle: then the cycles are what is read.
-        alike = NUMBERS if self._past_damage or schema.CYCLE not in found else (schema.CYCLE,)
-        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in alike}) > 1:
+        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
         return [topic for topic, gap in gaps.items() if gap]
 
