@@ -180,7 +180,8 @@ class Scan:
         self._visit = visit
         self._topics = topics
         self._past_damage = past_damage
-        self._gap = False  # whether chunks were left out, or lost, behind the last one
+        self._gap = False  # whether something was lost behind the last sound chunk
+        self._skipped = False  # whether chunks were left out: channels go on at any number
         self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
         self._waiting: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
         self._place = 0  # place in the list of the chunk that comes next
@@ -238,7 +239,8 @@ class Scan:
                 for record in container.records(stream, self.size, skip=outside):
                     if record.offset in outside:
                         self._flush()
-                        self._place, self._gap = self._place + 1, True
+                        self._place, self._skipped = self._place + 1, True
+                        self._next.clear()
                         continue
                     self._take(record)
                     if record.opcode == container.METADATA:
@@ -364,6 +366,8 @@ class Scan:
         else:
             self._waiting.append((offset, slice(begin, begin + len(data))))
             self._buffer[begin : begin + len(data)] = data
+            if not self.parser.channels:  # they stand in the first
+                self._flush()
 
     def _flush(self) -> None:
         """Decode the chunks that wait: all at once, or one by one where that fails.
@@ -374,7 +378,8 @@ class Scan:
         waiting, self._waiting = self._waiting, []
         if len(waiting) > 1:
             try:
-                self._decode(self._buffer[: waiting[-1][1].stop], waiting[0][0])
+                whole = self._buffer[: waiting[-1][1].stop]
+                self._decode(whole, waiting[0][0], several=True)
                 self.chunks += len(waiting)
                 return
             except Damage:
@@ -424,12 +429,17 @@ class Scan:
             raise Damage(offset, "(chunk) does not continue the one before")
         self._place = int(places[-1]) + 1
 
-    def _decode(self, data: Content, offset: int) -> None:
-        """Take messages that must be the next of their channels; else nothing of them counts."""
+    def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
+        """Take messages that must be the next of their channels; else nothing of them counts.
+
+        Several chunks at once must not define channels: what was in front of these is judged first.
+        """
         parser = self.parser
         before = dict(parser.schemas), dict(parser.channels)
         try:
             by_number = parser.messages(data, offset)
+            if several and parser.channels.keys() != before[1].keys():
+                raise Damage(offset, "(chunk) defines a channel")
             if not by_number.keys() <= parser.channels.keys():
                 for definition in self.definitions:
                     parser.define(definition)
@@ -466,7 +476,9 @@ class Scan:
             sequence = messages.of_heads("sequence")
             if (np.diff(sequence) != 1).any():
                 raise Damage(offset, "(chunk) has messages out of order")
-            gaps[topic] = (int(sequence[0]) - self._next.get(topic, 0)) % _SEQUENCES
+            first = int(sequence[0])
+            gaps[topic] = first - self._next.get(topic, first if self._skipped else 0)
+            gaps[topic] %= _SEQUENCES
             if gaps[topic] > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages that were before")
         if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
@@ -476,7 +488,7 @@ class Scan:
     def _check_gap(self, topics: Collection[str], offset: int) -> None:
         """Messages of these topics are missing in front of the chunk at `offset`."""
         if not self._past_damage:
-            if not self._gap and not self.expected.repaired:
+            if not self.expected.repaired:
                 reason = "(chunk) does not continue the one before it: a chunk is missing"
                 raise Damage(offset, reason)
             return
