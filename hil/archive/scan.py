@@ -247,6 +247,9 @@ class Scan:
                         self._require_ours(record.offset)
             finally:
                 self._flush()  # what waits is in front of any damage so far
+            chunks = self.expected.chunks
+            if outside and chunks is not None and self._place < len(chunks):
+                raise Damage(self.size, "is not there: a chunk is missing")
             if not outside and self.header is not None:
                 for _, text in self._shortfalls():
                     raise Damage(self.size, f"is not there: {text}")

@@ -76,6 +76,9 @@ class TestDamage:
             archive = read(written, path, bytes(changed))
             whole = archive is not None and archive.complete
             assert whole == (record.opcode not in matters)
+            if archive is not None:
+                part = open_archive(path, start=50.1, stop=50.3)
+                assert part.n_samples == 20 or not part.complete
 
     @pytest.mark.parametrize("place", range(5))
     def test_a_chunk_that_was_cut_out_is_noticed(self, written, path, place):
