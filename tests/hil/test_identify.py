@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import scipy
 import typer
 from typer.testing import CliRunner
 
@@ -616,11 +617,15 @@ class TestCalibration:
     """Held-out means of torque beside their 95 % intervals."""
 
     def test_is_honest(self, split: Identification) -> None:
-        """4.8 s of six axes, white noise: nine or ten block means each, all but a few inside."""
+        """4.8 s of six axes, white noise: nine or ten block means each, all but a few inside.
+
+        So few inside as are refused here come once in a thousand recordings.
+        """
         found = split.results.calibration
         assert found is not None
         assert 54 <= found.means <= 60
-        assert found.inside >= 0.9
+        inside = round(found.inside * found.means)
+        assert scipy.stats.binom.cdf(inside, found.means, 0.95) > 1e-3
         assert len(found.joint_inside) == len(found.half_width) == 6
 
     def test_stands_on_the_terminal_and_in_the_report(
