@@ -196,20 +196,20 @@ def log(
         uncoupled: Leave the inertias and the friction of coupled motors out of the model, to see
             what they explain; angles and torques stay those of the map.
     """
-    found = ColumnMap.load(columns)
 
     def recorded() -> tuple[str, ...]:
-        if found.joints is None:
+        joints = ColumnMap.load(columns).joints
+        if joints is None:
             problem = "does not say which joints were recorded"
             remedy = "--lock-others needs joints = [...], the URDF's joint of each column"
             raise InputError(columns, problem, field="joints", remedy=remedy)
-        return found.joints
+        return joints
 
     path = import_log(
         source,
         output,
         robot=arm.robot(recorded),
-        columns=found,
+        columns=ColumnMap.load(columns),
         held_joints=held or (),
         use=kind,
         coupled=not uncoupled,
