@@ -1,14 +1,52 @@
-"""Work for the workers of a batch: no archives, but all their woes. Their processes import it."""
+"""Workers for tests: in this process, or with archives and tasks that end theirs."""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, Final
 
-from hil.batch.workers import ArchiveTask
+from hil.batch.discovery import Place
+from hil.batch.types import ArchiveRef, Broken
+from hil.batch.workers import ArchiveTask, Workers, run_task
 from hil.errors import ArchiveError
+
+NOTHING_OPEN: Final = (
+    *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
+    *("--standstill", "slow", "--delay", "stated", "--estimator", "wls"),
+)
+"""Options of `hil reidentify` that leave nothing to be chosen of a controller's archives."""
+
+
+class Here(Workers):
+    """This process; `deadly` archives, by name, end it, or would if it were another."""
+
+    count = 1
+
+    def __init__(self, *deadly: str, near: bool = True) -> None:
+        self.deadly, self.near = deadly, near
+        self.tasks: list[ArchiveTask[Any]] = []
+
+    def results(
+        self, tasks: Sequence[ArchiveTask[Any]], done: Callable[[int], None] | None = None
+    ) -> Iterator[Any]:
+        for task in tasks:
+            self.tasks.append(task)
+            if done is not None:
+                done(1)
+            deadly = any(ref.name in self.deadly for ref in _refs(task.arguments[0]))
+            yield Broken(task.path, "ended its process") if deadly else run_task(task)
+
+
+def _refs(argument: Any) -> Iterator[ArchiveRef]:
+    if isinstance(argument, ArchiveRef):
+        yield argument
+    elif not isinstance(argument, Place):  # looking into an archive is harmless
+        for one in argument:
+            yield from _refs(one)
 
 
 def number(k: int) -> int:

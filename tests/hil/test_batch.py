@@ -47,7 +47,7 @@ from identification.estimators.consistent import Shrinkage
 from identification.signals.samples import Preprocessing
 
 from .arm_histories import Load, steady, trend_of
-from .batch_workers import NOTHING_OPEN, Here
+from .batch_work import NOTHING_OPEN, Here
 from .conftest import small
 from .mcap_bytes import with_attachment
 

@@ -10,17 +10,22 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from drivers.transports.udp import UdpSpec
+from hil.campaign.folder import MESH, MISSING, checksums
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.schema import CanTable, CellFile
-from hil.cell.text import replaced_value
+from hil.cell.text import replaced_value, urdf_limits
 from hil.design import preset, problem_of
+from hil.importers.findings import urdf_limits as limits_of_an_import
 from hil.simulation import planted_values
 from sim_fixtures.ns16 import CELL_PATH, TABLE2, URDF_PATH
+from sim_fixtures.plant import build_model
+from tests.hil.new_cells import TWO_JOINTS
 
 
 @pytest.fixture
@@ -494,3 +499,35 @@ def test_the_worked_example_can_be_designed_for_with_all_checks(ur10: Path) -> N
     assert problem.constraints.checker is not None
     assert problem.constraints.currents is not None
     assert ("base_link", "upper_arm_link") in problem.constraints.checker.pairs
+
+
+DRAKES = TWO_JOINTS.replace('"1.0"', '"1.0" encoding="GB2312"').replace(
+    "<robot ", '<robot xmlns="http://drake.mit.edu" xmlns:gazebo="x" gazebo:y="z" '
+)
+
+
+def test_a_default_namespace_changes_no_limit() -> None:
+    np.testing.assert_array_equal(
+        urdf_limits(DRAKES, ["hip", "knee"]), urdf_limits(TWO_JOINTS, ["hip", "knee"])
+    )
+    assert limits_of_an_import(DRAKES) == limits_of_an_import(TWO_JOINTS)
+    assert limits_of_an_import(DRAKES)["hip"].upper == 2.0
+
+
+def test_a_simulated_arm_gets_other_inertias() -> None:
+    plain, drakes = (
+        build_model(text, (0.0, 0.0, -9.81), np.zeros(2), (1.1, 0.9))
+        for text in (TWO_JOINTS, DRAKES)
+    )
+    masses = [inertia.mass for inertia in drakes.inertias]
+    assert masses == [inertia.mass for inertia in plain.inertias]
+    assert masses[1] == 1.1 * pin.buildModelFromXML(TWO_JOINTS).inertias[1].mass
+
+
+def test_a_simulated_joint_that_turns_on_and_on_has_one_angle() -> None:
+    assert build_model(DRAKES, (0.0, 0.0, -9.81), np.zeros(2)).nq == 2
+
+
+def test_meshes_are_sealed(tmp_path: Path) -> None:
+    urdf = DRAKES.replace('<box size="0.08 0.08 0.3"/>', '<mesh filename="a.stl"/>')
+    assert checksums({"robot.urdf": urdf.encode()}, tmp_path)[f"{MESH}a.stl"] == MISSING

@@ -29,7 +29,7 @@ from hil.importers.robot import _cell_text
 from hil.importers.table import Table
 from hil.recordings import open_recording
 from identification import FrictionLaw
-from tests.hil.three_joints import JOINTS, imported, three_joint_robot
+from tests.hil.simulated_logs import JOINTS, imported, three_joint_robot
 
 Array = NDArray[np.float64]
 Q = np.random.default_rng(5).normal(size=(40, 3))

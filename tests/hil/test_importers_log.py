@@ -13,8 +13,8 @@ from hil.errors import SourceError
 from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.column_map import UNITS
 from hil.recordings import open_recording
-from tests.hil.three_joints import column_map, three_joint_robot
-from tests.hil.three_joints import imported as read
+from tests.hil.simulated_logs import column_map, three_joint_robot
+from tests.hil.simulated_logs import imported as read
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ from hil.simulation import (
     simulated_link,
 )
 from sim_fixtures.faults import Faultable, parse_fault, split_faults
-from tests.hil.batch_workers import Here
+from tests.hil.batch_work import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 
 Array = NDArray[np.float64]

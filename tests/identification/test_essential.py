@@ -22,8 +22,8 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.signals.samples import Samples, prepare
 from identification.validation.prediction import over_all, prediction_error
 from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import ur10
 from tests.identification.two_link import URDF, as_samples, sine_motion, truth
-from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 

@@ -16,6 +16,7 @@ from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
 from identification.signals.samples import Samples, prepare
 from identification.validation.prediction import prediction_error
+from tests.identification.robots import ur10
 from tests.identification.two_link import (
     MODEL,
     NOISE,
@@ -26,7 +27,6 @@ from tests.identification.two_link import (
     recording,
     truth,
 )
-from tests.identification.ur10_bag import ur10
 
 Array = NDArray[np.float64]
 LOSSES = [Huber(), Tukey()]
