@@ -30,7 +30,7 @@ from hil.progress import Silent
 from hil.results import Results
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import simulate
-from tests.hil.test_gains_command import CENTRE, MASS, archive
+from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
 from tests.motion_table import MotionTable
 
 
@@ -79,8 +79,8 @@ class TestBringYourOwnRobot:
         (workplace / "runs" / "demo").symlink_to(identified_campaign.folder.root)
         times = np.arange(0.0, 20.0, 8e-3)
         load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
-        archive(workplace, "empty", simulate("ur5_robot.urdf", times, seed=1))
-        archive(workplace, "full", simulate("ur5_robot.urdf", times, seed=2, load=load))
+        archive_of_currents(workplace, "empty", simulate("ur5_robot.urdf", times, seed=1))
+        archive_of_currents(workplace, "full", simulate("ur5_robot.urdf", times, seed=2, load=load))
         ran = []
         for language, block in blocks(self.TEXT.replace(self.BALANCER, "")):
             if language == "python":

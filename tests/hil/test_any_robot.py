@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import butter, sosfilt, sosfiltfilt
+from typer.testing import CliRunner
 
+from hil.cli import app
+from hil.cli.verdict import NOT_GOOD
 from hil.errors import ArchiveError
 from hil.identify.options import FIXED, Options
 from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.settings import stated_settings
 from hil.identify.sources import gather_sources
-from hil.importers import ColumnMap, Robot, Use, import_log
+from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, Use, import_log
 from hil.progress import Silent
+from hil.results import FittedResult, Results
 from identification import Estimate, FrictionLaw, estimate, prediction_error
 from identification.factor.factor import Factor
 from tests.hil.simulated_logs import (
@@ -25,6 +32,7 @@ from tests.hil.simulated_logs import (
     Simulated,
     planted,
     simulate,
+    urdf_path,
 )
 
 Array = NDArray[np.float64]
@@ -341,3 +349,128 @@ def test_a_log_without_time_finds_the_parameters(tmp_path: Path) -> None:
     columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
     options = Options(torque_bandwidth=None)
     assert_found(identify(tmp_path, simulated, "log.npz", columns, options=options), simulated)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT.parent / "shared" / "data"
+TEXT = (ROOT / "docs" / "bring-your-own-robot.md").read_text(encoding="utf-8")
+SECTION = TEXT.split("## Two published recordings")[1].split("\n## ")[0]
+COMMANDS = re.findall(r"^\$ hil (.*)$", SECTION, re.MULTILINE)
+
+
+def fitted_by(commands: list[str], output: Path) -> FittedResult:
+    """Run an import and an identification, and read the errors of the fit."""
+    for command in commands:
+        arguments = shlex.split(command)
+        status = 0
+        if arguments[0] == "identify":
+            arguments, status = [*arguments, "--output", str(output)], NOT_GOOD
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == status, (command, result.output, result.exception)
+    fitted = Results.load(output / "results.json").fitted
+    assert fitted is not None
+    return fitted
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    if not (DATA / "tx40").is_dir() or not (DATA / "ur10_unisa").is_dir():
+        pytest.skip(f"there are no recordings below {DATA}")
+    files = [*(DATA / "tx40").iterdir(), *(DATA / "ur10_unisa").iterdir()]
+    for file in [*files, urdf_path("ur10_robot.urdf")]:
+        (tmp_path / file.name).symlink_to(file)
+    (block,) = re.findall(r"```toml\n(.*?)```", SECTION, re.DOTALL)
+    (tmp_path / "tx40.toml").write_text(block)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_page_has_the_commands_of_three_identifications() -> None:
+    assert [command.split()[0] for command in COMMANDS] == ["import", "identify"] * 3
+
+
+@pytest.mark.slow
+def test_the_ur10_in_sample(workplace: Path) -> None:
+    """At most 5.15 % over all joints and every row."""
+    assert fitted_by(COMMANDS[:2], workplace / "ur10").all_rows_relative_error <= 0.0515
+
+
+@pytest.mark.slow
+def test_the_tx40_in_sample_with_its_coupling_and_without(workplace: Path) -> None:
+    """At most 10.9 % with, 14.3 % without, of the torque through 40 Hz, every row."""
+    coupled = fitted_by(COMMANDS[2:4], workplace / "coupled").smoothed_overall_relative_error
+    alone = fitted_by(COMMANDS[4:6], workplace / "alone").smoothed_overall_relative_error
+    assert coupled is not None and alone is not None
+    assert coupled <= 0.109
+    assert coupled < alone <= 0.143
+
+
+RATE = 125.0  # Hz
+BANDWIDTH = 4.0  # Hz
+OPTIONS = replace(FIXED, delay=None, torque_bandwidth="auto")
+COLUMNS = ColumnMap(
+    time=TimeColumn(column="time"),
+    position=Quantity(columns="position", joints_along="columns"),
+    torque=Quantity(columns="torque", joints_along="columns"),
+)
+
+
+def prepared(
+    folder: Path, order: int | None, *, causal: bool = False, options: Options = OPTIONS
+) -> Prepared:
+    """A log of a UR5, its torque through a Butterworth low-pass."""
+    log = simulate("ur5_robot.urdf", np.arange(0.0, 24.0, 1.0 / RATE), pace=2.0)
+    torque = log.torque
+    if order is not None:
+        sections = butter(order, BANDWIDTH, fs=RATE, output="sos")
+        torque = (sosfilt if causal else sosfiltfilt)(sections, torque, axis=0)
+    np.savez(folder / "log.npz", time=log.time, position=log.position, torque=torque)
+    robot = Robot.from_urdf(
+        log.urdf, friction=FrictionLaw(third=None, offset=True, standstill=0.02)
+    )
+    archive = import_log(folder / "log.npz", folder / "log.mcap", robot=robot, columns=COLUMNS)
+    return prepare_sources(gather_sources([archive], 0.7), options, Silent())
+
+
+def held_out_error(found: Prepared) -> float:
+    model = found.sources.cell.model
+    values = estimate(model, Factor.of(model, found.fitted[0])).values
+    (error,) = prediction_error(model, values, found.held_out, all_rows=True)
+    return error.overall
+
+
+@pytest.fixture(scope="module")
+def unfiltered(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    return prepared(tmp_path_factory.mktemp("unfiltered"), None)
+
+
+class TestFilteredTorque:
+    def test_none_is_claimed_without_one(self, unfiltered: Prepared) -> None:
+        assert unfiltered.settings.preprocessing.torque_bandwidth is None
+
+    @pytest.mark.parametrize("order", [1, 4])
+    def test_without_phase(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
+        found = prepared(tmp_path, order)
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
+
+    @pytest.mark.parametrize("order", [1, 2])
+    def test_a_lag_is_no_delay(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
+        """A low-pass that runs forwards lags by some ten ms, which are not taken for a delay."""
+        found = prepared(tmp_path, order, causal=True)
+        assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert found.settings.preprocessing.torque_shape.causal
+        assert found.settings.preprocessing.torque_delay == 0.0
+        assert found.delays is None
+        assert held_out_error(found) < 1.3 * held_out_error(unfiltered)
+
+
+class TestFixedOptions:
+    def test_nothing_is_decided(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def never(*_: object, **__: object) -> None:
+            raise AssertionError("something was asked")
+
+        for name in ("choose_settings", "estimate_delays", "possible_low_passes"):
+            monkeypatch.setattr(f"hil.identify.settings.{name}", never)
+        found = prepared(tmp_path, 2, causal=True, options=FIXED)
+        assert found.settings == stated_settings(found.sources.cell, FIXED)

@@ -1,21 +1,35 @@
+"""Sequential design: what earlier archives say joins what the new motion is going to say."""
+
 from __future__ import annotations
 
 import os
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
 
+from hil.archive import open_archive
+from hil.campaign import plan_around
 from hil.cell import Cell
+from hil.cli.design import design
 from hil.design import DesignResult, load_design, preset, problem_of
+from hil.design.earlier import known_from
+from hil.design.problem import Knowledge
 from hil.design.result import _seal, fingerprint, references
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
+from hil.identify import identify_archives
+from hil.identify.options import FIXED
+from hil.plots import design_picture
 from hil.progress import Silent
-from identification.excitation import Objective
+from identification.excitation import Criteria, Excitation, Objective, midpoints
 from planner import FourierSeries
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -23,15 +37,15 @@ TINY = {"population": 8, "generations": 2, "polish": 0}
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
+def ns16() -> Cell:
     return Cell.load(CELL_PATH)
 
 
 @pytest.fixture(scope="module", params=["a", "b"])
-def made(request, cell, tmp_path_factory) -> tuple[DesignFolder, Designed]:
+def made(request, ns16, tmp_path_factory) -> tuple[DesignFolder, Designed]:
     folder = DesignFolder(tmp_path_factory.mktemp("design") / request.param)
     settings = preset(request.param).kinematic().replaced(search=TINY)
-    return folder, run_design(folder, cell, settings, Silent(), workers=1)
+    return folder, run_design(folder, ns16, settings, Silent(), workers=1)
 
 
 @pytest.fixture
@@ -45,11 +59,11 @@ def written(folder, text):
     return path
 
 
-def test_the_file_restores_everything(made, cell):
+def test_the_file_restores_everything(made, ns16):
     folder, done = made
     again = DesignResult.load(folder.result)
     assert again.excitation.to_dict() == done.design.excitation.to_dict()
-    assert load_design(folder.root, cell).to_dict() == again.excitation.to_dict()
+    assert load_design(folder.root, ns16).to_dict() == again.excitation.to_dict()
     assert again.settings == done.result.settings and again.complete
     front = again.data["front"]
     assert front["chosen"] == done.design.chosen
@@ -62,9 +76,9 @@ def test_the_file_restores_everything(made, cell):
     assert "polished_from" not in again.data
 
 
-def test_its_criteria_are_those_of_the_motion_at_a_millisecond(made, cell):
+def test_its_criteria_are_those_of_the_motion_at_a_millisecond(made, ns16):
     excitation = load_design(made[0].result)
-    again = Objective(cell.model).criteria(excitation.trajectory, 0.001)
+    again = Objective(ns16.model).criteria(excitation.trajectory, 0.001)
     assert again == excitation.criteria
     assert excitation.criteria.n_samples == pytest.approx(
         1000 * excitation.trajectory.duration, abs=2
@@ -150,38 +164,38 @@ def test_another_planner_may_differ_in_the_last_digits_and_no_more(made, text, t
             load_design(written(tmp_path, odd))
 
 
-def test_a_cell_with_other_limits_is_refused_by_name(made, cell):
+def test_a_cell_with_other_limits_is_refused_by_name(made, ns16):
     slow = [100.0, 155.0, 170.0, 360.0, 350.0, 550.0]
-    other = cell.with_values({"limits.velocity_deg": slow, "cell.name": "the slow one"})
+    other = ns16.with_values({"limits.velocity_deg": slow, "cell.name": "the slow one"})
     with pytest.raises(InputError) as caught:
         load_design(made[0].result, other)
     for word in ("'NS 16 (simulated)'", "'the slow one'", "limits"):
         assert word in str(caught.value)
 
 
-def test_a_cell_with_another_campaign_link_or_wall_is_the_same_robot(made, cell):
-    other = cell.with_campaign(repetitions=3).with_link(transport="udp", host="127.0.0.1")
+def test_a_cell_with_another_campaign_link_or_wall_is_the_same_robot(made, ns16):
+    other = ns16.with_campaign(repetitions=3).with_link(transport="udp", host="127.0.0.1")
     respelled = other.text.replace("margin = 0.05", "margin = 5e-2  # m")
     assert respelled != other.text
-    other = Cell.from_texts(respelled, cell.urdf, cell.path)
-    assert fingerprint(other) == fingerprint(cell)
+    other = Cell.from_texts(respelled, ns16.urdf, ns16.path)
+    assert fingerprint(other) == fingerprint(ns16)
     wall = {"lower": [2.0, 2.0, 0.0], "upper": [2.1, 2.1, 1.0]}
-    walled = cell.with_values({"workspace.walls": [wall]})
-    assert fingerprint(walled) != fingerprint(cell)
+    walled = ns16.with_values({"workspace.walls": [wall]})
+    assert fingerprint(walled) != fingerprint(ns16)
     for each in (other, walled):
         load_design(made[0].result, each)
 
 
-def test_a_subset_and_a_polish_are_recorded(cell, tmp_path):
-    names = list(cell.model.parameter_names[:12])
+def test_a_subset_and_a_polish_are_recorded(ns16, tmp_path):
+    names = list(ns16.model.parameter_names[:12])
     settings = preset("front").kinematic()
     settings = settings.replaced(search=TINY | {"polish": 80}, objective={"parameters": names})
     folder = DesignFolder(tmp_path / "few")
-    design = run_design(folder, cell, settings, Silent(), workers=2).design
+    design = run_design(folder, ns16, settings, Silent(), workers=2).design
     again = DesignResult.load(folder.result)
     assert again.data["search"]["parameters"] == names
     assert again.data["search"]["n_parameters"] == 12
-    objective = problem_of(cell, settings).objective
+    objective = problem_of(ns16, settings).objective
     criteria = objective.criteria(design.excitation.trajectory, 0.001)
     assert criteria == again.excitation.criteria
     assert "chosen" not in again.data["front"]
@@ -209,10 +223,10 @@ def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def result(cell, tmp_path_factory) -> DesignResult:
+def result(ns16, tmp_path_factory) -> DesignResult:
     folder = DesignFolder(tmp_path_factory.mktemp("design") / "a")
     settings = preset("a").kinematic().replaced(search=TINY)
-    return run_design(folder, cell, settings, Silent(), workers=1).result
+    return run_design(folder, ns16, settings, Silent(), workers=1).result
 
 
 @pytest.fixture
@@ -228,42 +242,189 @@ def changed(result: DesignResult, **tables: Any) -> DesignResult:
     return replace(result, data={**result.data, **tables})
 
 
-def test_what_was_searched_without_looking_at_everything_is_marked(cell, result, saved):
+def test_what_was_searched_without_looking_at_everything_is_marked(ns16, result, saved):
     path = saved(result)
-    found = references([path, path], cell, preset("b"), together=False)
+    found = references([path, path], ns16, preset("b"), together=False)
     name, measures = "method A (kinematic)", result.excitation.criteria.measures
     assert found == {name: measures, f"{name} ({path})": measures}
     whole = changed(result, settings=preset("a").to_dict())
-    assert set(references([saved(whole)], cell, preset("b"), together=False)) == {"method A"}
+    assert set(references([saved(whole)], ns16, preset("b"), together=False)) == {"method A"}
 
 
-def test_another_robot_is_refused(cell, result, saved):
-    heavier = cell.with_values({"robot.gravity": [0.0, 0.0, -1.62]})
+def test_another_robot_is_refused(ns16, result, saved):
+    heavier = ns16.with_values({"robot.gravity": [0.0, 0.0, -1.62]})
     words = r"excitation\.toml: cell: was designed for the cell .*, whose robot is not that of"
     with pytest.raises(InputError, match=words):
         references([saved(result)], heavier, preset("b"), together=False)
 
 
-def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(cell, result, saved):
+def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(ns16, result, saved):
     archives = changed(result, earlier={"archives": [["a.mcap", "0" * 64]]})
     with pytest.raises(InputError, match=r"excitation\.toml: --compare: was designed with --earl"):
-        references([saved(archives)], cell, preset("b"), together=False)
+        references([saved(archives)], ns16, preset("b"), together=False)
     with pytest.raises(InputError, match=r"^--compare: .*--earlier.*leave out one of the two"):
-        references([saved(result)], cell, preset("b"), together=True)
-    assert references([], cell, preset("b"), together=True) == {}
+        references([saved(result)], ns16, preset("b"), together=True)
+    assert references([], ns16, preset("b"), together=True) == {}
 
 
-def test_other_parameters_are_not_drawn_beside_all(cell, result, saved):
-    names = list(cell.model.parameter_names)
+def test_other_parameters_are_not_drawn_beside_all(ns16, result, saved):
+    names = list(ns16.model.parameter_names)
     some = preset("b").replaced(objective={"parameters": names[:3]})
     words = r"excitation\.toml: --compare: was judged by 58 parameters, this design by 3, of which"
     with pytest.raises(InputError, match=words + " 3 are the same; .*same \\[objective\\]"):
-        references([saved(result)], cell, some, together=False)
+        references([saved(result)], ns16, some, together=False)
     search = result.data["search"] | {"parameters": names[:3], "n_parameters": 3}
     subset = changed(result, search=search)
-    assert references([saved(subset)], cell, some, together=False)
+    assert references([saved(subset)], ns16, some, together=False)
     others = preset("b").replaced(objective={"parameters": names[1:4]})
     with pytest.raises(InputError, match="by 3 parameters, this design by 3, of which 2 are"):
-        references([saved(subset)], cell, others, together=False)
+        references([saved(subset)], ns16, others, together=False)
     everything = preset("b").replaced(objective={"parameters": names})
-    assert references([saved(result)], cell, everything, together=False)
+    assert references([saved(result)], ns16, everything, together=False)
+
+
+@pytest.fixture(scope="module")
+def known(campaign, cell) -> Knowledge:
+    return known_from([campaign.folder.root], cell, Silent())
+
+
+@pytest.mark.slow
+def test_joints_count_by_the_noise_of_their_torque(known, campaign):
+    kinds = ("excitation", "validation", "standstill")
+    paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
+    options = replace(FIXED, in_sample=True)
+    pooled = identify_archives(paths, Silent(), options).estimate.pooled
+    np.testing.assert_allclose(known.joint_weights, 1.0 / pooled.noise_std**2)
+    np.testing.assert_array_equal(known.values, pooled.values)
+    np.testing.assert_array_equal(known.std, pooled.std)
+
+
+def test_running_the_same_motion_again_says_about_the_same_again(excitations, cell, plan):
+    # The archives hold a sample for each cycle of 1 ms, the search takes one every 8 ms. A fit
+    # also leaves out rows near reversals, where a smoothed acceleration says little: up to one in
+    # twenty of those in which a joint accelerates.
+    known = known_from(excitations, cell, Silent())
+    objective = problem_of(cell, preset("b").kinematic(), known).objective
+    assert objective.repetitions == len(excitations) == 3
+    both = objective.information(midpoints(plan.excitation.trajectory))
+    np.testing.assert_allclose(np.diag(known.gram) / np.diag(both), 0.5, atol=0.03)
+
+
+@pytest.fixture(scope="module")
+def excitations(campaign) -> list[Path]:
+    return campaign.folder.completed("excitation")
+
+
+def rows(found: Knowledge) -> np.ndarray:
+    """Squares of each joint's friction columns; they depend on no weight."""
+    of_friction = [k for k, name in enumerate(found.names) if name.startswith("f")]
+    joints = [int(found.names[k].rpartition("_")[2]) - 1 for k in of_friction]
+    return np.diag(found.gram)[of_friction] / found.joint_weights[joints]
+
+
+@pytest.mark.slow
+def test_every_motion_counts_whether_fitted_or_held_out(known, excitations, campaign, cell):
+    """Of three repetitions alone one is held out, of one the end; a campaign has other motions."""
+    three = known_from(excitations, cell, Silent())
+    one = known_from(excitations[:1], cell, Silent())
+    assert one.samples == pytest.approx(three.samples / 3.0, rel=0.01)
+    np.testing.assert_allclose(rows(one), rows(three) / 3.0, rtol=0.02)
+    assert [name for name, _ in one.archives] == [excitations[0].name]
+    validation = campaign.folder.completed("validation")
+    assert {name for name, _ in known.archives} == {p.name for p in [*excitations, *validation]}
+    whole = known_from([*excitations, *validation[:1]], cell, Silent())
+    assert np.all(rows(whole) > 1.05 * rows(three))
+    assert np.all(rows(known) > 1.05 * rows(whole))
+
+
+class Listening(Silent):
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+
+@pytest.mark.slow
+def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell, run):
+    short = cell.with_campaign(repetitions=1, validation_runs=1)
+    limits, random = cell.joint_limits, np.random.default_rng(12)
+    amplitude = random.uniform(-0.5, 0.5, (6, 3))
+    amplitude[5] *= 1e-3  # its peak speed stays below what counts as standstill
+    series = FourierSeries(
+        offset=0.5 * (limits.lower + limits.upper),
+        amplitude=amplitude,
+        frequency=random.uniform(0.8, 3.2, (6, 3)),
+        length=8.0,
+        ramp=2.0,
+    )
+    unknown = Criteria(log10_det=0.0, coupling_index=0.0, fitness=0.0, n_samples=1)
+    excitation = Excitation(series, unknown, method="a", seed=7, tried=1, rejected={})
+    folder = run(tmp_path / "campaign", short, plan_around(short, excitation)).folder
+    reporter = Listening()
+    known = known_from(folder.completed("excitation"), cell, reporter)
+    (warning,) = (text for text in reporter.said if text.startswith("warning: "))
+    assert f"{cell.joint_names[5]} never moved" in warning
+    assert not any(name in warning for name in cell.joint_names[:5])
+    drives = cell.drive_train
+    strength = np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
+    share = known.joint_weights**-0.5 / strength
+    assert share[5] == pytest.approx(np.median(share[:5]))
+    # A design with it asks for what is missing: the sixth joint's parameters.
+    assert np.isinf(known.std[known.names.index("f0_6")])
+    assert known.gram[known.names.index("f0_6")].tolist() == [0.0] * len(known.names)
+    problem = problem_of(cell, preset("b").kinematic(), known)
+    genes = problem.genome.sample(np.random.default_rng(1), 3)
+    assert np.all(np.isfinite(problem.score(genes).measures))
+
+
+def test_archives_can_be_named_one_by_one(known, campaign, cell):
+    kinds = ("excitation", "validation", "standstill")
+    paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
+    again = known_from(paths, cell, Silent())
+    np.testing.assert_array_equal(again.gram, known.gram)
+    assert again.archives == known.archives
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in known.archives)
+
+
+def test_archives_of_another_robot_are_refused(campaign, cell):
+    text = cell.text.replace('third = "quadratic"', 'third = "cubic"')
+    other = Cell.from_texts(text, cell.urdf, cell.path)
+    with pytest.raises(InputError, match="whose robot is not that of"):
+        known_from([campaign.folder.root], other, Silent())
+
+
+def test_a_folder_without_archives_is_refused(tmp_path, cell):
+    with pytest.raises(InputError, match="holds no whole archive"):
+        known_from([tmp_path], cell, Silent())
+    with pytest.raises(InputError, match="is a folder among archives"):
+        known_from([tmp_path, tmp_path / "a.mcap"], cell, Silent())
+
+
+@pytest.mark.slow
+def test_a_second_design_names_what_it_adds_to(campaign, tmp_path, monkeypatch):
+    drawn = {}
+
+    def draw(*_, **asked):
+        drawn.update(asked)
+        return Figure()
+
+    monkeypatch.setattr(design_picture, "draw_design", draw)
+    app = typer.Typer()
+    app.command()(design)
+    (tmp_path / "my.toml").write_text(
+        'method = "b"\n[search]\npopulation = 8\ngenerations = 1\n'
+        "[objective]\nmax_relative_std = 50.0\n"
+    )
+    arguments = [campaign.folder.cell, "--settings", tmp_path / "my.toml", "--kinematic"]
+    arguments += ["--earlier", campaign.folder.root, "-o", tmp_path / "out", "--workers", "1"]
+    result = CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert drawn["together"]
+    data = tomllib.loads((tmp_path / "out" / "excitation.toml").read_text())
+    names = [name for name, _ in data["earlier"]["archives"]]
+    assert campaign.folder.completed("excitation")[0].name in names
+    judged = data["search"]["parameters"]
+    assert 2 <= len(judged) == data["search"]["n_parameters"] < 58
+    for path in campaign.folder.completed("excitation"):
+        assert open_archive(path).path.name in names

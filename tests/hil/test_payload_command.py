@@ -1,15 +1,18 @@
-"""`hil payload`: the commands of `docs/payload.md`, and what is refused."""
+"""`hil payload`, with the commands of `docs/payload.md`, and `hil gains`; what both refuse."""
 
 from __future__ import annotations
 
 import json
 import shlex
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from hil import weighing
@@ -21,6 +24,7 @@ from hil.errors import ArchiveError, InputError, OperatorStopError
 from hil.identify.options import FIXED
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.importers import ColumnMap, Robot, import_log
+from hil.importers.column_map import Drive
 from hil.progress import Silent
 from hil.simulation import carrying
 from identification import FrictionLaw, IdentificationError
@@ -66,9 +70,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(folder: Path, *arguments: str) -> tuple[int, str]:
+def run(folder: Path, *arguments: str, command: str = "payload") -> tuple[int, str]:
     named = [str(folder / a) if a.endswith(".mcap") else a for a in arguments]
-    result = CliRunner().invoke(app, ["payload", *named])
+    result = CliRunner().invoke(app, [command, *named])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.stdout
@@ -314,3 +318,113 @@ class TestRun:
     def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(CellError, match=r"simulation\.payload"):
             carrying(fast_cell(tmp_path))
+
+
+CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
+RATIO = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
+BOTH = ("--loaded", "full.mcap", "--mass", "4", "--centre", "0,0.09,0.12")
+
+
+def archive_of_currents(folder: Path, name: str, simulated: Simulated) -> Path:
+    """Positions in motor radians and currents in A, without torque constants."""
+    np.savez(
+        folder / f"{name}.npz",
+        q=simulated.position * RATIO,
+        i=simulated.torque / (RATIO * CONSTANTS),
+        t=simulated.time,
+    )
+    columns = {
+        "time": {"column": "t"},
+        "position": {"columns": "q", "side": "motor"},
+        "motor_current": {"columns": "i"},
+        "drive": {"gear_ratio": tuple(RATIO)},
+    }
+    return import_log(
+        folder / f"{name}.npz",
+        folder / f"{name}.mcap",
+        robot=Robot.from_urdf(simulated.urdf, friction=FrictionLaw(third=None, offset=True)),
+        columns=ColumnMap.model_validate(columns),
+    )
+
+
+@pytest.fixture(scope="module")
+def currents(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gains")
+    time = np.arange(0.0, 30.0, 4e-3)
+    archive_of_currents(folder, "empty", simulate("ur5_robot.urdf", time, seed=1))
+    load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
+    archive_of_currents(folder, "full", simulate("ur5_robot.urdf", time, seed=2, load=load))
+    return folder
+
+
+def gains(folder: Path, *arguments: str) -> tuple[int, str]:
+    return run(folder, *arguments, command="gains")
+
+
+def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
+    _, text = gains(currents, "empty.mcap", *BOTH, "--json")
+    found = json.loads(text)
+    assert found["side"] == "motor"
+    assert found["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
+    known = 0
+    for motor, truth in zip(found["motors"], CONSTANTS, strict=True):
+        if motor["not_determined"] is None:
+            known += 1
+            # Smoothing leaves a bias of half a percent.
+            error = abs(motor["torque_constant"] - truth)
+            assert error < 2.0 * motor["half_interval"] + 0.005 * truth
+            assert motor["half_interval"] < 0.1 * truth
+    assert known >= 5
+
+
+def test_what_is_printed_can_be_pasted(currents: Path) -> None:
+    status, text = gains(currents, "empty.mcap", *BOTH, "--quiet")
+    pasted = tomllib.loads(text)["torque_constant"]
+    assert (len(pasted) == len(CONSTANTS)) == (status == 0)
+    assert "# shoulder_lift_joint ±" in text
+
+
+def test_an_axis_parallel_to_gravity_is_named_and_gets_no_number(tmp_path: Path) -> None:
+    """In slow motion the payload is only weight, which the vertical axis does not carry."""
+    time = np.arange(0.0, 150.0, 2e-2)
+    load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
+    for seed, (name, body) in enumerate({"empty": None, "full": load}.items()):
+        slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.1, load=body)
+        noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
+        archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
+    status, text = gains(tmp_path, "empty.mcap", *BOTH, "-q")
+    assert status == 5
+    assert "nan,  # shoulder_pan_joint: not determined; " in text
+    assert "shoulder_lift_joint ±" in text
+    pasted = tomllib.loads(text)["torque_constant"]
+    assert len(pasted) == len(CONSTANTS)
+    with pytest.raises(ValidationError, match="torque_constant"):
+        Drive(torque_constant=pasted)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("empty.mcap", "--loaded", "full.mcap"), "--mass: the payload needs a mass above 0"),
+        (("empty.mcap", "--mass", "4"), "which recording was made with it"),
+        ((*("empty.mcap", *BOTH[:4]), "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(
+    currents: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        gains(currents, *arguments)
+
+
+def test_a_folder_stands_for_its_archives(currents: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no whole archive; name archives"):
+        gains(currents, str(tmp_path))
+    (tmp_path / "empty.mcap").symlink_to(currents / "empty.mcap")
+    _, text = gains(currents, str(tmp_path), *BOTH, "--json")
+    assert json.loads(text)["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
+
+
+def test_without_any_payload_nothing_is_determined(currents: Path) -> None:
+    with pytest.raises(Exception, match="no recording has a known payload"):
+        gains(currents, "empty.mcap")

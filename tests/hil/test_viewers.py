@@ -1,9 +1,13 @@
-"""Copies of archives for viewers, and the layouts that open them."""
+"""What is in an archive: `hil plot`, copies for viewers, and the layouts that open them."""
 
 from __future__ import annotations
 
+import base64
+import html
 import json
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,12 +24,20 @@ from typer.testing import CliRunner
 
 from drivers.record import cycle_dtype
 from hil.annotating import PREDICTED, annotate, annotated
-from hil.archive import ArchiveWriter, open_archive
+from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
 from hil.campaign import Campaign, design
 from hil.cli import app
-from hil.errors import InputError, NotAnArchiveError
+from hil.errors import ArchiveError, InputError, NotAnArchiveError
 from hil.identify import Identification, identify_campaign
 from hil.identify.options import FIXED
+from hil.plots.archive_view import (
+    ArchiveView,
+    Trace,
+    archive_page,
+    draw_archive,
+    even,
+    view_of,
+)
 from hil.progress import Silent
 from sim_fixtures.ns16 import URDF_PATH
 from tests.hil.fast_cell import fast_cell
@@ -47,17 +59,17 @@ def messages(path: Path) -> Messages:
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+def short_campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
     folder = tmp_path_factory.mktemp("viewers")
     cell = fast_cell(folder, repetitions=2)
-    campaign = Campaign.create(folder / "campaign", cell, design(cell, Silent()))
-    campaign.run(unrehearsed=True, durable=False)
-    return campaign
+    short_campaign = Campaign.create(folder / "campaign", cell, design(cell, Silent()))
+    short_campaign.run(unrehearsed=True, durable=False)
+    return short_campaign
 
 
 @pytest.fixture(scope="module")
-def found(campaign: Campaign) -> Identification:
-    return identify_campaign(campaign.folder.root, Silent(), FIXED)
+def found(short_campaign: Campaign) -> Identification:
+    return identify_campaign(short_campaign.folder.root, Silent(), FIXED)
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +111,9 @@ class TestCopies:
         assert np.isfinite(position).all()
         assert np.isfinite(velocity).all()
 
-    def test_times_are_those_of_the_day(self, campaign: Campaign, tmp_path: Path) -> None:
+    def test_times_are_those_of_the_day(self, short_campaign: Campaign, tmp_path: Path) -> None:
         """Where the archive knows it; a simulated one does not, and keeps its own."""
-        archive = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
+        archive = open_archive(short_campaign.folder.archives / "excitation_000_a1.mcap")
         n = len(archive.joint_names)
         prediction = {"time": np.array([0.0, 1.0]), "effort": np.zeros((2, n))}
         begins = []
@@ -124,8 +136,8 @@ class TestCopies:
         with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
             open_archive(copies[0])
 
-    def test_a_folder_is_needed(self, campaign: Campaign) -> None:
-        archive = str(campaign.folder.archives / "excitation_000_a1.mcap")
+    def test_a_folder_is_needed(self, short_campaign: Campaign) -> None:
+        archive = str(short_campaign.folder.archives / "excitation_000_a1.mcap")
         with pytest.raises(InputError, match="--annotate: has no folder"):
             CliRunner().invoke(app, ["identify", archive, "--annotate"], catch_exceptions=False)
 
@@ -202,3 +214,181 @@ class TestLayouts:
             for topic in re.findall(r"(/\w[\w/]*)/\*\*", str(call.kwargs["contents"]))
         ]
         assert set(named) == set(six)
+
+
+@pytest.fixture
+def excitation(campaign: Campaign) -> Path:
+    return campaign.folder.completed("excitation")[0]
+
+
+def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
+    excitation: Path, campaign: Campaign
+) -> None:
+    view, columns = view_of(excitation), open_archive(excitation).columns
+    titles = ", ".join(quantity.title.partition(" [")[0] for quantity in view.quantities)
+    assert titles == "position, speed, motor current, torque at the joint, following error"
+    current = view.quantities[2]
+    for joint, trace in enumerate(current.traces):
+        assert trace.value.max() == columns["target_current"][:, joint].max()
+        assert trace.value.min() == columns["target_current"][:, joint].min()
+        assert trace.limits[1] == campaign.cell.drive_table.current_limit[joint]
+    pendant = np.degrees(campaign.cell.controller_angles(columns["position"]))
+    assert view.quantities[0].traces[1].value.max() == pytest.approx(pendant[:, 1].max())
+    assert [name for _, _, name in view.states] == [
+        "closed", "opening", "open", "exiting", "closed"
+    ]  # fmt: skip
+    assert any(name == "MotionEnded" for _, name, _, _ in view.events)
+
+
+class TestFrame:
+    """Positions, speeds and torques of a page are in one frame, which the page names."""
+
+    def test_a_torque_turns_as_its_joint_does(self, excitation: Path, campaign: Campaign) -> None:
+        """Torque times speed is the power of the joint, whoever looks at it."""
+        columns = open_archive(excitation).columns
+        sign = np.array(campaign.cell.drive_table.joint_sign)
+        assert -1 in sign
+        drawn = {q.title.partition(" [")[0]: q.traces for q in view_of(excitation).quantities}
+        for joint, trace in enumerate(drawn["torque at the joint"]):
+            shown = columns["torque"][:, joint] * sign[joint]
+            assert np.nanmax(trace.value) == shown.max()
+            assert np.nanmin(trace.value) == shown.min()
+
+    def test_it_is_named(self, excitation: Path) -> None:
+        view = view_of(excitation)
+        frame = "angles, speeds and torques as on the teach pendant"
+        assert view.frame == frame
+        assert frame in html.unescape(archive_page(view).decode("utf-8"))
+        assert any(frame in text.get_text() for text in draw_archive(view).texts)
+
+
+def test_following_errors_are_those_of_the_motors(excitation: Path, campaign: Campaign) -> None:
+    """In the unit of the controller's thresholds, by the drive train's own conversion."""
+    columns, drives = open_archive(excitation).columns, campaign.cell.drive_train
+    error = drives.motor_revolutions(columns["target_position"]) - drives.motor_revolutions(
+        columns["position"]
+    )
+    traces = view_of(excitation).quantities[4].traces
+    for joint, trace in enumerate(traces):
+        assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
+
+
+def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:
+    """Six minutes at 500 Hz, in windows, with one spike and two stretches not recorded."""
+    time = np.arange(0.0, 360.0, 0.002)
+    time = time[(time < 100.0) | (time > 140.0)]
+    time = time[(time < 170.0) | (time > 170.1)]
+    position = 0.1 * np.sin(time)[:, np.newaxis]
+    spike = np.zeros_like(position)
+    spike[123_457] = 77.0
+    path = tmp_path / "long.mcap"
+    write_samples(
+        path,
+        Samples(np.rint(time * 1e9).astype(np.int64), position, torque=spike),
+        joint_names=("only",),
+        metadata={},
+        attachments={},
+    )
+    view = view_of(path)
+    (trace,) = view.quantities[-1].traces
+    assert trace.value.size < 10_000
+    at = trace.time[np.nanargmax(trace.value)]
+    assert np.nanmax(trace.value) == 77.0
+    assert at == pytest.approx(time[123_457], abs=1e-6)
+    broken = np.flatnonzero(np.isnan(trace.time))
+    assert trace.time[broken - 1] == pytest.approx([100.0, 170.0], abs=0.01)
+    assert trace.time[broken + 1] == pytest.approx([140.0, 170.1], abs=0.01)
+    assert view_of(path, start=200.0, stop=201.0).quantities[0].traces[0].value.size == 501
+
+
+def test_a_part_of_the_time_and_some_joints(excitation: Path) -> None:
+    view = view_of(excitation, start=1.0, stop=2.0, joints=("2", "joint_5"))
+    assert view.joint_names == ("joint_2", "joint_5")
+    for quantity in view.quantities:
+        for trace in quantity.traces:
+            assert np.nanmin(trace.time) >= 1.0 - 1e-9
+            assert np.nanmax(trace.time) <= 2.0 + 1e-9
+    with pytest.raises(InputError, match="name one of joint_1"):
+        view_of(excitation, joints=("7",))
+    with pytest.raises(ArchiveError, match="nothing lies in the time asked for"):
+        view_of(excitation, start=1e4)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf", "a.html"])
+def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path) -> None:
+    environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key}
+    done = subprocess.run(
+        [sys.executable, "-m", "hil", "plot", str(excitation), "-o", name, "--joint", "1"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{name}: repetition 1, attempt 1")
+    content = (tmp_path / name).read_bytes()
+    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "html": b"<!DOCTYPE html>"}
+    assert content.startswith(head[name.partition(".")[2]])
+    if name == "a.html":
+        assert b"http://" not in content.replace(b"http://www.w3.org", b"")
+        assert b"MotionEnded" in content
+
+
+def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
+    view = view_of(excitation, joints=("2",))
+    page = archive_page(view).decode("utf-8")
+    (text,) = re.findall(r'data-traces="([^"]*)"', page)
+    content = json.loads(html.unescape(text))
+    assert [plot["heading"] for plot in content["plots"]] == [q.title for q in view.quantities]
+    (line,) = content["plots"][2]["lines"]
+    counts = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
+    current = open_archive(excitation).columns["target_current"][:, 1]
+    values = line["low"] + line["step"] * counts
+    assert values.max() == pytest.approx(current.max(), abs=line["step"])
+    assert values.min() == pytest.approx(current.min(), abs=line["step"])
+    assert content["marks"] == [round(time, 6) for time, _, _, _ in view.events]
+    assert content["plots"][2]["limits"] == pytest.approx(view.quantities[2].traces[0].limits)
+    assert "Zoom over time" in page and "MotionEnded" in page
+
+
+def test_an_even_line_keeps_samples_peaks_and_gaps() -> None:
+    time = np.arange(100) * 0.01
+    value = np.sin(9.0 * time)
+    assert even(Trace(time, value), time) == pytest.approx(value)
+    value[[20, 71]] = 5.0, -5.0
+    coarse = even(Trace(time, value), np.linspace(0.0, time[-1], 20))
+    assert coarse.max() == 5.0 and coarse.min() == -5.0
+    broken = Trace(
+        np.concatenate([time[:40], [np.nan], time[60:]]),
+        np.concatenate([value[:40], [np.nan], value[60:]]),
+    )
+    there = np.isfinite(even(broken, time))
+    assert there.tolist() == [True] * 40 + [False] * 20 + [True] * 40
+
+
+def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:
+    """In words also where none was, and nothing where nobody counts them."""
+    view = view_of(excitation)
+
+    def header(view: ArchiveView) -> str:
+        return " ".join(text.get_text() for text in draw_archive(view).texts)
+
+    assert "packets: none missed" in header(view)
+    assert "packets: missed at 1 place " in header(replace(view, gaps=np.array([1.0])))
+    assert "missed" not in header(replace(view, states=(), events=()))
+
+
+def test_the_shares_of_limits_are_told_to_a_script(excitation: Path, tmp_path: Path) -> None:
+    target = tmp_path / "x.png"
+    result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(target), "--json"])
+    assert result.exit_code == 0
+    summary = json.loads(result.stdout)
+    assert summary["picture"] == str(target)
+    shares = summary["peak_share_of_limit"]["motor current [A]"]
+    assert set(shares) == {f"joint_{k}" for k in range(1, 7)}
+    assert all(0.0 < share < 1.0 for share in shares.values())
+
+
+def test_what_is_no_archive_or_no_format_is_refused(excitation: Path, tmp_path: Path) -> None:
+    (tmp_path / "no.mcap").write_bytes(b"no")
+    result = CliRunner().invoke(app, ["plot", str(tmp_path / "no.mcap")])
+    assert isinstance(result.exception, ArchiveError)
+    result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(tmp_path / "x.gif")])
+    assert isinstance(result.exception, InputError)

@@ -1,6 +1,7 @@
 """Whether a file keeps the profile: each rule of docs/archive-format.md, broken one at a time.
 
 The files are written by the mcap library, so what is checked is the file and not our writer.
+At the end `hil archive` at the command line: words, JSON and exit statuses.
 """
 
 from __future__ import annotations
