@@ -1,8 +1,8 @@
 """The circle is not closed on itself: an error planted on one side only turns the verdict red.
 
 "Physical" errors are in the simulated robot, which then differs from what its controller
-announces and the cell file says; the others are in what the PC makes of honest archives. What is planted otherwise: friction laws,
-and what the URDF is wrong by.
+announces and the cell file says; the others are in what the PC makes of honest archives.
+The planted truth itself: friction laws, and what the URDF is wrong by.
 """
 
 from __future__ import annotations

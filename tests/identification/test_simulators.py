@@ -344,9 +344,6 @@ class TestNoise:
         assert self.above(self.torque(0.0)[:20]) is None
 
 
-WRIST = np.eye(6)
-
-
 def an_ns16(**options: object) -> Simulated:
     model = RobotModel.from_urdf(urdf_text(), **options)  # type: ignore[arg-type]
     standard = np.zeros(model.layout.size)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers import (
     CycleRing,
@@ -37,7 +38,7 @@ from tests.fuzz.targets import Target
 
 
 class Controller:
-    """Status, modes and axis data of the packets to come.
+    """A controller's side as far as packets show it; its attributes can be set to misbehave.
 
     Args:
         train: of the arm.
@@ -47,7 +48,15 @@ class Controller:
         slots: slot of each joint.
     """
 
-    def __init__(self, train, start, *, arm: int, n_axes: int, slots) -> None:
+    def __init__(
+        self,
+        train: DriveTrain,
+        start: NDArray[np.float64],
+        *,
+        arm: int,
+        n_axes: int,
+        slots: Sequence[int],
+    ) -> None:
         self._train = train
         self._arm, self._n_axes, self._slots = arm, n_axes, slots
         self.number = 0
@@ -58,7 +67,7 @@ class Controller:
         self.put_arm_at(start)
         self.exit_asked = False
 
-    def put_arm_at(self, q) -> None:
+    def put_arm_at(self, q: NDArray[np.float64]) -> None:
         motor = self._train.motor_revolutions(q)
         for slot, value in zip(self._slots, motor, strict=True):
             self.d[slot, [0, 2]] = value
