@@ -1,0 +1,88 @@
+"""What the defaults of the automatic settings are worth on a robot that they were not chosen on.
+
+Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] [--json]``, with
+FOLDER as in `benchmarks.board`.
+
+Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
+the value with the least geometric mean of held-out errors over all *other* robots is taken and
+judged on this one: on the first held-out split, all rows, as a ratio to the error of
+`benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the ratios with a
+robot left out would be larger than that of the present values.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import numpy as np
+
+from benchmarks import parser_of, show
+from benchmarks.board import DATA, cut, identified_parts, plain_errors, split_logs
+from benchmarks.published import known
+from identification.selection import inner_prediction
+
+ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
+    "WORTHWHILE": (0.0, 0.03),
+    "TERM_WORTHWHILE": (0.0, 0.05),
+    "LOW_PASS_WORTHWHILE": (0.02, 0.10),
+    "LEFT_OUT": (("rests", "slow"),),
+    "BANDWIDTHS": ((20.0, 5.0, 7.0, 10.0, 14.0, 40.0),),
+    "PRESLIDING": ((1e-5, 1e-6, 3e-5, 1e-4, 3e-4, 1e-3),),
+    "FOLDS": (3, 8),
+}
+"""Other values of each default; of a sequence, the first is the one that others have to beat."""
+PRESENT: Final = "present values"
+
+
+def ratios(name: str, data: Path) -> dict[tuple[str, str], float]:
+    """Error over that of the plain fit on one robot, by default and its value."""
+    split, logs = split_logs(name, data)
+    parts = cut(split, logs)
+    plain, _ = plain_errors(parts)
+    found = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        found[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / plain
+        for default, values in ALTERNATIVES.items():
+            for value in values:
+                with patch.object(inner_prediction, default, value):
+                    error = identified_parts(parts, Path(scratch)).error
+                found[default, str(value)] = error / plain
+                print(f"{name}: {default} = {value}: {error / plain:.3f}", flush=True)
+    return found
+
+
+def chosen_without(robots: Mapping[str, Mapping[tuple[str, str], float]], default: str) -> Any:
+    """The value of a default that is best on the others, and the ratio with it, by robot."""
+    keys = [(PRESENT, ""), *((default, str(value)) for value in ALTERNATIVES[default])]
+    found = {}
+    for name, own in robots.items():
+        others = [ratio for other, ratio in robots.items() if other != name]
+        best = min(keys, key=lambda key: np.mean([np.log(one[key]) for one in others]))
+        found[name] = {"value": best[1] or "present", "ratio": own[best]}
+    return found
+
+
+def main() -> None:
+    """Print the table, and the line of JSON if asked for."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--only", nargs="+", default=known(), help="some of the recordings")
+    options = parser.parse_args()
+    robots = {name: ratios(name, options.data) for name in options.only}
+    mean = {PRESENT: _geometric([one[PRESENT, ""] for one in robots.values()])}
+    table = {default: chosen_without(robots, default) for default in ALTERNATIVES}
+    for default, by_robot in table.items():
+        mean[default] = _geometric([one["ratio"] for one in by_robot.values()])
+    show({"mean_ratio": mean, "chosen": table}, only_json=options.json)
+
+
+def _geometric(values: list[float]) -> float:
+    return float(np.exp(np.log(values).mean()))
+
+
+if __name__ == "__main__":
+    main()
