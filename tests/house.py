@@ -29,15 +29,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 84_900,
-    "product files": 331,
-    "test lines": 80_700,
-    "test files": 326,
+    "product lines": 80_200,
+    "product files": 324,
+    "test lines": 76_800,
+    "test files": 250,
     "import circles": 0,
-    "imports inside functions": 34,
+    "imports inside functions": 32,
     "files with one importer": 17,
     "banned names": 0,
-    "functions over 60 lines": 34,
+    "functions over 60 lines": 30,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {
