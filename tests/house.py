@@ -29,7 +29,7 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 80_200,
+    "product lines": 80_250,
     "product files": 324,
     "test lines": 76_800,
     "test files": 250,
