@@ -261,7 +261,8 @@ class Conduct:
             self.motors, self.lag, self.lost, self.repeats = [], 0, 0, 0
         else:
             rounding_of_target = 0.0
-            if self.missed > self.max_gap and self._goes_on_from_target(a, r):
+            if self.missed > self.max_gap:
+                self._go_on_from_target(a, r)
                 rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
             late = self.max_gap + 1
@@ -294,29 +295,31 @@ class Conduct:
         self.motor = motor
         del self.sent[:-3]
 
-    def _goes_on_from_target(self, a: np.ndarray, r: np.ndarray) -> bool:
+    def _go_on_from_target(self, a: np.ndarray, r: np.ndarray) -> None:
         """After a long gap in which the controller led the motion, its target counts as sent.
 
-        It carried the motion on, as fast as before or a little slower, or brought it to rest.
+        It carried the motion on, as fast as before or a little slower, or brought it to rest. A
+        target that is the set-point sent last, but for rounding, does not say which.
         """
         begun, standstill = a[0] - a[1], self.limits.standstill
         off_target, off_before = np.abs(begun - r[0]).max(), np.abs(begun - self.motor).max()
-        held = off_target <= np.spacing(np.float32(np.abs(a[0]).max())) and not r[1].any()
+        rounding = np.spacing(np.float32(np.abs(a[0]).max()))
         step = self.motors[-1] - self.motors[-2] if len(self.motors) > 1 else 0.0 * r[0]
         again = self.answered is not None and np.array_equal(a, self.answered) and a[1].any()
-        if again or not step.any() or not (off_target < off_before or held):
-            return False
+        if again or not step.any() or off_target > off_before + rounding:
+            return
+        self.without_jerk_bound = min(2 * self.missed, round(0.03 / self.period)) + 2
+        held = off_target <= rounding and not r[1].any()
+        if off_target >= off_before and not held:
+            return
         ahead = self.motor + np.arange(self.missed + 1)[:, None] * step
         off = np.abs(r[0] - ahead).max(axis=1)
         assert (np.abs(r[0] - ahead[off.argmin()]) <= 0.1 * self.threshold).all(), "off its way"
         slower = np.abs(r[1] - step) <= np.maximum(0.5 * np.abs(step), standstill) * (1 + 1e-6)
         assert slower.all() or (np.abs(r[1]) <= standstill).all(), "goes on at another speed"
-        joints = self.train.joint_position
         self.motors = [r[0] - k * r[1] for k in (3, 2, 1, 0)]
-        self.sent, self.motor = [joints(row) for row in self.motors], r[0]
-        self.without_jerk_bound = min(2 * self.missed, round(0.03 / self.period)) + 2
+        self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
         self._count("goes on from the target")
-        return True
 
     def _lag(self, target: np.ndarray) -> int:
         back = np.abs(np.array(self.motors[::-1]) - target)
