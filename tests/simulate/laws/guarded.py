@@ -253,7 +253,9 @@ def _led_on(stretch: Stretch, threshold: Array) -> Iterator[str]:
         yield "a motion went on after a long gap from a target that is not on its way"
     if np.any(np.abs(actual - target) > wide):
         yield "a motion went on after a long gap with an arm that does not follow"
-    rests = np.all(np.abs(velocity) <= slack)
+    # Slower than standstill, only the target says whether it was held.
+    led = np.abs(target - stretch.before) > np.spacing(np.abs(target).astype(np.float32))
+    rests = np.all(np.abs(velocity) <= slack) and ((np.abs(step) > slack).any() or not led.any())
     if rests and np.any(np.abs(stretch.sent[0] - target) > slack):
         yield "a motion went on after a long gap though the controller had brought it to rest"
     off = np.abs(velocity - step) > np.maximum(0.5 * np.abs(step), slack)
