@@ -144,17 +144,20 @@ def move(
 
 
 class _Shown:
-    """Moves the bar on with the arm; only Ctrl-C stops the motion, which is run as planned."""
+    """Moves the bar on with the arm; only Ctrl-C stops the motion."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._done = task, 0.0
-        self.request = OperatorRequest
 
     def show(self, progress: MotionProgress) -> None:
         """Look at the motion."""
         done = max(self._done, progress.motion_time or 0.0)
         self._task.advance(done - self._done)
         self._done = done
+
+    def request(self) -> OperatorRequest:
+        """The motion as it was planned."""
+        return OperatorRequest()
 
 
 @contextmanager

@@ -63,15 +63,15 @@ def train_of(n: int) -> DriveTrain:
     )
 
 
-def limits(**changes) -> GuardLimits:
+def limits(n: int = N, **changes) -> GuardLimits:
     standard = GuardLimits(
-        lower=np.full(N, -2.0),
-        upper=np.full(N, 2.0),
-        velocity=np.full(N, 2.0),
-        acceleration=np.full(N, 8.0),
-        jerk=np.full(N, 100.0),
-        following_error=np.full(N, 2.0),
-        current=np.full(N, 20.0),
+        lower=np.full(n, -2.0),
+        upper=np.full(n, 2.0),
+        velocity=np.full(n, 2.0),
+        acceleration=np.full(n, 8.0),
+        jerk=np.full(n, 100.0),
+        following_error=np.full(n, 2.0),
+        current=np.full(n, 20.0),
     )
     return replace(standard, **changes)
 

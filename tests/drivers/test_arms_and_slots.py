@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from drivers import (
     CycleRing,
     Guard,
-    GuardLimits,
     InitPacket,
     InitReceived,
     RequestError,
@@ -25,23 +24,11 @@ from drivers import (
     State,
 )
 from tests.drivers import oracle
-from tests.drivers.rig import Table, train_of
+from tests.drivers.rig import Table, limits, train_of
 
 PERIOD = 0.002
 OPEN, CLOSED = 4, 0
 ON = 5
-
-
-def limits_of(n: int) -> GuardLimits:
-    return GuardLimits(
-        lower=np.full(n, -3.0),
-        upper=np.full(n, 3.0),
-        velocity=np.full(n, 2.0),
-        acceleration=np.full(n, 20.0),
-        jerk=np.full(n, 1e4),
-        following_error=np.full(n, 2.0),
-        current=np.full(n, 20.0),
-    )
 
 
 @dataclass
@@ -68,7 +55,7 @@ class Bench:
         self.ring = CycleRing(self.n)
         self.session = Session(
             self.train,
-            Guard(limits_of(self.n), self.sample_time / 1000),
+            Guard(limits(self.n), self.sample_time / 1000),
             self.ring,
             arm=self.arm,
             settle_cycles=self.settle_cycles,

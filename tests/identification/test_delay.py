@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.packets import CyclicPacket, Mode, echo, is_init, next_number
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
@@ -32,6 +31,7 @@ from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
 from tests.identification.robots import ur10
 from tests.identification.two_link import MODEL, URDF, truth
+from tests.sim_fixtures.conftest import MinimalPC
 
 PERIOD = 0.001
 
@@ -72,7 +72,7 @@ def simulated_recording(
     )  # fmt: skip
     targets = np.array([drive.motor_revolutions(q.tolist()) for q in position])
     deltas = _motor_speed(drive, velocity) * PERIOD
-    axes = _play(controller, targets, deltas)
+    axes = MinimalPC(controller, targets, deltas).run(settle=50).axes
     motors, currents = axes["d"][:, :, 2].astype(float), axes["d"][:, :, 4].astype(float)
     turn = _turns(drive)
     rest = np.array(drive.motor_revolutions([0.0] * 6))
@@ -102,29 +102,6 @@ def _turns(drive: SimulatedDrive) -> Array:
 
 def _motor_speed(drive: SimulatedDrive, velocity: Array) -> Array:
     return velocity @ _turns(drive).T
-
-
-def _play(controller: SimulatedController, targets: Array, deltas: Array) -> NDArray[np.void]:
-    axes, k, n = [], -50, targets.shape[1]
-    while (packet := controller.next_packet()) is not None:
-        if is_init(packet):
-            controller.accept(echo(packet))
-            continue
-        received = CyclicPacket.decode(packet, n)
-        reply = CyclicPacket.zeros(next_number(received.number), n)
-        status = bytes(4)
-        reply.axes["mode"] = received.axes["mode"]
-        reply.axes["d"][:, 0] = received.axes["d"][:, 0]
-        if (received.axes["mode"] == Mode.POSITION).all() and received.status[0] == 5:
-            if 0 <= k < len(targets):
-                reply.axes["d"][:, 0], reply.axes["d"][:, 1] = targets[k], deltas[k]
-                axes.append(received.axes.copy())
-            elif k == len(targets) + 50:
-                status = bytes((1, 0, 0, 0))
-                controller.finish()
-            k += 1
-        controller.accept(CyclicPacket(reply.number, status, bytes(4), reply.axes).encode())
-    return np.array(axes)
 
 
 Array = NDArray[np.float64]

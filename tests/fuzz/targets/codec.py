@@ -159,17 +159,17 @@ class Talk:
         if self._untouched:
             assert len(replies) == 1, f"{len(replies)} answers of one"
         for reply in () if touched else replies:
-            # A stranger's frame in place of one may state another number, and fit by its last bits.
+            # Another sender's frame may state another number, and fit by its last bits.
             if arrived.number == sent.number:
                 assert reply[:4] == answer.encode()[:4], "an answer to another packet"
             if self._untouched and self._controller.segmented:
                 assert reply == answer.encode(), "segments carry every byte"
             elif self._untouched:
-                told = CyclicPacket.decode(reply, self._n)
+                received_back = CyclicPacket.decode(reply, self._n)
                 if refused:
-                    assert (told.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
+                    assert (received_back.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
                 else:
-                    self._as_answered(told, answer, arrived, sent)
+                    self._as_answered(received_back, answer, arrived, sent)
         return bool(replies)
 
     def _answer(self, received: CyclicPacket) -> CyclicPacket:
@@ -246,8 +246,8 @@ def harmed(sent: list[Frame], draw: Draw) -> tuple[list[Frame], bool]:
         frame = sent[at]
         changed = draw.raw(8) + frame.data[8:] if draw.chance(128) else frame.data[: draw.below(9)]
         return [*sent[:at], Frame(frame.id, changed), *sent[at + 1 :]], True
-    stranger = Frame(draw.choice((SEGMENT_UP, SEGMENT_DOWN, draw.below(2048))), draw.raw(8))
-    return [*sent[:at], stranger, *sent[at:]], True
+    foreign = Frame(draw.choice((SEGMENT_UP, SEGMENT_DOWN, draw.below(2048))), draw.raw(8))
+    return [*sent[:at], foreign, *sent[at:]], True
 
 
 GENTLE = np.array((0, 0, 1, 192, 194, 201), np.uint8)

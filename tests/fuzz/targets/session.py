@@ -23,7 +23,7 @@ from drivers import (
 from tests.drivers import oracle
 from tests.drivers.judge import POSITION_MODES, Conduct, Judged
 from tests.drivers.oracle import number_of
-from tests.drivers.rig import train_of
+from tests.drivers.rig import limits, train_of
 from tests.drivers.sources import (
     FAULTS,
     WILD,
@@ -135,21 +135,12 @@ class Arm:
 def arm_of(n: int, number: int, order: int, foreign: int) -> Arm:
     """An arm of `n` joints among `foreign` axes that are not its own, in a drawn order."""
     own = [(number, joint) for joint in range(n)]
-    strangers = [(number, 9), (number % 4 + 1, 0), (number % 4 + 1, 3)][:foreign]
+    others = [(number, 9), (number % 4 + 1, 0), (number % 4 + 1, 3)][:foreign]
     mixed = np.random.default_rng(order).permutation(n + foreign) if order else range(n + foreign)
-    axes = tuple((own + strangers)[k] for k in mixed)
+    axes = tuple((own + others)[k] for k in mixed)
     train = train_of(n)
-    limits = GuardLimits(
-        lower=np.full(n, -2.0),
-        upper=np.full(n, 2.0),
-        velocity=np.full(n, 2.0),
-        acceleration=np.full(n, 8.0),
-        jerk=np.full(n, 100.0),
-        following_error=np.full(n, 2.0),
-        current=np.full(n, 20.0),
-    )
     made = [init_of(axes, number, train, n, ratio) for ratio in (1.0, 1.5)]
-    return Arm(n, number, axes, CYCLE_MS / 1000, train, limits, *made)
+    return Arm(n, number, axes, CYCLE_MS / 1000, train, limits(n), *made)
 
 
 def init_of(
