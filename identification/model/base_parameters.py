@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 Array = NDArray[np.float64]
 
@@ -100,11 +101,13 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
     """
     reduced = np.linalg.qr(regressor, mode="r")
     lengths = np.linalg.norm(reduced, axis=0)
-    longest = {unit: lengths[np.array(units) == unit].max() for unit in units}
-    scale = np.array([longest[unit] or 1.0 for unit in units])
+    _, of_unit = np.unique(units, return_inverse=True)
+    longest = np.zeros(len(units))
+    np.maximum.at(longest, of_unit, lengths)
+    scale = np.where(longest > 0.0, longest, 1.0)[of_unit]
     scaled = reduced / scale
-    pivots, shares = _first_independent(scaled)
-    relation, *_ = np.linalg.lstsq(scaled[:, pivots], scaled, rcond=None)
+    pivots, basis, shares = _first_independent(scaled)
+    relation = solve_triangular(basis.T @ scaled[:, pivots], basis.T @ scaled)
     # What is no larger than what stays unexplained is rounding, not grouping.
     unexplained = np.linalg.norm(scaled - scaled[:, pivots] @ relation, axis=0).max(initial=0.0)
     relation[np.abs(relation) < max(_ROUNDING, 10.0 * float(unexplained))] = 0.0
@@ -129,8 +132,8 @@ def share_left(columns: Array, basis: Array) -> Array:
     return share
 
 
-def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the indices, and per column the length that earlier independent ones leave of it."""
+def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """Return the indices, their orthonormal basis, and what earlier ones leave of each column."""
     basis = np.zeros_like(columns)
     pivots: list[int] = []
     shares = np.zeros(columns.shape[1])
@@ -143,4 +146,4 @@ def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array]:
         if shares[index] > TOLERANCE and len(pivots) < basis.shape[1]:
             basis[:, len(pivots)] = rest / shares[index]
             pivots.append(index)
-    return np.array(pivots, dtype=np.intp), shares
+    return np.array(pivots, dtype=np.intp), basis[:, : len(pivots)], shares

@@ -115,7 +115,6 @@ class _Reading:
         self._links = 0
         self._inertial: set[str] = set()  # the elements of the one that is open
         self._fault = ""  # the first of an inertia
-        self._xacro = False
         self._data = b""
         # The text was decoded: whatever encoding it says it has, it has no longer.
         self._parser = expat.ParserCreate("utf-8")
@@ -132,7 +131,8 @@ class _Reading:
         finally:
             del self._parser  # it knows this object: both would wait for the cycle collector
         if self._fault:
-            raise _RefusedError(XACRO if self._xacro else self._fault)
+            unexpanded = any(left_by_xacro(e.tag, e.attrib) for e in urdf_tree(text).iter())
+            raise _RefusedError(XACRO if unexpanded else self._fault)
         self._require_prefixes()
 
     def _require_prefixes(self) -> None:
@@ -162,7 +162,6 @@ class _Reading:
             raise _RefusedError(f"its elements are nested more than {_DEEPEST} deep")
         if len(attributes) > _MOST_ATTRIBUTES:
             raise _RefusedError(f"its <{tag[:40]}> has more than {_MOST_ATTRIBUTES} attributes")
-        self._xacro = self._xacro or left_by_xacro(tag, attributes)
         if len(self._path) == 2 and tag in ("link", "joint"):
             self._named(tag, attributes.get("name", ""))
         elif self._path[1:] == ["link", "inertial"]:

@@ -195,6 +195,8 @@ class _Search:
                 measured[joints] = target[joints[::-1]]
             else:
                 own = _columns_of(tables, model, values, fault)
+                if not own.any():
+                    continue  # such as other friction of a joint that was found to have none
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
             ratio, highest = score.against(usual)
             size, std = _size(fault, score, tables, own)
