@@ -498,8 +498,8 @@ class Judged:
         record = self.ring.last(1)[0]
         conduct = self.conduct
         conduct.aged = self.ages is not None and bool(self.ages[list(conduct.slots), 0].any())
-        # Packets that got no answer are gaps to the controller.
-        conduct.judge(packet, reply, record, int(record["gap"]) + self.unanswered)
+        # Packets that got no answer are gaps to the controller; numbers show most of them.
+        conduct.judge(packet, reply, record, max(int(record["gap"]), self.unanswered))
         self.unanswered = 0
         missed = (number_of(packet) - last) % 0x7FFF - 1
         assert record["gap"] in (missed, 0), "the gap recorded"

@@ -81,9 +81,10 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         if talk.silent[row]:
             conduct.interrupted()
         record, one = talk.records[row], talk.life.exchanged[index]
-        unanswered = int(record["gap"]) + index - last - 1
+        # Packets left out for a newer one are among those that the numbers say are missing.
+        missed = max(int(record["gap"]), index - last - 1)
         last = index
-        conduct.judge(one.packet, one.replies[0], record, unanswered)
+        conduct.judge(one.packet, one.replies[0], record, missed)
 
 
 def _note(conduct: Conduct, what: str) -> None:
