@@ -693,6 +693,13 @@ class TestGroups:
         assert len({ref.arm for ref in result.refs}) == len(result.refs) == 2
         assert [one.reason for one in result.skipped] == ["belongs to a rehearsal"]
 
+    def test_a_copy_counts_once(self, tmp_path: Path, arm: Cell) -> None:
+        (tmp_path / "copy").mkdir()
+        shutil.copy(recording(tmp_path / "a.mcap", arm), tmp_path / "copy" / "b.mcap")
+        result = found_in(tmp_path)
+        assert [Path(ref.location).name for ref in result.refs] == ["a.mcap"]
+        assert "holds the same as" in reasons_of(result.skipped)["b.mcap"]
+
     def test_what_is_made_beside_a_campaign_is_left_alone(self, tmp_path: Path, arm: Cell) -> None:
         """Runs with a payload that no cell states, and copies for viewers."""
         recording(tmp_path / "real.mcap", arm)

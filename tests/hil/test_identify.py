@@ -142,6 +142,12 @@ class TestCampaign:
         assert coverage is not None
         assert coverage.within_3 >= 55
 
+    def test_held_out_torque_lies_inside_its_intervals(self, found: Identification) -> None:
+        calibration = found.results.calibration
+        assert calibration is not None
+        assert calibration.inside >= 0.93
+        assert None not in calibration.joint_inside
+
     def test_planned_criteria_are_those_that_were_executed(self, found: Identification) -> None:
         """At the same instants; stiction and noise of acceleration change columns by per mille."""
         planned, executed = found.results.excitation.planned, found.results.excitation.executed

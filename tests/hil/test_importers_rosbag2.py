@@ -493,6 +493,11 @@ def test_the_parts_of_a_split_bag_follow_each_other_by_number(tmp_path: Path, ro
     assert_imported(import_rosbag2(folder, tmp_path / "out.mcap", robot=robot))
 
 
+def test_an_archive_of_ours_can_be_imported_like_any_other(tmp_path: Path, robot: Robot) -> None:
+    first = import_rosbag2(joint_states(tmp_path / "x.mcap"), tmp_path / "a.mcap", robot=robot)
+    assert_imported(import_rosbag2(first, tmp_path / "b.mcap", robot=robot))
+
+
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_joint_states_in_another_encoding_are_refused_by_its_name(
     tmp_path: Path, robot: Robot, encoding: str

@@ -280,6 +280,8 @@ def test_the_cycles_are_those_of_an_archive_without_packets(tmp_path: Path, cell
     for name, column in poor.columns.items():
         assert column.tobytes() == rich.columns[name].tobytes(), name
     assert poor.events == rich.events
+    with pytest.raises(ValueError, match="open one at a time"):
+        open_archive(rich.path, topics=[CYCLE, PACKETS])
 
 
 def test_a_packet_that_was_lost_is_not_there_and_those_around_it_keep_their_cycles(

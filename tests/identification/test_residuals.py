@@ -163,6 +163,9 @@ def test_the_memory_of_coloured_noise_is_that_of_theory(memory: float) -> None:
     decay = np.exp(-STEP / memory)
     expected = 0.5 * STEP * (1.0 + decay) / (1.0 - decay)
     np.testing.assert_allclose(found.time, expected, rtol=0.15)
+    # White noise has a memory of half a step: each sample counts.
+    rows = 0.5 * STEP * len(residual) / expected
+    np.testing.assert_allclose(found.effective_rows, rows, rtol=0.15)
 
 
 @given(st.integers(20, 60), st.integers(0, 2**32 - 1), st.integers(1, 3))

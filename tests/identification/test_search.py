@@ -371,6 +371,16 @@ def test_a_finished_search_is_read_without_scoring(population):
     assert len(file.getvalue()) == size
 
 
+def test_a_journal_that_lost_its_tail_costs_only_that(population):
+    chosen = settings("b")
+    file = io.BytesIO()
+    whole = bits(search(population, chosen, journal=opened(file, chosen)))
+    torn = io.BytesIO(file.getvalue()[:-100])
+    assert bits(search(population.begin(), chosen, journal=opened(torn, chosen))) == whole
+    assert [len(genes) for genes in population.genes] == [12]
+    assert torn.getvalue() == file.getvalue()
+
+
 def test_progress_says_how_far_it_is_and_the_best(population):
     seen = []
     design = search(population, settings("front", polish=40), progress=seen.append)
