@@ -138,12 +138,10 @@ def test_with_room_again_the_run_completes(disk: Disk, campaign: Campaign) -> No
 SHORT = {"population": 8, "generations": 1}
 """Of a search that is only to write what a search writes."""
 STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "design": (
-        *("design cell/cell.toml --settings short.toml -o designed --workers 1", ("designed",)),
-    ),
-    "compare": (
-        *("compare campaign second -o pages/compare.html", ("pages", "campaign", "second")),
-    ),
+    "design":
+        ("design cell/cell.toml --settings short.toml -o designed --workers 1", ("designed",)),
+    "compare":
+        ("compare campaign second -o pages/compare.html", ("pages", "campaign", "second")),
     "rehearse": ("rehearse campaign --again", ("campaign",)),
     "identify": ("identify campaign --quiet", ("campaign",)),
     "report": ("report campaign", ("campaign",)),
@@ -151,7 +149,7 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "plot": ("plot campaign/archives/excitation_000_a1.mcap --output plot.png", ("plot.png",)),
     "repair": ("archive repair excitation_000_a1.mcap", ("excitation_000_a1_repaired.mcap",)),
     "new": ("new --urdf campaign/robot.urdf --output new.toml --force", ("new.toml",)),
-}
+}  # fmt: skip
 """What else leaves something on the disk: the command, and where it writes; sums of archives are
 beside these."""
 

@@ -55,43 +55,35 @@ def loses_axes(whole: Callable[..., bytes | None]) -> Callable[..., bytes | None
     return emptied
 
 
+def unnamed_errors(entries: dict[str, str]) -> ArchiveHeader:
+    return ArchiveHeader.model_validate({**entries, "entries": entries})
+
+
 encode = CyclicPacket.encode
 IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
+IN_THE_JUDGE = "AssertionError-tests.drivers.judge"
 PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
-    "a guard that lets everything pass": (
-        *("session", Guard, "check_set_point", lambda *_: None),
-        "AssertionError-tests.drivers.judge",
-    ),
-    "an exception in the session": (
-        "session",
-        Session,
-        "_cyclic",
-        lambda *_: 1 // 0,
-        "ZeroDivision",
-    ),
-    "a codec that changes a byte": (
-        *("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
-    ),
-    "replies by CAN to another packet": (
-        *("codec", ends, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
-    ),
-    "a PC that hears nothing by CAN": ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
-    "a controller that hears nothing": (
-        *("codec", ControllerEnd, "receive", lambda *_: None, IN_THE_CODEC),
-    ),
-    "a controller that sends nothing": (
-        *("codec", ControllerEnd, "packet", lambda *_: int("none"), "ValueError"),
-    ),
-    "a PC that loses axes": ("codec", PcEnd, "_packet", loses_axes(PcEnd._packet), IN_THE_CODEC),
-    "a controller that loses axes": (
-        *("codec", ControllerEnd, "_packet", loses_axes(ControllerEnd._packet), IN_THE_CODEC),
-    ),
-    "a header whose errors are not named": (
-        *("archive", ArchiveHeader, "of"),
-        lambda entries: ArchiveHeader.model_validate({**entries, "entries": entries}),
-        "ValidationError",
-    ),
-}
+    "a guard that lets everything pass":
+        ("session", Guard, "check_set_point", lambda *_: None, IN_THE_JUDGE),
+    "an exception in the session":
+        ("session", Session, "_cyclic", lambda *_: 1 // 0, "ZeroDivision"),
+    "a codec that changes a byte":
+        ("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
+    "replies by CAN to another packet":
+        ("codec", ends, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
+    "a PC that hears nothing by CAN":
+        ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
+    "a controller that hears nothing":
+        ("codec", ControllerEnd, "receive", lambda *_: None, IN_THE_CODEC),
+    "a controller that sends nothing":
+        ("codec", ControllerEnd, "packet", lambda *_: int("none"), "ValueError"),
+    "a PC that loses axes":
+        ("codec", PcEnd, "_packet", loses_axes(PcEnd._packet), IN_THE_CODEC),
+    "a controller that loses axes":
+        ("codec", ControllerEnd, "_packet", loses_axes(ControllerEnd._packet), IN_THE_CODEC),
+    "a header whose errors are not named":
+        ("archive", ArchiveHeader, "of", unnamed_errors, "ValidationError"),
+}  # fmt: skip
 """Target, what is replaced by what, and the beginning of the cause that shows it."""
 
 

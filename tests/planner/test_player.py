@@ -290,9 +290,8 @@ class TestCarriedOn:
         player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
         player.begin(player.start)
         aside = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-4])
-        before, last = ([player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))])[
-            -2:
-        ]
+        played = [player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))]
+        before, last = played[-2:]
         with pytest.raises(StartMismatch, match=r"at most 0\.002 rad"):
             for _ in range(30):
                 player.go_on_from(last + aside, (last - before) / PERIOD, 2)

@@ -164,7 +164,9 @@ def round_in_which(victim: Victim) -> int:
         ("supervisor", "SIGINT", 4, "was stopped: the supervisor asked for a stop"),
         pytest.param("supervisor", "SIGHUP", 4, "was stopped", marks=pytest.mark.slow),
         (
-            *("archive", "SIGSTOP", 4),
+            "archive",
+            "SIGSTOP",
+            4,
             "gave no sign of life for 5 s and was ended; the arm was brought to rest",
         ),
         ("archive", "full disk", 2, "cannot be written further"),
