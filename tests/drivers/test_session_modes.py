@@ -11,7 +11,6 @@ from drivers import (
     FirstSetPoint,
     FollowingError,
     HoldChanged,
-    Mode,
     NotAtStandstill,
     NotFinite,
     OverrideChanged,
@@ -104,20 +103,11 @@ class TestEveryMode:
             motor = rig.train.motor_revolutions(START).astype(np.float32)
             np.testing.assert_array_equal(answer.axes["d"][:, 0], motor)
 
-    @pytest.mark.parametrize("mode", sorted(POSITION_MODES))
-    def test_corrections_are_no_motion(self, mode):
-        with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
-            Rig(mode=mode).session.request(correction(2))
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_a_motion_is_no_correction(self, mode):
-        with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
-            Rig(mode=mode).session.request(Cruise())
-
-    @pytest.mark.parametrize("source", [None, object(), 3, "begin"])
-    def test_something_else_is_neither(self, source):
-        for mode in (4, 8):
-            with pytest.raises(RequestError):
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
+    def test_a_source_of_another_kind_is_refused(self, mode):
+        other = correction(2) if mode in POSITION_MODES else Cruise()
+        for source in (other, None, object(), 3, "begin"):
+            with pytest.raises(RequestError, match=f"kind of source mode {mode} needs"):
                 Rig(mode=mode).session.request(source)
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
@@ -435,14 +425,6 @@ class TestCorrections:
         assert not d[3, 1:3].any()
 
 
-def test_the_open_mode_wanted_is_the_only_one_that_moves():
-    rig = Rig(mode=Mode.VELOCITY)
-    rig.session.request(correction(8))
-    rig.close()
-    assert all_drive_off(rig.cycle(mode=Mode.FEED_FORWARD))
-    assert rig.ended.outcome == "refused"
-
-
 WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
 
@@ -575,27 +557,6 @@ class TestHold:
         assert not at_rest(rig)
 
 
-class TestResume:
-    def test_needs_a_motion(self):
-        rig = Rig()
-        with pytest.raises(RequestError, match="no motion was requested"):
-            rig.session.resume()
-
-    def test_needs_a_motion_that_can_be_held(self):
-        rig, _ = moving()
-        with pytest.raises(RequestError, match="cannot be held"):
-            rig.session.resume()
-
-    def test_needs_a_motion_that_is_not_being_stopped(self):
-        rig = playing()
-        rig.session.hold()
-        rig.cycle(5)
-        rig.session.stop()
-        rig.cycle(1)
-        with pytest.raises(RequestError, match="is being stopped"):
-            rig.session.resume()
-
-
 class TestSourcesThatRaiseAnything:
     def test_so_does_a_property_where_a_method_should_be(self):
         def fails(self):
@@ -638,29 +599,6 @@ def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):
     assert "the session failed: MemoryError: no room" in str(rig.refusal)
     assert rig.ended.outcome == "refused"
     assert all_drive_off(rig.cycle())
-
-
-class TestRequestAfterAStop:
-    def test_none_is_taken_before_open_mode_was_left(self):
-        rig = opened()
-        rig.session.stop()
-        with pytest.raises(RequestError, match="being left"):
-            rig.session.request(smooth_move(WAY, 300))
-        rig.cycle()
-        assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
-        rig.close()
-        rig.exits_asked = 0
-        rig.session.request(smooth_move(WAY, 300))
-        rig.open()
-        rig.run_to("completed")
-
-    def test_none_is_taken_while_axes_open(self):
-        rig = closed()
-        rig.axes["mode"][: N - 1] = 4
-        rig.cycle()
-        rig.session.stop()
-        with pytest.raises(RequestError, match="being left"):
-            rig.session.request(smooth_move(WAY, 300))
 
 
 WIDE = {"jerk": np.full(N, 1e9)}
@@ -706,39 +644,29 @@ def test_the_bounds_of_an_override_are_granted_from_then_on_and_enforced():
             assert rig.state is State.OPEN
 
 
-class TestRefused:
-    def test_without_a_motion(self):
-        with pytest.raises(RequestError, match="no change of override can be requested"):
-            Rig().session.override(0.5)
+NOT_FITTING = [
+    (lambda: Rig(), "override", "no change of override can be requested"),
+    (lambda: moving(10)[0], "override", "knows no override"),
+    (lambda: stopping(Overridable(np.tile(START, (20, 1)))), "override", "is being stopped"),
+    (lambda: Rig(), "resume", "no motion was requested"),
+    (lambda: moving(10)[0], "resume", "cannot be held"),
+    (lambda: stopping(player()), "resume", "is being stopped"),
+]
 
-    def test_for_a_source_that_knows_none(self):
-        rig = running(Cruise())
-        with pytest.raises(RequestError, match="knows no override"):
-            rig.session.override(0.5)
-        rig.cycle(10)
-        assert rig.state is State.OPEN
 
-    @pytest.mark.parametrize("fraction", [-0.01, 1.01, np.nan, np.inf])
-    def test_outside_its_range(self, fraction):
-        source = Overridable(np.tile(START, (20, 1)))
-        rig = running(source)
-        with pytest.raises(RequestError, match=r"0\.\.1"):
-            rig.session.override(fraction)
-        assert source.fractions == []
+def stopping(source) -> Rig:
+    rig = running(source, 5)
+    if hasattr(source, "hold"):
+        rig.session.hold()
+    rig.session.stop()
+    rig.cycle()
+    return rig
 
-    def test_while_the_motion_is_brought_to_rest(self):
-        rig = running(Overridable(np.tile(START, (20, 1))))
-        rig.session.stop()
-        rig.cycle()
-        with pytest.raises(RequestError, match="is being stopped"):
-            rig.session.override(0.5)
 
-    def test_by_the_source_itself_and_the_motion_goes_on(self):
-        class Stubborn(Overridable):
-            def override(self, fraction):
-                raise ZeroDivisionError("not now")
-
-        rig = running(Stubborn(np.tile(START, (20, 1))))
-        with pytest.raises(RequestError, match="ZeroDivisionError: not now"):
-            rig.session.override(0.5)
-        rig.run_to("completed")
+@pytest.mark.parametrize(("situation", "request_", "words"), NOT_FITTING)
+def test_overrides_and_resumptions_without_a_motion_that_takes_them(situation, request_, words):
+    rig = situation()
+    state = rig.state
+    with pytest.raises(RequestError, match=words):
+        getattr(rig.session, request_)(*[0.5] * (request_ == "override"))
+    assert rig.state is state
