@@ -141,6 +141,21 @@ def cyclic_link(profile: str):
     return near, far
 
 
+def assert_refused(near, far, kind: type, words: str, axis: int, column: int, value: float) -> None:
+    """An answer with one such number becomes drive-off and closes the link."""
+    far.send(open_packet(11))
+    near.receive(1.0)
+    reply = CyclicPacket.zeros(12, 6)
+    reply.axes["mode"] = 4
+    reply.axes["d"][axis, column] = value
+    with pytest.raises(TransportClosed, match=words) as caught:
+        near.send(reply.encode())
+    assert isinstance(caught.value.__cause__, kind)
+    assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
+    with pytest.raises(TransportClosed):
+        near.receive(0.0)
+
+
 def open_packet(number: int) -> bytes:
     packet = CyclicPacket.zeros(number, 6)
     packet.axes["mode"] = 4
@@ -148,18 +163,7 @@ def open_packet(number: int) -> bytes:
 
 
 def test_an_answer_that_cannot_be_carried_becomes_drive_off_and_closes_the_link(profile):
-    near, far = cyclic_link(profile)
-    far.send(open_packet(11))
-    near.receive(1.0)
-    reply = CyclicPacket.zeros(12, 6)
-    reply.axes["mode"] = 4
-    reply.axes["d"][2, 4] = 0.5
-    with pytest.raises(TransportClosed, match="mode 4") as caught:
-        near.send(reply.encode())
-    assert isinstance(caught.value.__cause__, CanModeError)
-    assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
-    with pytest.raises(TransportClosed):
-        near.receive(0.0)
+    assert_refused(*cyclic_link(profile), CanModeError, "mode 4", 2, 4, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -167,17 +171,7 @@ def test_an_answer_that_cannot_be_carried_becomes_drive_off_and_closes_the_link(
     [("fd", np.nan), ("fd", np.inf), ("classic", np.nan), ("classic", np.inf), ("classic", 1024.0)],
 )
 def test_a_target_that_is_no_number_or_out_of_its_field_never_leaves(profile, value):
-    near, far = cyclic_link(profile)
-    far.send(open_packet(11))
-    near.receive(1.0)
-    reply = CyclicPacket.zeros(12, 6)
-    reply.axes["mode"] = 4
-    reply.axes["d"][5, 0] = value
-    with pytest.raises(TransportClosed) as caught:
-        near.send(reply.encode())
-    assert isinstance(caught.value.__cause__, CanValueError)
-    assert "slot 5" in str(caught.value.__cause__)
-    assert (CyclicPacket.decode(far.receive(1.0), 6).axes["mode"] == 505).all()
+    assert_refused(*cyclic_link(profile), CanValueError, "slot 5", 5, 0, value)
 
 
 def test_a_session_with_more_axes_is_refused_by_both_ends(profile):
@@ -295,6 +289,10 @@ def test_a_bus_that_fails_is_a_closed_link_with_its_cause(error):
     assert caught.value.__cause__ is error
     near.close()
     near.close()
+    near = CanTransport(Failing(OSError(9, "bad file descriptor")), BusRates("fd"))
+    with pytest.raises(TransportClosed, match="bad file"):
+        near.send(bytes(48))
+    near.close()
 
 
 @pytest.mark.parametrize(
@@ -304,13 +302,6 @@ def test_a_frame_that_the_bus_does_not_take_is_lost_and_counted(error):
     near = CanTransport(Failing(error), BusRates("fd"))
     near.send(bytes(48))
     assert near.rejected() == {"unsent": 1}
-    near.close()
-
-
-def test_a_send_that_fails_otherwise_is_a_closed_link():
-    near = CanTransport(Failing(OSError(9, "bad file descriptor")), BusRates("fd"))
-    with pytest.raises(TransportClosed, match="bad file"):
-        near.send(bytes(48))
     near.close()
 
 

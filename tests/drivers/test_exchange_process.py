@@ -371,41 +371,38 @@ def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until
 class TestBetweenReadingAndBeginning:
     """Whatever comes in between, a motion begins only as it was meant to."""
 
+    @staticmethod
+    def assert_nothing_moves(controller: UdpController) -> None:
+        controller.open = True
+        controller.cycle(50)
+        assert controller.moved == 0.0
+
     def test_a_stop(self):
         with running() as (exchange, controller):
             controller.open = True
             with pytest.raises(RequestError, match="asked for a stop"):
                 exchange.submit(Cruise(), lambda: exchange.stop() is None)
-            controller.open = True
-            controller.cycle(50)
-            assert controller.moved == 0.0
+            self.assert_nothing_moves(controller)
 
     def test_a_new_session_of_the_controller(self):
         with running() as (exchange, controller):
             with pytest.raises(RequestError, match="new session since"):
                 exchange.submit(Cruise(), lambda: controller.start() is None)
-            controller.open = True
-            controller.cycle(50)
-            assert controller.moved == 0.0
+            self.assert_nothing_moves(controller)
 
     def test_another_wish_while_the_exchange_stands_still(self):
         with running() as (exchange, controller):
-            asked = []
+            signals = iter([signal.SIGSTOP, signal.SIGCONT])
 
             def wanted():
-                asked.append(time.monotonic())
-                if len(asked) == 1:
-                    os.kill(exchange.pid, signal.SIGSTOP)
-                    return True
-                os.kill(exchange.pid, signal.SIGCONT)
-                return False
+                number = next(signals)
+                os.kill(exchange.pid, number)
+                return number is signal.SIGSTOP
 
             with pytest.raises(WithdrawnError):
                 exchange.submit(Cruise(), wanted)
-            assert len(asked) == 2
-            controller.open = True
-            controller.cycle(50)
-            assert controller.moved == 0.0
+            assert list(signals) == []
+            self.assert_nothing_moves(controller)
 
     def test_an_exception_leaves_no_motion_behind_that_another_could_be_taken_for(
         self, monkeypatch
@@ -421,9 +418,7 @@ class TestBetweenReadingAndBeginning:
                 patch.setattr(process, "hand_over", interrupted)
                 exchange.submit(Cruise())
             exchange.submit(still(10))
-            controller.open = True
-            controller.cycle(50)
-            assert controller.moved == 0.0
+            self.assert_nothing_moves(controller)
 
 
 class Lengthy(Cruise):
@@ -503,34 +498,39 @@ class Slow(Cruise):
 
 
 class TestStops:
-    def test_asked_for(self):
-        with running() as (exchange, controller):
-            set_going(exchange, controller)
-            exchange.stop()
+    """On the path, whoever asks for it or can no longer."""
+
+    @staticmethod
+    def stopped(exchange, controller, *, by: str, ends: bool) -> list:
+        """The arm came to rest as it should, for this reason; events."""
+        if ends:
+            events = run_to_the_end(exchange, controller)
+            assert exchange.wait(30.0) == 0
+            reason = the(Leaving, events).reason
+        else:
             controller.until(lambda: not controller.open)
             controller.cycle(3)
-            controller.assert_stopped_on_its_path(PERIOD)
-            ended = the(MotionEnded, exchange.events())
-            assert (ended.outcome, ended.reason) == ("stopped", "the supervisor asked for a stop")
+            events = exchange.events()
             assert exchange.alive
+            reason = the(MotionEnded, events).reason
+        controller.assert_stopped_on_its_path(PERIOD)
+        assert the(MotionEnded, events).outcome == "stopped"
+        assert by in reason
+        return events
 
-    def test_by_sigterm_which_also_ends_the_process(self):
+    @pytest.mark.parametrize(
+        ("ask", "reason", "ends"),
+        [
+            (ExchangeProcess.stop, "the supervisor asked for a stop", False),
+            (ExchangeProcess.terminate, "asked to terminate", True),
+            (ExchangeProcess.finish, "the supervisor wants to end", True),
+        ],
+    )
+    def test_asked_for(self, ask, reason, ends):
         with running() as (exchange, controller):
             set_going(exchange, controller)
-            exchange.terminate()
-            events = run_to_the_end(exchange, controller)
-            controller.assert_stopped_on_its_path(PERIOD)
-            assert the(MotionEnded, events).outcome == "stopped"
-            assert "asked to terminate" in the(Leaving, events).reason
-            assert exchange.wait(30.0) == 0
-
-    def test_by_the_end_of_the_session(self):
-        with running() as (exchange, controller):
-            set_going(exchange, controller)
-            exchange.finish()
-            events = run_to_the_end(exchange, controller)
-            controller.assert_stopped_on_its_path(PERIOD)
-            assert the(MotionEnded, events).outcome == "stopped"
+            ask(exchange)
+            self.stopped(exchange, controller, by=reason, ends=ends)
 
     @pytest.mark.parametrize("end", ["silent", "failed"])
     def test_by_the_end_of_the_archive(self, end):
@@ -552,12 +552,7 @@ class TestStops:
             else:
                 control.archive_state = ArchiveState.FAILED
                 reason = "the archive cannot be written"
-            controller.until(lambda: not controller.open)
-            controller.cycle(3)
-            controller.assert_stopped_on_its_path(PERIOD)
-            ended = the(MotionEnded, exchange.events())
-            assert (ended.outcome, ended.reason) == ("stopped", reason)
-            assert exchange.alive
+            self.stopped(exchange, controller, by=reason, ends=False)
 
     def test_by_a_supervisor_that_is_silent(self):
         with running() as (exchange, controller):
@@ -567,10 +562,7 @@ class TestStops:
             silent_from = time.monotonic()
             controller.until(lambda: not controller.open)
             assert time.monotonic() - silent_from > 0.4
-            events = run_to_the_end(exchange, controller)
-            controller.assert_stopped_on_its_path(PERIOD)
-            assert "no sign of life" in the(Leaving, events).reason
-            assert exchange.wait(30.0) == 0
+            self.stopped(exchange, controller, by="no sign of life", ends=True)
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
     def test_not_by_an_interrupt_or_a_hang_up(self, number):
@@ -761,18 +753,12 @@ def test_a_processor_can_be_chosen():
     assert not report.refused
 
 
-def test_a_processor_that_is_not_there_is_refused():
-    report, _, _ = enter("priority=0, lock_memory=False, hold_cpu_awake=False, cpu=4096")
-    assert len(report.refused) == 1
-    assert "choose one of" in report.refused[0]
-
-
-@pytest.mark.parametrize("priority", [100, 1000])
-def test_a_priority_that_does_not_exist_is_refused(priority):
-    report, _, _ = enter(f"priority={priority}, lock_memory=False, hold_cpu_awake=False")
+@pytest.mark.parametrize(
+    ("impossible", "remedy"),
+    [("priority=0, cpu=4096", "choose one of"), ("priority=100", ""), ("priority=1000", "")],
+)
+def test_a_processor_or_priority_that_does_not_exist_is_refused(impossible, remedy):
+    report, _, _ = enter(f"{impossible}, lock_memory=False, hold_cpu_awake=False")
     assert report.scheduling == "ordinary"
     assert len(report.refused) == 1
-
-
-def test_settings_have_a_default_for_every_wish():
-    assert RealTimeSettings() == RealTimeSettings(50, None, True, True)
+    assert remedy in report.refused[0]

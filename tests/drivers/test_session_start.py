@@ -416,7 +416,8 @@ def test_slots_of_unknown_arms_are_driven_if_any_drive_is_on(arms, status, power
     answer = safe_answer(bytes(status), modes, arms)
     assert answer.status == bytes(back)
     assert answer.mask[:, D1:].all() == (not powered)
-    reading = Reader(np.arange(2), arms, 1, Mode.POSITION).read(bytes(status), modes)
+    opened = np.full(2, Mode.POSITION, np.int32)
+    reading = Reader(np.arange(2), arms, 1, Mode.POSITION).read(bytes(status), opened)
     assert reading.powered == powered
 
 

@@ -115,18 +115,13 @@ class TestPeer:
         assert near.receive(0.05) is None
         assert near.rejected() == {"foreign": 1}
         near.forget_peer()
+        near.send(bytes(48))
+        assert controller.heard_nothing()
         another.send(b"c" * 48)
         assert near.receive(PATIENCE) == b"c" * 48
         near.send(b"answer")
         another.wait()
         assert another.replies == [b"answer"]
-        assert controller.heard_nothing()
-
-    def test_a_forgotten_peer_is_not_answered(self, near, controller):
-        controller.send(bytes(48))
-        near.receive(PATIENCE)
-        near.forget_peer()
-        near.send(bytes(48))
         assert controller.heard_nothing()
 
     @pytest.mark.parametrize("length", [0, 11, 1501, 9000])
@@ -154,19 +149,19 @@ class TestPeer:
         assert near.receive(0.05) is None
         assert near.rejected() == {"malformed": 1}
 
-    def test_strangers_do_not_lengthen_the_wait(self, near, stranger):
+    def test_strangers_neither_lengthen_the_wait_nor_hide_a_packet(
+        self, near, controller, stranger
+    ):
         for _ in range(200):
             stranger.send(bytes(48))
         before = time.monotonic()
         assert near.receive(0.05) is None
         assert 0.05 <= time.monotonic() - before < 5.0
-
-    def test_a_packet_behind_strangers_is_received(self, near, controller, stranger):
         for _ in range(20):
             stranger.send(bytes(48))
         controller.send(b"x" * 48)
         assert near.receive(PATIENCE) == b"x" * 48
-        assert near.rejected() == {"foreign": 20}
+        assert near.rejected() == {"foreign": 220}
 
     def test_without_patience_too(self, near, controller, stranger):
         controller.send(b"a" * 48)
@@ -195,14 +190,8 @@ class TestPeer:
 
 
 class TestWaiting:
-    @pytest.mark.parametrize("timeout", [1e-9, 0.0005, 0.003, 0.0101])
-    def test_it_waits_no_shorter_than_asked(self, near, timeout):
-        before = time.monotonic()
-        assert near.receive(timeout) is None
-        assert timeout <= time.monotonic() - before < timeout + 5.0
-
-    def test_changing_patience_is_honoured(self, near):
-        for timeout in (0.03, 0.01, 0.0, 0.02, 0.02):
+    def test_it_waits_no_shorter_than_asked(self, near):
+        for timeout in (1e-9, 0.0005, 0.003, 0.0101, 0.03, 0.0, 0.02, 0.02):
             before = time.monotonic()
             assert near.receive(timeout) is None
             assert timeout <= time.monotonic() - before < timeout + 5.0
@@ -327,18 +316,18 @@ class TestOpening:
             UdpTransport(HOST, 1000)
         assert "net.ipv4.ip_unprivileged_port_start=1000" in caught.value.remedy
 
-    def test_an_address_of_no_device_here(self):
-        with pytest.raises(TransportError, match="no network device"):
-            UdpTransport(HOST, 0, "192.0.2.1")
-
-    def test_an_address_that_is_none(self):
-        with pytest.raises(TransportError, match="controller's address is not known"):
-            UdpTransport("no host", 0)
-
-    @pytest.mark.parametrize("port", [-1, 65536])
-    def test_a_port_that_is_none(self, port):
-        with pytest.raises(TransportError, match="no such port"):
-            UdpTransport(HOST, port)
+    @pytest.mark.parametrize(
+        ("address", "words"),
+        [
+            ((HOST, 0, "192.0.2.1"), "no network device"),
+            (("no host", 0), "controller's address is not known"),
+            ((HOST, -1), "no such port"),
+            ((HOST, 65536), "no such port"),
+        ],
+    )
+    def test_an_address_that_is_none(self, address, words):
+        with pytest.raises(TransportError, match=words):
+            UdpTransport(*address)
 
     def test_a_closed_link_frees_its_port(self, near):
         port = near.address[1]
@@ -357,16 +346,13 @@ class TestOpening:
         assert pickle.loads(pickle.dumps(spec)) == spec
         error = TransportError("UDP port 1000", "taken", "free it")
         copy = pickle.loads(pickle.dumps(error))
-        assert (str(copy), copy.link, copy.reason, copy.remedy) == (
-            str(error),
-            "UDP port 1000",
-            "taken",
-            "free it",
-        )
+        assert (str(copy), vars(copy)) == (str(error), vars(error))
 
 
 class TestSession:
     """A session behind the port: the controller's words arrive as they are, answers go back."""
+
+    SYNC = (1).to_bytes(4, "little") + bytes(728)
 
     @pytest.fixture
     def session(self):
@@ -422,13 +408,10 @@ class TestSession:
         assert PacketRejected("foreign", 1) in session.events()
         assert stranger.heard_nothing()
 
-    def sync(self, number: int) -> bytes:
-        return int.to_bytes(number, 4, "little") + bytes(728)
-
     def test_a_stranger_does_not_take_over_a_start_that_goes_on(
         self, near, controller, another, session
     ):
-        controller.send(self.sync(1))
+        controller.send(self.SYNC)
         loops = 0
 
         def until():
@@ -436,7 +419,7 @@ class TestSession:
             loops += 1
             if loops in (2, 4):
                 another.send(init_packet().encode())
-                controller.send(self.sync(loops))
+                controller.send(loops.to_bytes(4, "little") + bytes(728))
             elif loops == 6:
                 controller.send(init_packet().encode())
             return session.state is State.INIT or loops > 20
@@ -468,7 +451,7 @@ class TestSession:
             for _ in range(20):
                 another.send(packet)
 
-        for packet in (bytes(228), self.sync(1), b"\xff" * 228):
+        for packet in (bytes(228), self.SYNC, b"\xff" * 228):
             flood(packet)
         controller.send(init_packet().encode())
         flood(b"\xff" * 228)
@@ -485,7 +468,7 @@ class TestSession:
     ):
         monkeypatch.setattr(loop, "FALLEN_SILENT", 0.2)
         end = time.monotonic() + 5.0
-        another.send(self.sync(1))
+        another.send(self.SYNC)
 
         def until():
             controller.send(init_packet().encode())

@@ -1,17 +1,16 @@
-"""Laws that hold in every run, whatever the fault: judged by bytes and records, not the guard."""
+"""Every fault in every situation of a session, judged as the session's own tests are."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers import (
-    Counters,
     CycleRing,
     CyclicPacket,
     DriveTrain,
@@ -28,14 +27,14 @@ from drivers import (
     StateChanged,
     exchange,
 )
-from drivers.packets import DRIVE_ON, Mode, cyclic_length, is_init, next_number, packet_number
+from drivers.packets import Mode, cyclic_length
 from planner import JointLimits, TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
+from tests.drivers.judge import Conduct, Judged
 from tests.fault_matrix import small_cell
 
 Array = NDArray[np.float64]
-Exchanged = Sequence[Sequence[Any]]  # Packets received, each with its answer or None
 
 N: Final = small_cell.N
 PERIOD: Final = 0.001
@@ -51,98 +50,6 @@ TOLERATED: Final = 4
 MAX_GAP: Final = 2  # Of the session, by default
 SESSION_THRESHOLD: Final = 0.6 * small_cell.FOLLOWING_ERROR
 """Narrower than the controller's own, so that the session is the first to notice."""
-_ALLOWANCE: Final = 0.1 * SESSION_THRESHOLD
-_STOP_FACTORS: Final = (1.0, 2.0, 3.0)
-_ASKS: Final = {Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR}
-_OPEN: Final = [Mode.POSITION] * N
-_FASTEST: Final = max(
-    abs(ratio) * speed * PERIOD / (2.0 * np.pi)
-    for ratio, speed in zip(small_cell.TABLE["gear_ratio"], small_cell.SPEED, strict=True)
-)
-
-
-def broken_on_the_wire(exchanged: Exchanged, fates: Counters) -> Iterator[str]:
-    """Answers: one for each that gets one; set-points only for open axes with the drive on."""
-    answered = sum(reply is not None for _, reply in exchanged)
-    if answered != fates.answered + fates.duplicates:
-        yield f"{answered} answers for {fates}"
-    silent = len(exchanged) - answered
-    if silent != fates.stale + fates.malformed + fates.ended:
-        yield f"{silent} packets unanswered, but {fates}"
-    for packet, reply in exchanged:
-        if reply is None:
-            continue
-        if packet_number(reply) != next_number(packet_number(packet)):
-            yield f"number {packet_number(reply)} in the answer to {packet_number(packet)}"
-        if not is_init(packet) and len(packet) == cyclic_length(N):
-            yield from _broken_in_answer(packet, reply)
-
-
-def _broken_in_answer(packet: bytes, reply: bytes) -> Iterator[str]:
-    received = CyclicPacket.decode(packet, N)
-    answer = CyclicPacket.decode(reply, N)
-    modes = received.axes["mode"].tolist()
-    powered = received.status[0] == DRIVE_ON
-    if _ASKS & set(answer.axes["mode"].tolist()):
-        return
-    ours, theirs = answer.axes["d"], received.axes["d"]
-    if powered and modes == _OPEN:
-        ahead = float(np.abs(ours[:, 0] - theirs[:, 0]).max())
-        # Every target is one of the last MAX_GAP + 1 set-points, give or take a tenth of the
-        # threshold, and the answer is the next of them.
-        if not ahead <= (MAX_GAP + 1) * 1.01 * _FASTEST + _ALLOWANCE:
-            yield f"a set-point {ahead} motor revolutions from the controller's target"
-        return
-    for axis in range(N):
-        is_open = powered and modes[axis] == Mode.POSITION
-        same = ours[axis].view(np.int32) == theirs[axis].view(np.int32)
-        if not is_open and not np.all(same | (ours[axis] == 0.0)):
-            yield f"set-point {ours[axis]} for closed axis {axis + 1}, not {theirs[axis]}"
-
-
-def broken_in_records(records: NDArray[np.void], still: slice | None) -> Iterator[str]:
-    """Records (m,) keep the bounds; none moves in `still`, between a loss and the next request."""
-    sent = np.isfinite(records["commanded_position"]).all(axis=1)
-    may = (records["mode"] == Mode.POSITION).all(axis=1) & (records["status"] == DRIVE_ON)
-    if np.any(sent & ~may):
-        yield f"set-points in {int(np.sum(sent & ~may))} cycles without open mode"
-    if still is not None and np.any(np.nan_to_num(records["commanded_velocity"][still])):
-        yield "set-points that move after the motion was lost or refused"
-    for first, last in _stretches(sent & (records["state"] != State.OPENING)):
-        rows = records[first:last]
-        v = rows["commanded_velocity"]
-        # After a long gap a motion goes on from the controller's target, and at its velocity.
-        carried = np.flatnonzero((rows["gap"][1:] > MAX_GAP) & v[:-1].any(axis=1)) + 1
-        for number, part in enumerate(np.split(rows, carried)):
-            yield from _broken_bounds(part, int(part["gap"][0]) if number else 0)
-
-
-def _broken_bounds(rows: NDArray[np.void], carried: int) -> Iterator[str]:
-    """Of a motion from rest, or from where the controller carried it by so many steps."""
-    q, v = rows["commanded_position"], rows["commanded_velocity"]
-    if np.any(q < LIMITS.lower) or np.any(q > LIMITS.upper):
-        yield "a set-point outside the joints' range"
-    same = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
-    # What the controller did not take is sent again, with its velocity: no step of the motion.
-    q = q[~(same & v.any(axis=1))]
-    before = np.tile(q[:1], (3, 1))
-    if carried:
-        step = PERIOD * rows["target_velocity"][0]
-        before = rows["target_position"][0] - np.arange(2.0, -1.0, -1.0)[:, None] * step
-    q = np.vstack((before, q))
-    bounds = (LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk)
-    for order, (bound, factor) in enumerate(zip(bounds, _STOP_FACTORS, strict=True), start=1):
-        rates = np.abs(np.diff(q, order, axis=0)) / PERIOD**order
-        # The controller's own steps have no acceleration: it comes back in a few cycles.
-        free = min(2 * carried, round(0.03 / PERIOD)) + 2 if carried and order == 3 else 0
-        rate = rates[free:].max(axis=0, initial=0.0)
-        if np.any(rate > bound * factor * (1.0 + 1e-5)):
-            yield f"derivative {order} of the set-points is {rate}, allowed is {bound * factor}"
-
-
-def _stretches(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(int)))
-    yield from zip(edges[::2], edges[1::2], strict=True)
 
 
 SILENCE: Final = 0.1
@@ -234,26 +141,82 @@ def session(
     return Session(DriveTrain(**table), Guard(limits, period), ring, settle_cycles=10, **options)
 
 
-class Watched:
-    """A transport that remembers what went over it."""
+class Heard:
+    """A session that remembers its answers, and hands out its events twice."""
 
-    def __init__(self, transport: SimulatedTransport) -> None:
-        self._transport = transport
-        self.exchanged: list[list[Any]] = []
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.replies: list[bytes] = []
+        self.pending: list[Any] = []
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._transport, name)
+        return getattr(self._session, name)
 
-    def receive(self, timeout: float) -> bytes | None:
-        packet = self._transport.receive(timeout)
-        if packet is not None:
-            self.exchanged.append([packet, None])
-        return packet
+    def reply(self, packet: bytes, now: float, ages: Any) -> bytes | None:
+        reply = self._session.reply(packet, now, ages)
+        self.replies.append(reply or b"")
+        return reply
 
-    def send(self, packet: bytes) -> None:
-        assert self.exchanged[-1][1] is None, "answered twice"
-        self.exchanged[-1][1] = packet
-        self._transport.send(packet)
+    def events(self) -> list[Any]:
+        events = self._session.events()
+        self.pending += events
+        return events
+
+
+class JudgedSession(Judged):
+    """A session all whose packets, answers and records are judged.
+
+    Attributes:
+        broken: the law that was broken first, in words; nothing is judged after it.
+    """
+
+    def __init__(self, heard: Heard, limits: GuardLimits) -> None:
+        conduct = Conduct(
+            limits, heard.drive_train, Mode.POSITION, 1, tuple(range(N)), (1,) * N,
+            threshold=limits.following_error, current=limits.current, period=PERIOD,
+            max_gap=MAX_GAP,
+        )  # fmt: skip
+        self.hear(
+            heard._session, heard._ring, conduct, n_axes=N, max_gap=MAX_GAP, silence=SILENCE,
+            period=PERIOD, inits={},
+        )  # fmt: skip
+        self.session = self._heard = heard  # type: ignore[assignment]
+        self.broken: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._heard, name)
+
+    def reply(self, packet: bytes, now: float, ages: Any) -> bytes | None:
+        if self.broken:
+            return self._heard.reply(packet, now, ages)
+        self._silent_by(now)
+        try:
+            self.deliver(packet, now - self.now)
+        except AssertionError as error:
+            self.broken.append(str(error).partition("\n")[0])
+        return self._heard.replies[-1] or None
+
+    def tick(self, now: float) -> None:
+        self._silent_by(now)
+        self._heard.tick(now)
+
+    def _silent_by(self, now: float) -> None:
+        if now >= self._heard.deadline:
+            self.silence_heard()
+
+    def events(self) -> list[Any]:
+        self.take_events()
+        events, self._heard.pending = self._heard.pending, []
+        return events
+
+    def request(self, source: TrajectoryPlayer) -> None:
+        self._heard.request(source)
+        self.conduct.entitled, self.conduct.stopping = True, False
+
+    def stop(self, reason: str) -> None:
+        self._heard.stop(reason)
+        self.take_events()
+        self.conduct.stopping = self.conduct.entitled
 
 
 @dataclass
@@ -275,16 +238,15 @@ class Run:
     cycles: dict[str, int] = field(default_factory=dict)  # first cycle of each situation
 
     def __post_init__(self) -> None:
-        self.session = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
+        made = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
+        self.heard = Heard(made)
+        self.session = JudgedSession(self.heard, made._guard.limits)
         self.events: list[Any] = []
-        self._still_from: int | None = None
-        self._still_until: int | None = None
 
     def play(self, faults: tuple[Any, ...], fault_cycle: int = 0, over: int = 0) -> None:
         """The whole run: the first motion, the fault, what follows, a motion afterwards."""
         self._over = over
         self.transport = SimulatedTransport(self.controller, faults)
-        self.link = Watched(self.transport)
         if self.requested_first:
             self.session.request(motion(np.array(small_cell.HOME), WAY, self.speed))
         patience = fault_cycle + 150
@@ -293,9 +255,7 @@ class Run:
         self._check_calm()
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
             self.recovery = self._recover()
-        self.broken += broken_on_the_wire(self.link.exchanged, self.session.counters)
-        still = None if self._still_from is None else slice(self._still_from, self._still_until)
-        self.broken += broken_in_records(self.session._ring.last(8192), still)
+        self.broken += self.session.broken
 
     def _go_on(self, until: Callable[[], bool], limit: int) -> None:
         end = self.transport.cycle + limit
@@ -306,19 +266,11 @@ class Run:
                 self._note_situation()
             return until() or self.transport.cycle >= end
 
-        exchange(self.link, self.session, until=done)
+        exchange(self.transport, cast(Session, self.session), until=done)
         self._note_events()
 
-    @property
-    def _written(self) -> int:
-        return self.session._ring._written
-
     def _note_events(self) -> None:
-        fresh = self.session.events()
-        self.events += fresh
-        for event in fresh:
-            if isinstance(event, MotionEnded) and event.outcome in ("lost", "refused"):
-                self._still_from = self._still_from or self.session._ring._written
+        self.events += self.session.events()
 
     def _note_situation(self) -> None:
         state = self.session.state
@@ -359,8 +311,8 @@ class Run:
 
     def _asked_for(self) -> str:
         """What the first answer asks for that is no set-point: 505 on all axes, or 508 on one."""
-        for _, reply in self.link.exchanged:
-            if reply is not None and len(reply) == cyclic_length(N):
+        for reply in self.heard.replies:
+            if len(reply) == cyclic_length(N):
                 modes = CyclicPacket.decode(reply, N).axes["mode"].tolist()
                 if modes == [Mode.DRIVE_OFF_REQUEST] * N:
                     return "505"
@@ -378,7 +330,6 @@ class Run:
             self._go_on(lambda: self.session.state is State.CLOSED, 200)
         if not self.session.requested:
             self._go_on(self._ready, 1500)
-            self._still_until = self._written
             try:
                 self.session.request(motion(self.controller.plant.position.copy(), -0.4 * WAY))
             except RequestError as error:
