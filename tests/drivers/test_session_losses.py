@@ -669,41 +669,34 @@ class Sent:
         return False
 
 
+NEAR_TARGETS = [  # step, depth; steps ahead, packets missed; whether it is refused
+    # A tenth of the threshold off any of them, either way.
+    *((way * 0.01, 3, 19.99, 0, False) for way in (-1, 1)),
+    *((way * 0.01, 3, 20.01, 0, True) for way in (-1, 1)),
+    *((way * 0.01, 3, -21.99, 0, False) for way in (-1, 1)),
+    *((way * 0.01, 3, -22.01, 0, True) for way in (-1, 1)),
+    # One of so many back counts and none before.
+    *((0.24, depth, 1.0 - depth, 0, False) for depth in (1, 2, 3)),
+    *((0.24, depth, -depth, 0, True) for depth in (1, 2, 3)),
+    # A quarter of the threshold from the last, whatever was sent.
+    *((0.2499, 3, ahead, missed, False) for ahead, missed in ((-2.0, 0), (2.0, 2))),
+    *((0.2501, 3, ahead, missed, True) for ahead, missed in ((-2.0, 0), (2.0, 2))),
+    # Carried on by as many steps as packets were missed, and by fewer than may be.
+    *((0.24, 3, ahead, missed, ahead > missed) for ahead in (1.0, 2.0) for missed in range(3)),
+    *((0.24, 2, ahead, 5, ahead > 1.0) for ahead in (1.0, 2.0)),
+]
+
+
 class TestWhere:
+    @pytest.mark.parametrize(("step", "depth", "ahead", "missed", "refused"), NEAR_TARGETS)
+    def test_a_target_is_near_one_of_those_sent(self, step, depth, ahead, missed, refused):
+        assert Sent(step, depth).refuses(ahead, missed) == refused
+
     def test_the_target_received_first_is_the_one_held(self):
         sent = Sent(0.1, count=0)
         assert sent.check(0.0) == 0
         assert sent.check(2.0, missed=2) == 0
         assert sent.refuses(2.01)
-
-    @pytest.mark.parametrize("way", [-1.0, 1.0])
-    def test_a_tenth_of_the_threshold_off_any_of_them(self, way):
-        assert not Sent(way * 0.01).refuses(19.99)
-        assert Sent(way * 0.01).refuses(20.01)
-        assert Sent(way * 0.01).refuses(-19.99 - 2.02)
-        assert not Sent(way * 0.01).refuses(-19.99 - 2.0)
-
-    @pytest.mark.parametrize("depth", [1, 2, 3])
-    def test_one_of_so_many_back_counts_and_none_before(self, depth):
-        step = 0.24
-        assert not Sent(step, depth).refuses(1.0 - depth)
-        assert Sent(step, depth).refuses(-depth)
-
-    def test_a_quarter_of_the_threshold_from_the_last_whatever_was_sent(self):
-        assert not Sent(0.2499).refuses(-2.0)
-        assert Sent(0.2501).refuses(-2.0)
-        assert not Sent(0.2499).refuses(2.0, missed=2)
-        assert Sent(0.2501).refuses(2.0, missed=2)
-
-    def test_the_last_carried_on_by_as_many_steps_as_packets_were_missed(self):
-        assert Sent(0.24).refuses(1.0, missed=0)
-        assert not Sent(0.24).refuses(1.0, missed=1)
-        assert Sent(0.24).refuses(2.0, missed=1)
-        assert not Sent(0.24).refuses(2.0, missed=2)
-
-    def test_the_last_is_carried_on_by_fewer_steps_than_may_be_missed(self):
-        assert not Sent(0.24, depth=2).refuses(1.0, missed=5)
-        assert Sent(0.24, depth=2).refuses(2.0, missed=5)
 
     def test_carried_on_means_by_the_last_step(self):
         sent = Sent(0.01)
@@ -719,11 +712,29 @@ class TestWhere:
             Sent(0.0).set_points.check(target, 0, 3)
         assert (caught.value.joint, caught.value.cycle) == (4, 3)
 
+    def test_only_the_joints_asked_for_matter(self):
+        sent, others = Sent(0.24), np.arange(N) != 1
+        assert sent.check(9.0, where=others) == 0
+        assert sent.check(-1.0, where=others) == 0
+        with pytest.raises(MotionNotCarriedOn):
+            sent.check(9.0, where=~others)
+
 
 class TestHowMany:
-    @pytest.mark.parametrize("lost", [1, 2, 3])
-    def test_as_many_as_the_target_is_behind_one_too_many_included(self, lost):
-        assert Sent(SLOW).check(-float(lost)) == lost
+    @pytest.mark.parametrize(
+        ("step", "ahead", "missed", "lost"),
+        [
+            *((SLOW, -lost, 0, lost) for lost in (1, 2, 3)),
+            *((SLOW, ahead, 2, 0) for ahead in (1.0, 2.0)),
+            # Other joints stand where they were, as carried on; this one is behind.
+            (SLOW, -1.01, 1, 1),
+            # What a standing joint moves hides one.
+            *((0.999 * STANDSTILL, -behind, 0, lost) for behind, lost in ((1, 0), (2, 2))),
+            (1.01 * STANDSTILL, -1, 0, 1),
+        ],
+    )
+    def test_as_many_as_the_target_is_behind(self, step, ahead, missed, lost):
+        assert Sent(step).check(ahead, missed) == lost
 
     def test_each_counts_once_however_long_the_target_stays_behind(self):
         sent = Sent(SENT_STEP)
@@ -733,21 +744,12 @@ class TestHowMany:
             sent.add(1.0)
         assert counts == [0, 1, 0, 1, 0, 1, 0, 1]
 
-    @pytest.mark.parametrize("ahead", [1.0, 2.0])
-    def test_a_target_carried_on_is_no_answer_lost(self, ahead):
-        assert Sent(SLOW).check(ahead, missed=2) == 0
-
     def test_a_target_carried_on_past_where_the_joint_was_is_no_answer_lost(self):
         sent = Sent(SLOW)
         sent.add(1.0)
         sent.add(2.1)
         sent.add(-1.0)  # one more of these steps is a tenth of a step from two set-points ago
         assert sent.set_points.check(sent.last - sent.step, 1, 7) == 0
-
-    def test_what_other_joints_do_is_no_excuse_for_one_that_is_behind(self):
-        """They stand where they were, which a target carried on is as well."""
-        sent = Sent(SLOW)
-        assert sent.check(-1.01, missed=1) == 1
 
     def test_the_joint_furthest_behind_counts(self):
         sent = Sent(SLOW)
@@ -756,12 +758,6 @@ class TestHowMany:
             sent.add(1.0)
         target = sent.last - sent.step * np.array([0, 1, 0, 0, 2, 0])
         assert sent.set_points.check(target, 0, 1) == 2
-
-    def test_what_a_standing_joint_moves_hides_one(self):
-        share = 0.999 * STANDSTILL
-        assert Sent(share).check(-1.0) == 0
-        assert Sent(share).check(-2.0) == 2
-        assert Sent(1.01 * STANDSTILL).check(-1.0) == 1
 
     @pytest.mark.parametrize("way", [-1.0, 1.0])
     @pytest.mark.parametrize(("step", "lost"), [(0.0, 0), (1.0, 1)], ids=["at rest", "moving on"])
@@ -819,11 +815,3 @@ class TestHowMany:
         sent.add(1.0)
         assert sent.check(-1.0) == 1
         assert sent.refuses(25.0)
-
-
-def test_only_the_joints_asked_for_matter():
-    sent, others = Sent(0.24), np.arange(N) != 1
-    assert sent.check(9.0, where=others) == 0
-    assert sent.check(-1.0, where=others) == 0
-    with pytest.raises(MotionNotCarriedOn):
-        sent.check(9.0, where=~others)

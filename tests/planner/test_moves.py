@@ -361,56 +361,40 @@ def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(six_axis_limits, fl
     assert max(grown) < 0.1
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"target": []},
-        {"target": [[1.0]]},
-        {"target": ["north"]},
-        {"speed": 0.0},
-        {"speed": 1.1},
-        {"speed": float("nan")},
-        {"speed": None},
-        {"acceleration": -1.0},
-        {"joint_speed": [1.0]},
-        {"joint_speed": [1.0, 0.0]},
-        {"joint_acceleration": [1.0, 2.0]},
-        {"joint_jerk": ["fast", 1.0]},
-        {"fly": 50},
-        {"termination": "exact"},
-    ],
+BAD_MOVES = (
+    *({"target": target} for target in ([], [[1.0]], ["north"])),
+    *({"speed": speed} for speed in (0.0, 1.1, float("nan"), None)),
+    {"acceleration": -1.0},
+    *({"joint_speed": share} for share in ([1.0], [1.0, 0.0])),
+    {"joint_acceleration": [1.0, 2.0]},
+    {"joint_jerk": ["fast", 1.0]},
+    {"fly": 50},
+    {"termination": "exact"},
 )
-def test_a_move_that_is_none_is_refused_by_name(bad):
-    with pytest.raises(InvalidSetting) as refusal:
-        Move(**{"target": [0.0, 1.0], **bad})
-    assert refusal.value.name == next(iter(bad))
+UNIT = JointLimits(-np.ones(2), *[np.ones(2)] * 4)
 
 
 @pytest.mark.parametrize(
     ("make", "name"),
     [
+        *(
+            (lambda bad=bad: Move(**{"target": [0.0, 1.0], **bad}), next(iter(bad)))
+            for bad in BAD_MOVES
+        ),
         *((lambda v=v: FlyPercent(v), "fly percentage") for v in (-1.0, 100.5, np.nan)),
         *((lambda v=v: FlyDistance(v), "fly distance") for v in (-1e-9, np.inf, np.nan)),
         (lambda: Overrides(joint=[1.0, 0.0]), "joint override"),
         (lambda: Overrides(deceleration=0.0), "deceleration override"),
+        *((lambda v=v: plan(np.zeros((2, 2)), UNIT, fly=v), "fly") for v in (-0.1, 1.1, np.nan)),
+        *(
+            (lambda v=v: plan(np.zeros((2, 2)), UNIT, speed=v), "speed")
+            for v in (0.0, 1.01, -1.0, np.nan, [1.0], [1.0, 0.0])
+        ),
     ],
 )
 def test_a_setting_out_of_range_is_refused_by_name(make, name):
     with pytest.raises(InvalidSetting) as refusal:
         make()
-    assert refusal.value.name == name
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("fly", value) for value in (-0.1, 1.1, np.nan)),
-        *(("speed", value) for value in (0.0, 1.01, -1.0, np.nan, [1.0, 1.0], [1.0] * 5 + [0.0])),
-    ],
-)
-def test_a_plan_with_a_setting_out_of_range_is_refused(six_axis_limits, name, value):
-    with pytest.raises(InvalidSetting) as refusal:
-        plan(np.zeros((2, 6)), six_axis_limits, **{name: value})
     assert refusal.value.name == name
 
 
@@ -433,12 +417,7 @@ def test_a_via_point_out_of_limits_is_named(six_axis_limits, random_points, fact
         plan(points, six_axis_limits)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_via_point_that_is_no_number_is_named(six_axis_limits, random_points, value):
-    points = random_points(16)
-    points[5, 0] = value
-    with pytest.raises(InvalidViaPoints, match=r"via point 5, joint 0: .* not a finite"):
-        plan(points, six_axis_limits)
+NO_NUMBERS = (np.nan, np.inf, -np.inf)
 
 
 @pytest.mark.parametrize(
@@ -451,9 +430,10 @@ def test_a_via_point_that_is_no_number_is_named(six_axis_limits, random_points, 
         (np.zeros((2, 3, 6)), "shape"),
         ([[0.0] * 6, [0.0] * 5], "table of numbers"),
         ([["north"] * 6, ["south"] * 6], "table of numbers"),
+        *(([[0.0] * 6, [bad] * 6], "point 1, joint 0: .* not a finite") for bad in NO_NUMBERS),
     ],
 )
-def test_via_points_of_the_wrong_form_are_refused(six_axis_limits, points, problem):
+def test_via_points_that_are_none_are_refused(six_axis_limits, points, problem):
     with pytest.raises(InvalidViaPoints, match=problem):
         plan(points, six_axis_limits)
 
@@ -535,6 +515,7 @@ class TestPopulation:
         good, outside, unknown = random_points(0), random_points(1), random_points(2)
         outside[3, 2] = 50.0
         unknown[0, 0] = np.nan
+        assert plan_chunk([], np.ones((0, 6)), six_axis_limits, 0.5) == []
         individuals = [good, outside, good[:1], unknown, good[:, :5], good[:3], good]
         planned = plan_chunk(individuals, np.ones((7, 6)), six_axis_limits, 0.5)
         assert [isinstance(each, InvalidViaPoints) for each in planned] == [False] + [True] * 4 + [
@@ -542,9 +523,6 @@ class TestPopulation:
         ] * 2
         assert bits(planned[0]) == bits(planned[6])
         assert planned[5].sample(np.array([np.inf]))[0][0] == pytest.approx(good[2], abs=1e-11)
-
-    def test_nobody_to_plan_for(self, six_axis_limits):
-        assert plan_chunk([], np.ones((0, 6)), six_axis_limits, 0.5) == []
 
 
 COUNT, JOINTS, PIECES = 3, 2, 5
