@@ -448,6 +448,16 @@ def nothing(self):
     pass
 
 
+def failing(*parts: str, error: BaseException, **others) -> Cruise:
+    """A source that can hold and resume, but fails in these parts."""
+
+    def fails(self, *_):
+        raise error
+
+    methods = {"hold": nothing, "resume": nothing} | dict.fromkeys(parts, fails) | others
+    return type("Odd", (Cruise,), methods)()
+
+
 def held_before_it_began() -> Rig:
     rig = closed()
     rig.session.request(player())
@@ -497,10 +507,7 @@ class TestHold:
         assert "cannot" in rig.ended.reason
 
     def test_one_that_fails_to_hold_is_stopped(self):
-        def fails(self):
-            raise SystemExit("no")
-
-        source = type("Odd", (Cruise,), {"hold": fails, "resume": fails})()
+        source = failing("hold", "resume", error=SystemExit("no"))
         rig = running(source, 300)
         with pytest.raises(RequestError, match="SystemExit: no"):
             rig.session.resume()
@@ -523,11 +530,8 @@ class TestHold:
         assert (rig.ended.outcome, rig.ended.interval) == ("stopped", -1)
 
     def test_one_that_fails_to_hold_as_it_begins_is_refused(self):
-        def fails(self):
-            raise ValueError("no")
-
         rig = Rig()
-        rig.session.request(type("Odd", (Cruise,), {"hold": fails, "resume": nothing})())
+        rig.session.request(failing("hold", error=ValueError("no")))
         rig.session.hold()
         rig.open()
         rig.cycle()
@@ -557,35 +561,39 @@ class TestHold:
         assert not at_rest(rig)
 
 
+def no(self):
+    raise SystemExit("no")
+
+
 class TestSourcesThatRaiseAnything:
-    def test_so_does_a_property_where_a_method_should_be(self):
-        def fails(self):
-            raise SystemExit("no")
+    """A method, or a property where a method should be."""
 
-        for name in ("override", "hold", "resume"):
-            parts = {"hold": nothing, "resume": nothing, name: property(fails)}
-            rig = running(source := type("Odd", (Cruise,), parts)(), 50)
-            if name == "hold":
-                rig.session.hold()
-                rig.cycle()
-                assert source.stops == 1
-                continue
-            call = {"override": lambda rig=rig: rig.session.override(0.5)}
-            with pytest.raises(RequestError, match="SystemExit: no"):
-                call.get(name, rig.session.resume)()
-            assert rig.state is State.OPEN
-        with pytest.raises(RequestError, match="SystemExit: no"):
-            Rig().session.request(type("Odd", (Cruise,), {"feed_forward": property(fails)})())
-
-    def test_an_override_that_raises_anything_is_a_request_refused(self):
-        def fails(self, fraction):
-            raise Unspeakable
-
-        rig = running(type("Odd", (Cruise,), {"override": fails})(), 5)
-        with pytest.raises(RequestError, match="Unspeakable, whose message"):
-            rig.session.override(0.5)
+    @pytest.mark.parametrize(
+        ("source", "words"),
+        [
+            (failing(error=SystemExit(), override=property(no)), "SystemExit: no"),
+            (failing(error=SystemExit(), resume=property(no)), "SystemExit: no"),
+            (failing("override", error=Unspeakable()), "Unspeakable, whose message"),
+            (failing("override", error=ZeroDivisionError("not now")), "ZeroDivisionError: not now"),
+        ],
+    )
+    def test_a_request_is_refused_and_the_motion_goes_on(self, source, words):
+        rig = running(source, 50)
+        with pytest.raises(RequestError, match=words):
+            if isinstance(vars(type(source))["resume"], property):
+                rig.session.resume()
+            else:
+                rig.session.override(0.5)
         rig.cycle(5)
         assert rig.state is State.OPEN
+
+    def test_one_that_fails_to_hold_or_to_be_requested(self):
+        rig = running(source := failing(error=SystemExit(), hold=property(no)), 50)
+        rig.session.hold()
+        rig.cycle()
+        assert source.stops == 1
+        with pytest.raises(RequestError, match="SystemExit: no"):
+            Rig().session.request(failing(error=SystemExit(), feed_forward=property(no)))
 
 
 def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):

@@ -788,49 +788,40 @@ class TestReopenedWhileLeaving:
         assert not rig.cycle().axes["d"].any()
 
 
-class TestAStrayAxisWhileCorrectionsEnd:
-    """It is in a mode of positions, so its own target is given back: if it can be held there."""
-
-    def stray(self, wanted, target=None, age=0, opening=False):
-        rig = opened(5, mode=wanted)
-        if opening:
-            rig.close()
-        rig.modes = [wanted if opening else 0, 0, 4, 0, 0, 0]
-        if target is not None:
-            rig.axes["d"][2, 0] = target
-        rig.ages = np.full((N, 8), age, np.uint16)
-        return rig, rig.cycle()
-
-    @pytest.mark.parametrize("opening", [False, True])
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_a_target_that_is_no_number_is_not_given_back(self, mode, opening):
-        rig, answer = self.stray(mode, np.nan, opening=opening)
-        assert all_drive_off(answer)
-        assert np.isfinite(answer.axes["d"]).all()
-        assert type(rig.refusal) is NotFinite
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_one_far_from_the_arm_is_not_given_back(self, mode):
-        rig, answer = self.stray(mode, 50.0)
-        assert answer.axes["mode"].tolist() == [0, 0, 508, 0, 0, 0]
-        assert type(rig.refusal) is FollowingError
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_one_of_an_earlier_cycle_is_not_given_back(self, mode):
-        rig, answer = self.stray(mode, age=1)
-        assert all_drive_off(answer)
-        assert type(rig.refusal) is FirstSetPointUnknown
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_another_is(self, mode):
-        rig, answer = self.stray(mode)
+@pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+@pytest.mark.parametrize(
+    ("target", "age", "opening", "kind"),
+    [
+        (np.nan, 0, False, NotFinite),
+        (np.nan, 0, True, NotFinite),
+        (50.0, 0, False, FollowingError),
+        (None, 1, False, FirstSetPointUnknown),
+        (None, 0, False, None),
+    ],
+)
+def test_a_stray_axis_is_given_its_target_back_if_it_can_be_held_there(
+    mode, target, age, opening, kind
+):
+    """It is in a mode of positions while corrections end, or begin."""
+    rig = opened(5, mode=mode)
+    if opening:
+        rig.close()
+    rig.modes = [mode if opening else 0, 0, 4, 0, 0, 0]
+    if target is not None:
+        rig.axes["d"][2, 0] = target
+    rig.ages = np.full((N, 8), age, np.uint16)
+    answer = rig.cycle()
+    assert np.isfinite(answer.axes["d"]).all()
+    if kind is None:
         assert rig.state is State.EXITING
         assert answer.axes["mode"].tolist() == [0, 0, 4, 0, 0, 0]
         assert answer.axes["d"][2, 0] == rig.axes["d"][2, 0]
-        assert (
-            np.isfinite(rig.records[-1]["commanded_position"]).tolist()
-            == [False] * 2 + [True] + [False] * 3
-        )
+        has = np.isfinite(rig.records[-1]["commanded_position"])
+        np.testing.assert_array_equal(has, np.arange(N) == 2)
+    else:
+        assert type(rig.refusal) is kind
+        reported = [0, 0, 508, 0, 0, 0] if kind is FollowingError else [505] * N
+        assert answer.axes["mode"].tolist() == reported
 
 
 class TestOpeningThatNeverCompletes:
@@ -844,34 +835,24 @@ class TestOpeningThatNeverCompletes:
         assert rig.state is State.OPENING
         return rig
 
-    def test_a_stop_leaves_open_mode_and_holds_each_axis_at_its_target(self):
+    @pytest.mark.parametrize("last", [Mode.CLOSED, Mode.POSITION])
+    def test_a_stop_leaves_open_mode_and_holds_each_axis_at_its_target(self, last):
+        """The last axis as well if it opens after all."""
         rig = self.opening(Cruise())
         rig.session.stop("enough")
         assert rig.session.requested is False
         rig.axes["d"][1, [0, 2]] += 0.01
         target = rig.axes["d"][:, 0].copy()
-        answer = rig.cycle()
-        assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
-        for _ in range(3):
+        for _ in range(4):
+            answer = rig.cycle()
+            assert (rig.state, rig.exits_asked) == (State.EXITING, 1)
             np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
             assert not answer.axes["d"][: N - 1, 1].any()
-            answer = rig.cycle()
-        assert rig.exits_asked == 1
+            rig.modes[N - 1] = last
+        assert set(rig.records["interval"]) == {-1}
         assert rig.ended.outcome == "stopped"
         rig.cycle(mode=Mode.CLOSED)
         assert rig.state is State.CLOSED
-
-    def test_the_last_axis_opening_after_all_is_held_too(self):
-        rig = self.opening(Cruise())
-        rig.session.stop()
-        rig.cycle()
-        target = rig.axes["d"][:, 0].copy()
-        rig.modes = Mode.POSITION
-        for _ in range(5):
-            answer = rig.cycle()
-            np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
-        assert rig.state is State.EXITING
-        assert set(rig.records["interval"]) == {-1}
 
     @pytest.mark.parametrize("opened", [1, N - 1])
     def test_a_motion_that_waits_too_long_is_given_up(self, opened):
@@ -994,39 +975,28 @@ class TestOtherAxes:
         assert (type(refusal.error), refusal.error.arm) == (TargetNotFinite, arm)
 
 
-class TestPause:
-    def paused(self) -> Rig:
-        rig = opened(5)
-        rig.axes["mode"][5] = Mode.PAUSE_BY_CONTROLLER
-        rig.cycle()
-        assert rig.state is State.FREEZING
-        return rig
-
-    def test_axes_still_open_are_held_at_their_target(self):
-        rig = self.paused()
-        rig.axes["d"][0, 0] += 1.9
+@pytest.mark.parametrize(
+    ("column", "off", "kind"),
+    [
+        (0, 1.9, None),
+        *((column, 2.1, FollowingError) for column in (0, 2)),
+        *((0, value, TargetNotFinite) for value in NOT_FINITE),
+    ],
+)
+def test_axes_still_open_in_a_pause_are_held_only_near_their_target(column, off, kind):
+    rig = opened(5)
+    rig.axes["mode"][5] = Mode.PAUSE_BY_CONTROLLER
+    rig.cycle()
+    rig.axes["d"][0, column] += off
+    for _ in range(5):
         answer = rig.cycle()
-        assert answer.axes["mode"].tolist() == [4, 4, 4, 4, 4, 0]
-        assert answer.axes["d"][0, 0] == rig.axes["d"][0, 0]
-        assert not rig.seen(Refused)
-
-    @pytest.mark.parametrize("value", NOT_FINITE)
-    def test_not_at_what_is_no_number(self, value):
-        rig = self.paused()
-        rig.axes["d"][0, 0] = value
-        answer = rig.cycle()
-        assert all_drive_off(answer)
+        modes = {None: [4] * 5 + [0], FollowingError: [508] + [4] * 4 + [0]}.get(kind, [505] * N)
+        assert answer.axes["mode"].tolist() == modes
         assert np.isfinite(answer.axes["d"]).all()
-        assert isinstance(rig.refusal, NotFinite)
-        assert rig.state is State.FAULTED
-
-    @pytest.mark.parametrize("column", [0, 2])
-    def test_axes_still_open_are_not_held_at_a_target_that_is_far_from_the_arm(self, column):
-        rig = self.paused()
-        rig.axes["d"][0, column] += 2.1
-        for _ in range(5):
-            assert rig.cycle().axes["mode"].tolist() == [508, 4, 4, 4, 4, 0]
-        assert [type(event.error) for event in rig.seen(Refused)] == [FollowingError]
+    assert [type(event.error) for event in rig.seen(Refused)] == [kind] * (kind is not None)
+    if kind is None:
+        assert rig.state is State.FREEZING
+        assert answer.axes["d"][0, 0] == rig.axes["d"][0, 0]
 
 
 def test_a_mode_unknown_here_beside_open_axes_asks_for_drive_off():

@@ -87,36 +87,27 @@ def test_only_open_axes_can_be_left_on_request():
     assert asking == [State.OPENING, State.OPEN, State.EXITING]
 
 
-class TestReading:
-    CLOSED, OPEN = [Mode.CLOSED] * 3, [Mode.POSITION] * 3
+MEANINGS = {
+    Input.CLOSED: ([0, 0, 0], [0, 10, 0]),
+    Input.DRIVING_ON: ([501, 501, 501], [0, 501, 0]),
+    Input.OPEN: ([4, 4, 4],),
+    Input.PARTLY_OPEN: ([4, 0, 4], [4, 5, 4], [5, 5, 5], [4, 501, 4]),
+    Input.PAUSE: ([502, 502, 502], [4, 500, 4]),
+    Input.END: ([504, 504, 504],),
+    Input.UNAVAILABLE: (
+        *([4, 504, 4], [4, 999, 4], [4, 4, 3], [502, 3, 4], [504, 0, 504]),
+        *([508, 0, 0], [3, 3, 3], [-1, -1, -1]),
+    ),
+}
 
+
+class TestReading:
     def read(self, modes, *, drive_on=True, wanted=slice(None)):
         return read_input(drive_on, modes, modes[wanted], Mode.POSITION)
 
     @pytest.mark.parametrize(
         ("modes", "meaning"),
-        [
-            ([0, 0, 0], Input.CLOSED),
-            ([0, 10, 0], Input.CLOSED),
-            ([501, 501, 501], Input.DRIVING_ON),
-            ([0, 501, 0], Input.DRIVING_ON),
-            ([4, 4, 4], Input.OPEN),
-            ([4, 0, 4], Input.PARTLY_OPEN),
-            ([4, 5, 4], Input.PARTLY_OPEN),
-            ([5, 5, 5], Input.PARTLY_OPEN),
-            ([4, 501, 4], Input.PARTLY_OPEN),
-            ([4, 504, 4], Input.UNAVAILABLE),
-            ([4, 999, 4], Input.UNAVAILABLE),
-            ([4, 4, 3], Input.UNAVAILABLE),
-            ([502, 3, 4], Input.UNAVAILABLE),
-            ([502, 502, 502], Input.PAUSE),
-            ([4, 500, 4], Input.PAUSE),
-            ([504, 504, 504], Input.END),
-            ([504, 0, 504], Input.UNAVAILABLE),
-            ([508, 0, 0], Input.UNAVAILABLE),
-            ([3, 3, 3], Input.UNAVAILABLE),
-            ([-1, -1, -1], Input.UNAVAILABLE),
-        ],
+        [(modes, meaning) for meaning, each in MEANINGS.items() for modes in each],
     )
     def test_modes(self, modes, meaning):
         assert self.read(modes) is meaning

@@ -234,43 +234,40 @@ def nested(depth: int) -> list:
     return inner
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"version": True},
-        {"version": 1.0},
-        {"version": "1"},
-        {"joints": "ab"},
-        {"joints": ["a", "a"]},
-        {"joints": [1, 2]},
-        {"joints": None},
-        {"start": [HUGE, 0]},
-        {"start": ["0", 0]},
-        {"start": [True, 0]},
-        {"start": [[0, 0]]},
-        {"start": nested(5000)},
-        {"moves": None},
-        {"moves": {"target": [1, 1]}},
-        {"moves": [5]},
-        {"moves": [{"target": ["1", "2"]}]},
-        {"moves": [{"target": [1, 1], "speed": HUGE}]},
-        {"moves": [{"target": [1, 1], "speed": "1"}]},
-        {"moves": [{"target": [1, 1], "speed": True}]},
-        {"moves": [{"target": [1, 1], "fly_percent": "50"}]},
-        {"moves": [{"target": [1, 1], "fly_percent": HUGE}]},
-        {"moves": [{"target": [1, 1], "fly_distance": True}]},
-        {"moves": [{"target": [1, 1], "joint_speed": [True, 1]}]},
-        {"moves": [{"target": [1, 1], "termination": ["fine"]}]},
-        {"overrides": None},
-        {"overrides": {"joint": ["1", 1]}},
-        {"overrides": {"speed": True}},
-        {"limits": [1]},
-        {"limits": {"lower": [HUGE, 0]}},
-        {"motion": [1]},
-        {"motion": {"type": "piecewise_cubic", "knots": [[0, HUGE]], "coefficients": []}},
-        {"motion": {"type": "piecewise_cubic", "knots": [["0", 1]], "coefficients": [[[0] * 4]]}},
-        {"motion": {"type": "piecewise_cubic", "knots": 5, "coefficients": 5}},
+DAMAGED_MOVES = {
+    "target": [["1", "2"]],
+    "speed": [HUGE, "1", True],
+    "fly_percent": ["50", HUGE],
+    "fly_distance": [True],
+    "joint_speed": [[True, 1]],
+    "termination": [["fine"]],
+}
+DAMAGE = {
+    "version": [True, 1.0, "1"],
+    "joints": ["ab", ["a", "a"], [1, 2], None],
+    "start": [[HUGE, 0], ["0", 0], [True, 0], [[0, 0]], nested(5000)],
+    "moves": [
+        *(None, {"target": [1, 1]}, [5]),
+        *(
+            [{"target": [1, 1], name: value}]
+            for name, values in DAMAGED_MOVES.items()
+            for value in values
+        ),
     ],
+    "overrides": [None, {"joint": ["1", 1]}, {"speed": True}],
+    "limits": [[1], {"lower": [HUGE, 0]}],
+    "motion": [
+        [1],
+        *(
+            {"type": "piecewise_cubic", "knots": knots, "coefficients": coefficients}
+            for knots, coefficients in (([[0, HUGE]], []), ([["0", 1]], [[[0] * 4]]), (5, 5))
+        ),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    "damage", [{name: value} for name, values in DAMAGE.items() for value in values]
 )
 def test_a_damaged_file_is_an_invalid_one_whatever_the_damage(damage):
     assert PlanFile.from_dict(PLAIN).joint_names == ("a", "b")

@@ -538,7 +538,7 @@ def test_long_packets_have_732_bytes_and_a_tail_that_one_seed_repeats() -> None:
     ids=str,
 )
 def test_settings_that_cannot_be_are_refused(change: dict[str, Any]) -> None:
-    words = {"slots": "slots", "foreign_axes": "20 axes in all"}.get(next(iter(change)), "")
+    words = {"slots": "slots", "foreign_axes": "20 axes in all"}.get(next(iter(change)))
     with pytest.raises(SettingError, match=words):
         small_cell.controller(**change)
 
