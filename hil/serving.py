@@ -156,19 +156,13 @@ def undisturbed(priority: int | None) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Served:
-    """How a session on a real link came out: controller and counts are of the last start.
-
-    Attributes:
-        intervals: how often all axes have been open.
-        starts: how often the start was begun.
-        foreign: datagrams from elsewhere; 0 where the link cannot tell.
-    """
+    """How a session on a real link came out: controller and counts are of the last start."""
 
     controller: SimulatedController
     summary: Tally
-    intervals: int
-    starts: int
-    foreign: int
+    intervals: int  #: how often all axes have been open
+    starts: int  #: how often the start was begun
+    foreign: int  #: datagrams from elsewhere; 0 where the link cannot tell
 
 
 def serve_session(

@@ -31,15 +31,10 @@ Run = Callable[[Campaign, int, Link | None], object]
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """A payload after some pairs.
+    """A payload after some pairs."""
 
-    Attributes:
-        found: what it weighs.
-        pairs: of one recording without and one with it.
-    """
-
-    found: PayloadFound
-    pairs: int
+    found: PayloadFound  #: what it weighs
+    pairs: int  #: of one recording without and one with it
 
     @property
     def width(self) -> tuple[float, float]:

@@ -69,16 +69,12 @@ LIBRARIES: Final = ("numpy", "scipy", "pin")
 
 @dataclass(frozen=True)
 class Where:
-    """Which folder caches what belongs to an archive.
+    """Which folder caches what belongs to an archive."""
 
-    Attributes:
-        root: of the whole cache; None: beside each archive, and below the user's own cache folder
-            (XDG) where that cannot be written to or something else has its name.
-        keep: whether anything is cached at all.
-    """
-
+    #: of the whole cache; None: beside each archive, and below the user's own cache folder (XDG)
+    #: where that cannot be written to or something else has its name
     root: str | None = None
-    keep: bool = True
+    keep: bool = True  #: whether anything is cached at all
 
     def store(self, location: str) -> Store:
         """That of the archives in the folder of this one."""

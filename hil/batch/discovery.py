@@ -47,17 +47,12 @@ change: file systems count in steps, some of them of two seconds."""
 
 
 class Discovery(NamedTuple):
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        refs: archives to use, in canonical order.
-        broken: files that cannot be used and folders that cannot be looked into, by path.
-        skipped: archives that are not meant to be fitted, and why, by path.
-    """
-
-    refs: tuple[ArchiveRef, ...]
+    refs: tuple[ArchiveRef, ...]  #: archives to use, in canonical order
+    #: files that cannot be used and folders that cannot be looked into, by path
     broken: tuple[Broken, ...]
-    skipped: tuple[Broken, ...]
+    skipped: tuple[Broken, ...]  #: archives that are not meant to be fitted, and why, by path
 
 
 def discover(
@@ -101,15 +96,10 @@ def discover(
 
 
 class Place(NamedTuple):
-    """Where an archive lies, and what is known of its file without opening it.
+    """Where an archive lies, and what is known of its file without opening it."""
 
-    Attributes:
-        location: path or URL.
-        version: of a remote object's content, "" where its store does not say.
-    """
-
-    location: str
-    version: str = ""
+    location: str  #: path or URL
+    version: str = ""  #: of a remote object's content, "" where its store does not say
 
     @property
     def name(self) -> str:

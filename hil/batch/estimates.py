@@ -46,25 +46,17 @@ _NAMED: Final = 12
 
 @dataclass(eq=False)
 class Group:
-    """What is fitted together, and what is predicted by it.
+    """What is fitted together, and what is predicted by it."""
 
-    Attributes:
-        refs: archives that were fitted.
-        phase: sum of their factors; None before there is one.
-        repetitions: the estimate of each.
-        unseen: sum of the totals of what is predicted; None if nothing is.
-        products: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`.
-        warned: every archive, with the warnings about it.
-        settings: digests.
-    """
-
-    refs: list[ArchiveRef] = field(default_factory=list)
-    phase: PhaseFactor | None = None
-    repetitions: list[LevelEstimate] = field(default_factory=list)
-    unseen: PhaseFactor | None = None
+    refs: list[ArchiveRef] = field(default_factory=list)  #: archives that were fitted
+    phase: PhaseFactor | None = None  #: sum of their factors; None before there is one
+    repetitions: list[LevelEstimate] = field(default_factory=list)  #: the estimate of each
+    unseen: PhaseFactor | None = None  #: sum of the totals of what is predicted; None if nothing is
+    #: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`
     products: Array | None = None
+    #: every archive, with the warnings about it
     warned: list[tuple[ArchiveRef, tuple[str, ...]]] = field(default_factory=list)
-    settings: set[str] = field(default_factory=set)
+    settings: set[str] = field(default_factory=set)  #: digests
 
     def add_bundle(self, bundle: Bundle) -> None:
         """Add archives; their estimates are added apart."""

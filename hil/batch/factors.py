@@ -165,15 +165,10 @@ def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]
 
 
 class Decision(NamedTuple):
-    """Settings of a campaign.
+    """Settings of a campaign."""
 
-    Attributes:
-        settings: None where there is not one archive to decide them from.
-        broken: archives that could not be read for it.
-    """
-
-    settings: Settings | None
-    broken: tuple[Broken, ...] = ()
+    settings: Settings | None  #: None where there is not one archive to decide them from
+    broken: tuple[Broken, ...] = ()  #: archives that could not be read for it
 
 
 def consulted(refs: Sequence[ArchiveRef], arms: Settings | None) -> tuple[ArchiveRef, ...]:

@@ -94,18 +94,12 @@ def opened_alone(ref: ArchiveRef) -> None:
 
 @dataclass(eq=False)
 class _Campaign:
-    """Archives of one group on their way.
+    """Archives of one group on their way."""
 
-    Attributes:
-        key: of the group.
-        refs: archives.
-        settings: None until they are decided.
-        bundles: what is reduced together, and whether it is in the cache.
-    """
-
-    key: GroupKey
-    refs: list[ArchiveRef]
-    settings: Settings | None = None
+    key: GroupKey  #: of the group
+    refs: list[ArchiveRef]  #: archives
+    settings: Settings | None = None  #: None until they are decided
+    #: what is reduced together, and whether it is in the cache
     bundles: list[tuple[tuple[ArchiveRef, ...], bool]] = field(default_factory=list)
 
     @property

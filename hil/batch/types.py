@@ -37,57 +37,36 @@ class CacheError(InputError):
 
 
 class GroupKey(NamedTuple):
-    """Archives that are fitted together.
+    """Archives that are fitted together."""
 
-    Attributes:
-        arm: digest of URDF, model, friction law and drive train.
-        campaign: the folder the archives were recorded into.
-        setup: delay and payload that their cells state, in words; "" for neither.
-    """
-
-    arm: str
-    campaign: str
-    setup: str = ""
+    arm: str  #: digest of URDF, model, friction law and drive train
+    campaign: str  #: the folder the archives were recorded into
+    setup: str = ""  #: delay and payload that their cells state, in words; "" for neither
 
 
 @dataclass(frozen=True, slots=True)
 class ArchiveRef:
-    """One archive: where it lies, and what it is, without its samples.
+    """One archive: where it lies, and what it is, without its samples."""
 
-    Attributes:
-        location: path or URL.
-        sha256: of all bytes.
-        use: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of
-            an archive that a batch does not use; of such a one `arm` and `cell` are "".
-        arm, campaign, setup: see :class:`GroupKey`.
-        index: of the interval within its kind; 0 for imported ones.
-        cell: digest of the texts of cell file and URDF.
-        motion: digest of the planned motion, "" where none is known.
-        when: time of recording, ISO 8601; "" in simulation.
-        stamp: of the file when it was hashed; None of a remote one.
-        kind: as its metadata say.
-        attempt: at the interval; 0 where the archive does not number them.
-        outcome: how the recording ended.
-        record: digest of the metadata.
-        simulated: whether no arm moved.
-    """
-
-    location: str
-    sha256: str
+    location: str  #: path or URL
+    sha256: str  #: of all bytes
+    #: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of an
+    #: archive that a batch does not use; of such a one `arm` and `cell` are ""
     use: str
+    #: see :class:`GroupKey`
     arm: str
     campaign: str
-    index: int
-    cell: str
-    motion: str
-    when: str = ""
+    index: int  #: of the interval within its kind; 0 for imported ones
+    cell: str  #: digest of the texts of cell file and URDF
+    motion: str  #: digest of the planned motion, "" where none is known
+    when: str = ""  #: time of recording, ISO 8601; "" in simulation
     setup: str = ""
-    stamp: Stamp | None = None
-    kind: str = ""
-    attempt: int = 0
-    outcome: str = "completed"
-    record: str = ""
-    simulated: bool = False
+    stamp: Stamp | None = None  #: of the file when it was hashed; None of a remote one
+    kind: str = ""  #: as its metadata say
+    attempt: int = 0  #: at the interval; 0 where the archive does not number them
+    outcome: str = "completed"  #: how the recording ended
+    record: str = ""  #: digest of the metadata
+    simulated: bool = False  #: whether no arm moved
 
     @property
     def name(self) -> str:
@@ -114,44 +93,29 @@ class Broken(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What is cached of each archive beside the sum of all.
+    """What is cached of each archive beside the sum of all."""
 
-    Attributes:
-        ref: the archive.
-        total: its factor as one block.
-        fit: the estimate from it alone, with cluster-robust covariance; None of a validation run.
-        design_effect: ratio of its mean variance to that of white residuals.
-        warnings: what a reader must know of it.
-        products: (n, p, p + 1), see
-            :func:`identification.estimators.delay.rate_products`; None where the delay
-            is known, or nothing is fitted.
-    """
-
-    ref: ArchiveRef
-    total: PhaseFactor
+    ref: ArchiveRef  #: the archive
+    total: PhaseFactor  #: its factor as one block
+    #: the estimate from it alone, with cluster-robust covariance; None of a validation run
     fit: Estimate | None
-    design_effect: float
-    warnings: tuple[str, ...] = ()
+    design_effect: float  #: ratio of its mean variance to that of white residuals
+    warnings: tuple[str, ...] = ()  #: what a reader must know of it
+    #: (n, p, p + 1), see :func:`identification.estimators.delay.rate_products`; None where the
+    #: delay is known, or nothing is fitted
     products: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Some archives of one campaign, reduced together.
+    """Some archives of one campaign, reduced together."""
 
-    Attributes:
-        refs: those asked for, in their order.
-        summaries: of those that could be read, in their order.
-        phase: sum of the factors of those that are fitted; None where none is.
-        broken: the others.
-        read: archives that were read for it; the rest comes from the cache.
-    """
-
-    refs: tuple[ArchiveRef, ...]
-    summaries: tuple[Summary, ...] = ()
+    refs: tuple[ArchiveRef, ...]  #: those asked for, in their order
+    summaries: tuple[Summary, ...] = ()  #: of those that could be read, in their order
+    #: sum of the factors of those that are fitted; None where none is
     phase: PhaseFactor | None = None
-    broken: tuple[Broken, ...] = ()
-    read: int = 0
+    broken: tuple[Broken, ...] = ()  #: the others
+    read: int = 0  #: archives that were read for it; the rest comes from the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,83 +137,55 @@ class LevelEstimate:
 
     Names, units, values, noise, samples, condition and method are those of
     :class:`identification.factor.factor.Estimate`.
-
-    Attributes:
-        level: which of these.
-        arm: digest of the arm, a key of `BatchResult.arms`.
-        campaign: folder; "" if pooled.
-        archive, sha256: location and digest of the archive of a repetition; "" otherwise.
-        when: time of the (first) recording, ISO 8601, "" if unknown.
-        repetitions: archives that were fitted.
-        std: (p,), infinite where undetermined.
-        covariance: (p, p); None for a repetition, of which there may be very many.
-        torque_rms: of the fitted rows per joint (n,) [N·m or N].
-        unseen_rms: torque error per joint (n,) on the campaign's validation runs; NaN if none.
-        unseen_torque_rms: torque per joint (n,) there; NaN if none.
-        settings: digest of the settings; "" where campaigns with different ones are pooled.
-        warnings: what a reader must know.
-        speed_rms: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition.
-        information: weighted Gram matrix (p, p) of the fitted rows; None for a repetition.
-        setup: what the cell states that archives of one arm may differ in, in words; "" if
-            nothing, or if campaigns with different ones are pooled.
-        payload: that the cell states; None for none, or if pooled.
-        unseen: sum of the factors of the validation runs; None if there are none.
     """
 
-    level: Level
-    arm: str
-    campaign: str
+    level: Level  #: which of these
+    arm: str  #: digest of the arm, a key of `BatchResult.arms`
+    campaign: str  #: folder; "" if pooled
+    #: location and digest of the archive of a repetition; "" otherwise
     archive: str
     sha256: str
-    when: str
-    repetitions: int
+    when: str  #: time of the (first) recording, ISO 8601, "" if unknown
+    repetitions: int  #: archives that were fitted
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Array
-    std: Array
-    covariance: Array | None
+    std: Array  #: (p,), infinite where undetermined
+    covariance: Array | None  #: (p, p); None for a repetition, of which there may be very many
     interval_factor: float
     samples: NDArray[np.intp]
     noise_std: Array
-    torque_rms: Array
-    unseen_rms: Array
-    unseen_torque_rms: Array
+    torque_rms: Array  #: of the fitted rows per joint (n,) [N·m or N]
+    unseen_rms: Array  #: torque error per joint (n,) on the campaign's validation runs; NaN if none
+    unseen_torque_rms: Array  #: torque per joint (n,) there; NaN if none
     condition: float
     undetermined: tuple[str, ...]
     method: str
-    settings: str
-    warnings: tuple[str, ...] = ()
+    settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
+    warnings: tuple[str, ...] = ()  #: what a reader must know
+    #: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition
     speed_rms: Array | None = None
+    #: weighted Gram matrix (p, p) of the fitted rows; None for a repetition
     information: Array | None = None
+    #: what the cell states that archives of one arm may differ in, in words; "" if nothing, or if
+    #: campaigns with different ones are pooled
     setup: str = ""
-    payload: Payload | None = None
+    payload: Payload | None = None  #: that the cell states; None for none, or if pooled
+    #: sum of the factors of the validation runs; None if there are none
     unseen: Factor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """Everything a batch found.
+    """Everything a batch found."""
 
-    Attributes:
-        estimator: by name.
-        arms: by digest.
-        repetitions: of all campaigns, in the order of `ArchiveRef.order`.
-        campaigns: likewise, by arm and time.
-        pooled: one per arm.
-        broken: archives, and campaigns (by folder), that could not be used.
-        skipped: archives that are not meant to be fitted, and why.
-        read: archives whose factor was computed.
-        cached: archives whose factor was known.
-        code: digest of the programs.
-    """
-
-    estimator: str
-    arms: Mapping[str, Arm]
-    repetitions: tuple[LevelEstimate, ...]
-    campaigns: tuple[LevelEstimate, ...]
-    pooled: tuple[LevelEstimate, ...]
-    broken: tuple[Broken, ...]
-    skipped: tuple[Broken, ...]
-    read: int
-    cached: int
-    code: str
+    estimator: str  #: by name
+    arms: Mapping[str, Arm]  #: by digest
+    repetitions: tuple[LevelEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
+    campaigns: tuple[LevelEstimate, ...]  #: likewise, by arm and time
+    pooled: tuple[LevelEstimate, ...]  #: one per arm
+    broken: tuple[Broken, ...]  #: archives, and campaigns (by folder), that could not be used
+    skipped: tuple[Broken, ...]  #: archives that are not meant to be fitted, and why
+    read: int  #: archives whose factor was computed
+    cached: int  #: archives whose factor was known
+    code: str  #: digest of the programs

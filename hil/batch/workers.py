@@ -31,16 +31,11 @@ _START: Final = 60.0
 
 @dataclass(frozen=True, eq=False)
 class ArchiveTask(Generic[T_co]):
-    """Work on archives.
+    """Work on archives."""
 
-    Attributes:
-        path: file or URL, by which the task is named where it fails.
-        function: importable where it runs.
-        arguments: of the function; they travel with each task, so they should be small.
-    """
-
-    path: str
-    function: Callable[..., T_co]
+    path: str  #: file or URL, by which the task is named where it fails
+    function: Callable[..., T_co]  #: importable where it runs
+    #: of the function; they travel with each task, so they should be small
     arguments: tuple[Any, ...]
 
 
@@ -49,15 +44,10 @@ class WorkerSoftwareError(HilError):
 
 
 class Workers(ABC):
-    """Who does the work on archives.
+    """Who does the work on archives."""
 
-    Attributes:
-        near: whether files they write can be read here under the same names.
-        count: how many tasks are done at once.
-    """
-
-    near: bool
-    count: int
+    near: bool  #: whether files they write can be read here under the same names
+    count: int  #: how many tasks are done at once
 
     def __enter__(self) -> Self:
         return self

@@ -75,25 +75,18 @@ _Plan = tuple[tuple[Array, Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class Estimation:
-    """An estimate, and what was computed beside it.
+    """An estimate, and what was computed beside it."""
 
-    Attributes:
-        estimator: by name.
-        result: pooled and per repetition.
-        held_out: factors of what is predicted, one per recording.
-        posterior: the estimate with the prior from CAD, which says of each parameter whether it
-            was learned from the data; in words why there is none.
-        endogeneity: whether noise in the regressor has biased least squares; in words why that
-            could not be tested.
-        warnings: what a reader must know of the estimate.
-    """
-
-    estimator: Estimator
-    result: RepeatedEstimate
-    held_out: tuple[PhaseFactor, ...]
+    estimator: Estimator  #: by name
+    result: RepeatedEstimate  #: pooled and per repetition
+    held_out: tuple[PhaseFactor, ...]  #: factors of what is predicted, one per recording
+    #: the estimate with the prior from CAD, which says of each parameter whether it was learned
+    #: from the data; in words why there is none
     posterior: PosteriorEstimate | str
+    #: whether noise in the regressor has biased least squares; in words why that could not be
+    #: tested
     endogeneity: EndogeneityTest | str
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  #: what a reader must know of the estimate
 
 
 def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:

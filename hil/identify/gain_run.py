@@ -26,17 +26,11 @@ from .sources import cell_of, source_of
 
 @dataclass(frozen=True, eq=False)
 class GainsFound:
-    """Gains and what they are for.
+    """Gains and what they are for."""
 
-    Attributes:
-        gains: torque per current of each motor.
-        loads: by archive name, what it carried; None for nothing.
-        motor_side: whether gears are known; without, gains include them.
-    """
-
-    gains: Gains
-    loads: dict[str, Payload | None]
-    motor_side: bool
+    gains: Gains  #: torque per current of each motor
+    loads: dict[str, Payload | None]  #: by archive name, what it carried; None for nothing
+    motor_side: bool  #: whether gears are known; without, gains include them
 
 
 def find_gains(

@@ -32,38 +32,32 @@ ESTIMATORS: Final[dict[Estimator, str]] = {
 class Options:
     """How archives are turned into a result.
 
-    Attributes:
-        method: "default" smooths positions only; "paper" smooths positions and torques and
-            filters the regressor alike.
-        split: share of a single recording that is fitted; the rest is predicted. Used only where
-            there are no validation runs.
-        delay: time by which the torque lags the position [s]; "stated" takes it from the cell, None
-            likewise unless another one is found; "auto" estimates it per axis and compensates it.
-        torque_bandwidth: low-pass [Hz] the torque has come through before it was recorded; None
-            for none. "auto" looks for one in imported torques; a controller's own currents are
-            known to have come through none.
-        estimator: by name, see `ESTIMATORS`.
-        bandwidth: widest of the smoothed positions [Hz].
-        velocity: the slope of the smoothed positions, or the measured velocity.
-        friction: entries of `[robot.friction]` that differ from the cell's.
-        standstill: which rows are left out for being slow: long "rests", all "slow" ones and
-            those near a reversal, or "none"; None goes by the friction law.
-        in_sample: everything is fitted and nothing predicted: all errors are in-sample.
-
     What is "auto" is chosen by predicting parts of what is fitted from the rest
     (:mod:`identification.selection.inner_prediction`).
     """
 
+    #: "default" smooths positions only; "paper" smooths positions and torques and filters the
+    #: regressor alike
     method: Method = "default"
+    #: share of a single recording that is fitted; the rest is predicted. Used only where there are
+    #: no validation runs.
     split: float = 0.7
+    #: time by which the torque lags the position [s]; "stated" takes it from the cell, None
+    #: likewise unless another one is found; "auto" estimates it per axis and compensates it
     delay: float | Literal["auto", "stated"] | None = None
+    #: low-pass [Hz] the torque has come through before it was recorded; None for none. "auto" looks
+    #: for one in imported torques; a controller's own currents are known to have come through none.
     torque_bandwidth: float | Literal["auto"] | None = "auto"
-    estimator: Estimator = "auto"
-    bandwidth: float | Literal["auto"] = "auto"
+    estimator: Estimator = "auto"  #: by name, see `ESTIMATORS`
+    bandwidth: float | Literal["auto"] = "auto"  #: widest of the smoothed positions [Hz]
+    #: the slope of the smoothed positions, or the measured velocity
     velocity: VelocitySource | Literal["auto"] = "auto"
+    #: entries of `[robot.friction]` that differ from the cell's
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
+    #: which rows are left out for being slow: long "rests", all "slow" ones and those near a
+    #: reversal, or "none"; None goes by the friction law
     standstill: LeftOut | Literal["auto"] | None = "auto"
-    in_sample: bool = False
+    in_sample: bool = False  #: everything is fitted and nothing predicted: all errors are in-sample
 
 
 FRICTION_TERMS: Final = ", ".join(

@@ -39,26 +39,17 @@ _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=Tru
 
 @dataclass(frozen=True, eq=False)
 class PayloadFound:
-    """A payload, and what it was found from.
+    """A payload, and what it was found from."""
 
-    Attributes:
-        estimate: of the body.
-        body: as it was found.
-        frame: link of the robot description in whose frame it is.
-        box: edges of the reference body [m]; None for a point.
-        gravity: magnitude [m/s²].
-        bare, loaded: names of the archives without it and with it.
-        warnings: what a reader must know.
-    """
-
-    estimate: PayloadEstimate
-    body: Body
-    frame: str
-    box: tuple[float, float, float] | None
-    gravity: float
+    estimate: PayloadEstimate  #: of the body
+    body: Body  #: as it was found
+    frame: str  #: link of the robot description in whose frame it is
+    box: tuple[float, float, float] | None  #: edges of the reference body [m]; None for a point
+    gravity: float  #: magnitude [m/s²]
+    #: names of the archives without it and with it
     bare: tuple[str, ...]
     loaded: tuple[str, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  #: what a reader must know
 
     @property
     def figures(self) -> Array:

@@ -27,31 +27,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Sources as samples, and what was done to them.
+    """Sources as samples, and what was done to them."""
 
-    Attributes:
-        sources: with the friction law that was decided on, and the warnings that preparing raised.
-        fitted: what the fit reads.
-        training: the same recordings as a verdict reads them: torques never smoothed.
-        held_out: what is predicted, likewise; `training` where nothing was held out.
-        settings: of `fitted`.
-        delays: of the torque behind the position, as the longest of the fitted recordings has
-            them; None where that cannot be determined.
-        masked: rows of `fitted` that do not count, per joint (n,), by the first reason against
-            them, in words.
-        rows: time samples of `fitted`.
-        notes: what was found and done, in sentences.
-    """
-
+    #: with the friction law that was decided on, and the warnings that preparing raised
     sources: Sources
-    fitted: tuple[Samples, ...]
+    fitted: tuple[Samples, ...]  #: what the fit reads
+    #: the same recordings as a verdict reads them: torques never smoothed
     training: tuple[Samples, ...]
+    #: what is predicted, likewise; `training` where nothing was held out
     held_out: tuple[Samples, ...]
-    settings: Settings
+    settings: Settings  #: of `fitted`
+    #: of the torque behind the position, as the longest of the fitted recordings has them; None
+    #: where that cannot be determined
     delays: DelayEstimate | None
+    #: rows of `fitted` that do not count, per joint (n,), by the first reason against them, in
+    #: words
     masked: Mapping[str, NDArray[np.intp]]
-    rows: int
-    notes: tuple[str, ...]
+    rows: int  #: time samples of `fitted`
+    notes: tuple[str, ...]  #: what was found and done, in sentences
 
     @property
     def assumed_delay(self) -> Array:

@@ -37,29 +37,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Settings:
-    """How archives of one arm become samples, and samples an estimate: figures and words only.
+    """How archives of one arm become samples, and samples an estimate: figures and words only."""
 
-    Attributes:
-        preprocessing: of recordings, with the delay of the torque.
-        friction: entries of `[robot.friction]` that differ from the cell's.
-        noise_variance: of the positions (n,) [rad² or m²]; None takes each recording's own.
-        torque_variance: of the torques (n,) [N²·m² or N²]; likewise.
-        stated_delay: of the torque, before any was looked for [s].
-        axis_delays: by which torques are read earlier, axis by axis (n,) [s]; None for none.
-        delay_variance: of a delay that was found [s²]; zero where it is known.
-        shrinkage: of the automatic estimator.
-        choices: what was chosen by inner prediction.
-    """
-
-    preprocessing: Preprocessing
+    preprocessing: Preprocessing  #: of recordings, with the delay of the torque
+    #: entries of `[robot.friction]` that differ from the cell's
     friction: Mapping[str, Any] = field(default_factory=dict)
+    #: of the positions (n,) [rad² or m²]; None takes each recording's own
     noise_variance: tuple[float, ...] | None = None
-    torque_variance: tuple[float, ...] | None = None
-    stated_delay: float = 0.0
+    torque_variance: tuple[float, ...] | None = None  #: of the torques (n,) [N²·m² or N²]; likewise
+    stated_delay: float = 0.0  #: of the torque, before any was looked for [s]
+    #: by which torques are read earlier, axis by axis (n,) [s]; None for none
     axis_delays: tuple[float, ...] | None = None
-    delay_variance: float = 0.0
+    delay_variance: float = 0.0  #: of a delay that was found [s²]; zero where it is known
+    #: of the automatic estimator
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
-    choices: tuple[Choice, ...] = ()
+    choices: tuple[Choice, ...] = ()  #: what was chosen by inner prediction
 
     def preprocessed(self, **changes: Any) -> Settings:
         """These settings with others of the preprocessing."""

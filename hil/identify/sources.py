@@ -39,27 +39,17 @@ FLOAT32_STEP = 2.0**-24
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One archive: its recording and where the planned motion begins in it.
+    """One archive: its recording and where the planned motion begins in it."""
 
-    Attributes:
-        path: of the archive.
-        name: file name.
-        recording: joints in the order of the model.
-        origin: time of the first set-point [s].
-        merged: what was done about repeated time stamps, in words; nothing for none.
-        clock: what was decided about its time stamps, in sentences.
-        retimed: whether other times than the stamps were used.
-        context: the motion of a longer recording that this is a part of, and where it begins in
-            it, so that filters know what lies beyond its ends. Its torques are zero outside.
-    """
-
-    path: Path
-    name: str
-    recording: Recording
-    origin: float
-    merged: str = ""
-    clock: tuple[str, ...] = ()
-    retimed: bool = False
+    path: Path  #: of the archive
+    name: str  #: file name
+    recording: Recording  #: joints in the order of the model
+    origin: float  #: time of the first set-point [s]
+    merged: str = ""  #: what was done about repeated time stamps, in words; nothing for none
+    clock: tuple[str, ...] = ()  #: what was decided about its time stamps, in sentences
+    retimed: bool = False  #: whether other times than the stamps were used
+    #: the motion of a longer recording that this is a part of, and where it begins in it, so that
+    #: filters know what lies beyond its ends. Its torques are zero outside.
     context: tuple[Recording, int] | None = None
 
     def changed(self, change: Callable[[Recording], Recording]) -> Source:
@@ -74,33 +64,20 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """All archives of one identification.
+    """All archives of one identification."""
 
-    Attributes:
-        cell: from the attachments of the first archive.
-        header: of the first archive.
-        plan: of the first archive; None where none was attached.
-        training: what is fitted.
-        same_motion: whether these are repetitions of one motion.
-        held_out: what is predicted and never fitted.
-        noise_variance: of the positions (n,) [rad²]; None where no standstill was recorded.
-        torque_variance: of the torques at standstill (n,) [N²·m²]; None likewise.
-        warnings: what a reader must know about the archives.
-        tested_on: what is predicted, in words.
-        in_sample: whether nothing was held out: `held_out` is `training` then.
-    """
-
-    cell: Cell
-    header: ArchiveHeader
-    plan: dict[str, Any] | None
-    training: tuple[Source, ...]
-    same_motion: bool
-    held_out: tuple[Source, ...]
+    cell: Cell  #: from the attachments of the first archive
+    header: ArchiveHeader  #: of the first archive
+    plan: dict[str, Any] | None  #: of the first archive; None where none was attached
+    training: tuple[Source, ...]  #: what is fitted
+    same_motion: bool  #: whether these are repetitions of one motion
+    held_out: tuple[Source, ...]  #: what is predicted and never fitted
+    #: of the positions (n,) [rad²]; None where no standstill was recorded
     noise_variance: Array | None
-    torque_variance: Array | None
-    warnings: tuple[str, ...]
-    tested_on: str
-    in_sample: bool = False
+    torque_variance: Array | None  #: of the torques at standstill (n,) [N²·m²]; None likewise
+    warnings: tuple[str, ...]  #: what a reader must know about the archives
+    tested_on: str  #: what is predicted, in words
+    in_sample: bool = False  #: whether nothing was held out: `held_out` is `training` then
 
     def with_warning(self, warning: str) -> Sources:
         """These sources with one more thing a reader must know."""
