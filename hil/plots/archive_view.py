@@ -5,7 +5,7 @@ A long archive is read window by window, so that memory does not grow with its l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -28,23 +28,14 @@ from hil.plots.plan_picture import broken
 from hil.report.drawing import (
     FIRST,
     INK,
-    MUTED,
-    OUTSIDE_3,
     ROUTES,
     SECOND,
     Caption,
     Panel,
     Plot,
-    blank,
-    drawing,
-    footed,
-    headed,
     label,
-    place,
-    ruled,
-    thinned,
-    to_panel,
-    traces_text,
+    runs,
+    time_panel,
 )
 from hil.report.drawing import Trace as Line
 from hil.report.rendering import environment, page_bytes
@@ -59,7 +50,6 @@ _SAMPLES: Final = 30_000
 _BINS: Final = 4000
 """Stretches of the time shown whose lowest and highest sample go into the page: every sample of
 16 s at 500 Hz."""
-_BINS_SHOWN: Final = 300
 _LEAP: Final = 10.0  # Samples left out, by which a line is broken
 _TITLES: Final = {
     "position": "position [deg]",
@@ -363,50 +353,6 @@ def _state_name(number: int) -> str:
     return State(number).name.lower().replace("_", " ") if known else f"state {number}"
 
 
-def runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
-    """Stretches of finite values, each thinned; `bins` are for all of them together.
-
-    Args:
-        time: (m,) [s].
-        values: (m,); NaN where there is nothing.
-        bins: see `hil.report.drawing.thinned`.
-    """
-    finite = np.isfinite(values)
-    edges = np.flatnonzero(np.diff(finite, prepend=False, append=False))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
-
-
-def _draw(
-    axes: Axes,
-    view: ArchiveView,
-    recorded: Trace,
-    lines: Iterable[tuple[Array, Array]],
-    colours: tuple[str, str, str],
-) -> None:
-    """A quantity with limits that are within its reach, events, and packets that were missed.
-
-    `colours` are of the lines, of limits and warnings, and of all else.
-    """
-    colour, limit, mark = colours
-    for time, value in lines:
-        axes.plot(time, value, color=colour, linewidth=1.0)
-    low, high = axes.get_ylim()
-    least = 1e-3 * max(abs(low), abs(high), 1e-6)
-    if high - low < least:  # noise at rest does not fill the page
-        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
-    for bound in recorded.limits:
-        if low <= bound <= high:
-            axes.axhline(bound, color=limit, linewidth=0.9, linestyle=(0, (5, 2)))
-    for at, _, _, warns in view.events:
-        axes.axvline(at, color=limit if warns else mark, linewidth=0.8, linestyle=(0, (1, 2)))
-    for gap in view.gaps[:_MOST_GAPS]:
-        axes.axvline(gap, color=mark, linewidth=0.6, alpha=0.7)
-    axes.set_ylim(low, high)
-    axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
-    axes.ticklabel_format(axis="y", useOffset=False)
-
-
 def _share(recorded: Trace) -> str:
     share = recorded.peak_share
     return "" if share is None else "< 1" if share < 0.01 else f"{100.0 * share:.0f}"
@@ -448,54 +394,47 @@ def _panel(view: ArchiveView, j: int) -> Panel:
     most = max((q.traces[j].time.size for q in view.quantities), default=0)
     grid = np.linspace(view.start, view.start + length, 2 * max(1, min(_BINS, most // 2)))
     plots, shares = [], []
-    with drawing():
-        figure = blank(_WIDTH, _TOP + max(1, len(view.quantities)) * _STEP + _BOTTOM)
-        for k, quantity in enumerate(view.quantities):
-            recorded, name = quantity.traces[j], quantity.title.partition(" [")[0]
-            line = Line(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
-            box = (_LEFT, _TOP + k * _STEP, _WIDTH - _LEFT - _RIGHT, _PLOT)
-            plots.append(Plot(box, quantity.title, [line], recorded.limits))
-            shares += [f"{name} {share}"] if (share := _share(recorded)) else []
-            axes, last = place(figure, *box), k == len(view.quantities) - 1
-            shown = runs(grid, line.values, _BINS_SHOWN)
-            _draw(axes, view, recorded, shown, (line.colour, OUTSIDE_3, MUTED))
-            ruled(axes, "both", x_ticks=6, y_ticks=3)
-            headed(axes, quantity.title)
-            axes.tick_params(labelbottom=last)
-            if last:
-                footed(axes, _SECONDS)
-        note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
-        what = ", ".join(plot.heading for plot in plots)
-        caption = Caption(f"a{j}", label(view.joint_names[j]), note, what)
-        marks = [time for time, _, _, _ in view.events]
-        return to_panel(figure, caption, traces_text(grid, plots, points=grid.size, marks=marks))
+    for k, quantity in enumerate(view.quantities):
+        recorded, name = quantity.traces[j], quantity.title.partition(" [")[0]
+        line = Line(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
+        box = (_LEFT, _TOP + k * _STEP, _WIDTH - _LEFT - _RIGHT, _PLOT)
+        plots.append(Plot(box, quantity.title, [line], recorded.limits))
+        shares += [f"{name} {share}"] if (share := _share(recorded)) else []
+    note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
+    what = ", ".join(plot.heading for plot in plots)
+    caption = Caption(f"a{j}", label(view.joint_names[j]), note, what)
+    height = _TOP + max(1, len(plots)) * _STEP + _BOTTOM
+    marks = [*(time for time, _, _, _ in view.events), *view.gaps[:_MOST_GAPS].tolist()]
+    return time_panel(
+        height, grid, plots, caption, grid.size, width=_WIDTH, foot=_SECONDS, marks=marks
+    )
 
 
 def archive_page(view: ArchiveView) -> bytes:
     """The page; the same archive gives the same bytes."""
-    facts = view.facts
-    rows = [
-        ("shown", f"{view.start:.3f} s to {view.stop:.3f} s of {facts.duration:.3f} s"),
-        ("frame", view.frame),
-        ("joints", ", ".join(facts.joint_names)),
-        ("cycle", "not fixed" if facts.period is None else f"{1e3 * facts.period:g} ms"),
-        ("samples", str(facts.samples)),
-        ("packets", view.missed),
-        ("lost", facts.lost or "nothing"),
-        ("damage", facts.damage or "none"),
-        ("attachments", ", ".join(facts.attachments)),
-        *facts.metadata.items(),
-    ]
     template = environment().get_template("archive.html.j2")
-    text = template.render(
-        facts=facts,
-        joints=[_panel(view, j) for j in range(len(view.joint_names))],
-        events=view.events,
-        states=view.states,
-        simulated=facts.metadata.get("simulated") == "yes",
-        rows=rows,
-    )
+    joints = [_panel(view, j) for j in range(len(view.joint_names))]
+    text = template.render(view=view, facts=view.facts, joints=joints)
     return page_bytes(text)
+
+
+def _surround(axes: Axes, view: ArchiveView, recorded: Trace) -> None:
+    """Limits that are within reach, events, and packets that were missed."""
+    low, high = axes.get_ylim()
+    least = 1e-3 * max(abs(low), abs(high), 1e-6)
+    if high - low < least:  # noise at rest does not fill the page
+        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
+    for bound in recorded.limits:
+        if low <= bound <= high:
+            axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
+    for at, _, _, warns in view.events:
+        colour = style.LIMIT if warns else style.MUTED
+        axes.axvline(at, color=colour, linewidth=0.8, linestyle=(0, (1, 2)))
+    for gap in view.gaps[:_MOST_GAPS]:
+        axes.axvline(gap, color=style.MUTED, linewidth=0.6, alpha=0.7)
+    axes.set_ylim(low, high)
+    axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
+    axes.ticklabel_format(axis="y", useOffset=False)
 
 
 def draw_archive(view: ArchiveView) -> Figure:
@@ -512,8 +451,8 @@ def draw_archive(view: ArchiveView) -> Figure:
             colour = _COLOURS[quantity.title.partition(" [")[0]][1]
             for j, trace in enumerate(quantity.traces):
                 axes = figure.add_subplot(grid[j, k])
-                line = [(trace.time, trace.value)]
-                _draw(axes, view, trace, line, (colour, style.LIMIT, style.MUTED))
+                axes.plot(trace.time, trace.value, color=colour, linewidth=1.0)
+                _surround(axes, view, trace)
                 style.bare(axes)
                 axes.tick_params(labelbottom=j == rows - 1)
                 title = quantity.title if j == 0 else ""

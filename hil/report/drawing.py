@@ -168,6 +168,13 @@ def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
     return time[chosen], values[chosen]
 
 
+def runs(time: Array, values: Array, bins: int = 500) -> Iterator[tuple[Array, Array]]:
+    """Stretches of finite values (m,), each :func:`thinned`, with so many bins in all."""
+    edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
+
+
 @contextmanager
 def drawing() -> Iterator[None]:
     """Draw inside this: matplotlib's own defaults, whatever the caller's settings are.
@@ -368,34 +375,57 @@ def panel(
 
 
 def time_panel(
-    height: float, time: Array, plots: Sequence[Plot], caption: Caption, points: int = MOST_POINTS
+    height: float,
+    time: Array,
+    plots: Sequence[Plot],
+    caption: Caption,
+    points: int = MOST_POINTS,
+    *,
+    width: float = PANEL_WIDTH,
+    foot: str = "time [s]",
+    marks: Sequence[float] = (),
 ) -> Panel:
-    """Plots over the same time, one above the other, with their samples to zoom into."""
+    """Plots over the same time, one above the other, with their samples to zoom into.
+
+    At `marks` dotted lines are drawn [s].
+    """
     with drawing():
-        figure = blank(PANEL_WIDTH, height)
+        figure = blank(width, height)
         for k, plot in enumerate(plots):
             axes = place(figure, *plot.box)
             for stretch in plot.shaded:
                 axes.axvspan(*stretch, color=BAND, linewidth=0.0, zorder=0.5)
             for trace in plot.traces:
-                axes.plot(
-                    *thinned(time, trace.values),
-                    color=trace.colour,
-                    linewidth=trace.width,
-                    linestyle=(0, (4, 2)) if trace.dashed else "-",
-                    solid_joinstyle="round",
-                )
+                for part in runs(time, trace.values):
+                    axes.plot(
+                        *part,
+                        color=trace.colour,
+                        linewidth=trace.width,
+                        linestyle=(0, (4, 2)) if trace.dashed else "-",
+                        solid_joinstyle="round",
+                    )
             if plot.reach is not None:
                 axes.set_ylim(-plot.reach, plot.reach)
             headed(axes, plot.heading)
+            low, high = axes.get_ylim()
+            if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:
+                # Noise at rest does not fill the page.
+                axes.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
+            for limit in plot.limits:
+                if low <= limit <= high:
+                    axes.axhline(limit, color=OUTSIDE_3, linewidth=0.9, linestyle=DASHED)
+            for mark in marks:
+                axes.axvline(mark, color=MUTED, linewidth=0.8, linestyle=(0, (1, 2)))
             values = np.concatenate([one.values for one in plot.traces])
-            if values.min() < 0.0 < values.max():
+            if np.nanmin(values, initial=0.0) < 0.0 < np.nanmax(values, initial=0.0):
                 axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
             ruled(axes, "both", x_ticks=6, y_ticks=3 if k else 4)
-            axes.set_xlim(0.0, max(float(time[-1]), 1e-9))
+            axes.ticklabel_format(axis="y", useOffset=False)
+            axes.set_xlim(float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9))
             axes.tick_params(labelbottom=plot is plots[-1])
-        footed(axes, "time [s]")
-        return to_panel(figure, caption, traces_text(time, plots, points=points))
+            if plot is plots[-1]:
+                footed(axes, foot)
+        return to_panel(figure, caption, traces_text(time, plots, points=points, marks=marks))
 
 
 def box_panel(
