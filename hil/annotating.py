@@ -10,20 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
+from hil.archive import Archive, open_archive, schema
 from hil.archive.mcap_writer import McapWriter
-from hil.archive.schema import (
-    COMMANDED,
-    EVENT_CHANNEL,
-    LIBRARY,
-    MEASURED,
-    PROFILE,
-    Channel,
-    description_messages,
-    joint_states,
-    profile,
-    set_points,
-)
 from hil.archive.writer import register
 from hil.errors import InputError
 from hil.files import make_folder, write_together
@@ -105,26 +93,26 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
     shift = 0 if begin is None else begin - int(stamp[0])
     first = int(stamp[0]) + shift
     words = {"position": "position", "velocity": "velocity", "effort": "torque"}
-    states = {MEASURED: (stamp, {w: columns[c] for w, c in words.items() if c in columns})}
+    states = {schema.MEASURED: (stamp, {w: columns[c] for w, c in words.items() if c in columns})}
     if "commanded_position" in columns:
-        commands = {name: set_points(columns, name) for name in ("position", "velocity")}
-        states[COMMANDED] = (stamp, commands)
+        commands = {name: schema.set_points(columns, name) for name in ("position", "velocity")}
+        states[schema.COMMANDED] = (stamp, commands)
     times = stamp[0] + np.rint(1e9 * prediction["time"]).astype(np.int64)
     states[PREDICTED] = (times, {"effort": prediction["effort"]})
-    measured = profile(len(names))[MEASURED]
-    once = description_messages(archive.attachments.get("robot.urdf", b""))
+    measured = schema.profile(len(names))[schema.MEASURED]
+    once = schema.description_messages(archive.attachments.get("robot.urdf", b""))
     content: list[bytes] = []
-    writer = McapWriter(content.append, PROFILE, LIBRARY)
+    writer = McapWriter(content.append, schema.PROFILE, schema.LIBRARY)
     for channel, message in once.items():
         writer.add_message(register(writer, channel), first, 0, message)
-    events = register(writer, EVENT_CHANNEL)
+    events = register(writer, schema.EVENT_CHANNEL)
     for number, event in enumerate(archive.events):
         at = event.stamp + shift
         writer.add_message(events, at, number, event.encode(at))
     messages = []
     for topic, (times, values) in states.items():
-        number = register(writer, Channel(topic, measured.schema, measured.definition))
-        messages.append((number, times + shift, joint_states(names, times + shift, values)))
+        number = register(writer, schema.Channel(topic, measured.schema, measured.definition))
+        messages.append((number, times + shift, schema.joint_states(names, times + shift, values)))
     last = max(int(times[-1]) for _, times, _ in messages)
     for start in range(first, last + 1, _CHUNK):
         for number, times, rows in messages:

@@ -18,21 +18,10 @@ from hil.progress import Reporter
 from hil.terminal_text import plural
 from identification import IdentificationError
 
+from . import factors
 from .cache import Where, code_digest, settings_digest
 from .discovery import discover
 from .estimates import Estimator, Group, repetition_level, sum_level
-from .factors import (
-    bundles,
-    cached,
-    cell_from,
-    cell_in,
-    consulted,
-    decided,
-    is_cached,
-    known_settings,
-    opened,
-    reduced,
-)
 from .types import (
     ArchiveRef,
     Arm,
@@ -88,7 +77,7 @@ def reidentify(
 
 def opened_alone(ref: ArchiveRef) -> None:
     """Open an archive, to see whether that fails, or ends this process."""
-    with opened(ref):
+    with factors.opened(ref):
         pass
 
 
@@ -146,11 +135,13 @@ class _Batch:
         asked: list[tuple[_Campaign, tuple[Any, ...]]] = []
         for one in campaigns:
             own = arms.get(one.key.arm)
-            refs = consulted(one.refs, own)
-            one.settings = known_settings(refs, self.options, own, self.where)
+            refs = factors.consulted(one.refs, own)
+            one.settings = factors.known_settings(refs, self.options, own, self.where)
             if one.settings is None:
                 asked.append((one, (refs, self.options, own, self.where)))
-        tasks = [ArchiveTask(one.key.campaign, decided, arguments) for one, arguments in asked]
+        tasks = [
+            ArchiveTask(one.key.campaign, factors.decided, arguments) for one, arguments in asked
+        ]
         again: list[_Campaign] = []
         for (one, arguments), found in zip(
             asked, self._results(tasks, "deciding settings"), strict=True
@@ -183,12 +174,12 @@ class _Batch:
     # Factors
 
     def _reducing(self, one: _Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Bundle]:
-        return ArchiveTask(refs[0].location, reduced, (refs, one.ready, self.where))
+        return ArchiveTask(refs[0].location, factors.reduced, (refs, one.ready, self.where))
 
     def _reduced(self, one: _Campaign) -> Iterator[Bundle]:
         """The bundles of a campaign in turn; what ends its process is looked for one by one."""
         for refs, known in one.bundles:
-            found: Any = cached(refs, one.ready, self.where) if known else next(self.stream)
+            found: Any = factors.cached(refs, one.ready, self.where) if known else next(self.stream)
             if found is None:  # damaged
                 (found,) = self.workers.results([self._reducing(one, refs)])
             if isinstance(found, Bundle):
@@ -204,8 +195,8 @@ class _Batch:
         """Reduce and estimate everything; what the cache has is read here if that can be seen."""
         tasks = []
         for one in campaigns:
-            for refs in bundles([ref for ref in one.refs if ref.use != "standstill"]):
-                known = self.workers.near and is_cached(refs, one.ready, self.where)
+            for refs in factors.bundles([ref for ref in one.refs if ref.use != "standstill"]):
+                known = self.workers.near and factors.is_cached(refs, one.ready, self.where)
                 one.bundles.append((refs, known))
                 tasks += [] if known else [self._reducing(one, refs)]
         self.stream = self.workers.results(tasks)
@@ -299,9 +290,9 @@ class _Batch:
         """The cell of an archive."""
         texts = self.where.store(ref.location).get(ref.cell, list)
         if texts is not None and json_digest(texts) == ref.cell:
-            return cell_from(*texts)
-        with opened(ref) as archive:
-            return cell_in(archive)
+            return factors.cell_from(*texts)
+        with factors.opened(ref) as archive:
+            return factors.cell_in(archive)
 
 
 def _nothing_to_fit(broken: Sequence[Broken]) -> InputError:

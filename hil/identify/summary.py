@@ -9,32 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil import results
 from hil.archive import ArchiveHeader
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.results import (
-    CalibrationResult,
-    ChoiceResult,
-    ConsistencyResult,
-    CoverageResult,
-    CriteriaResult,
-    DelaysResult,
-    EndogeneityResult,
-    EssentialParameter,
-    EssentialResult,
-    EstimatorResult,
-    ExcitationResult,
-    FittedResult,
-    JointJudgement,
-    JudgementResult,
-    LinkResult,
-    ParameterResult,
-    ProfileResult,
-    Results,
-    UncertaintyResult,
-    ValidationResult,
-    VerdictResult,
-)
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel
@@ -81,7 +59,7 @@ def summarise(
     nominal: str | None,
     essential: EssentialChoice | str,
     consistency: ConsistencyCheck | str,
-) -> Results:
+) -> results.Results:
     """Everything that was found, as it goes into `results.json`.
 
     `nominal` is what the nominal model is, in words.
@@ -95,7 +73,7 @@ def summarise(
     simulated = sources.header.only_simulated
     truth = planted_in(cell, sources.header) if simulated else None
     posterior, endogeneity = estimation.posterior, estimation.endogeneity
-    return Results(
+    return results.Results(
         name=name,
         cell=cell.name,
         simulated=simulated,
@@ -104,7 +82,7 @@ def summarise(
         period=_period(prepared.training[0]),
         software=software(),
         excitation=excitation,
-        estimator=EstimatorResult(
+        estimator=results.EstimatorResult(
             name=estimation.estimator,
             words=pooled.method
             if estimation.estimator == "auto"
@@ -115,7 +93,7 @@ def summarise(
         ),
         endogeneity=None
         if isinstance(endogeneity, str)
-        else EndogeneityResult.of(
+        else results.EndogeneityResult.of(
             endogeneity, sentence=endogeneity.words, degrees_of_freedom=endogeneity.freedom
         ),
         endogeneity_untested=endogeneity if isinstance(endogeneity, str) else None,
@@ -132,13 +110,13 @@ def summarise(
         calibration=_calibration(prepared, estimation),
         delays=_delays(prepared),
         choices=[
-            ChoiceResult.of(
+            results.ChoiceResult.of(
                 choice, errors=[error if np.isfinite(error) else None for error in choice.errors]
             )
             for choice in prepared.settings.choices
         ],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
-        verdict=VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
+        verdict=results.VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
         essential=None if isinstance(essential, str) else essential_result(essential),
         consistency=None
         if isinstance(consistency, str)
@@ -147,7 +125,7 @@ def summarise(
     )
 
 
-def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResult | None:
+def _calibration(prepared: Prepared, estimation: Estimation) -> results.CalibrationResult | None:
     """Intervals of held-out torque; None without held-out motion, or too little fitted."""
     if prepared.sources.in_sample:
         return None
@@ -168,7 +146,7 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResul
         return None
     if math.isnan(found.overall):
         return None
-    return CalibrationResult.of(
+    return results.CalibrationResult.of(
         block=BLOCK,
         means=int(found.blocks.sum()),
         inside=found.overall,
@@ -178,19 +156,19 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> CalibrationResul
     )
 
 
-def consistency_result(model: RobotModel, check: ConsistencyCheck) -> ConsistencyResult:
+def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.ConsistencyResult:
     """As it goes into `results.json`."""
     found = check.consistent
     standard = dict(zip(model.standard_names, found.standard.tolist(), strict=True))
     inertial = found.standard[model.layout.links]
-    return ConsistencyResult.of(
+    return results.ConsistencyResult.of(
         check,
         in_sample=found.relative_error,
         unconstrained_in_sample=found.unconstrained_relative_error,
         shift=found.shift,
         status=found.status,
         links=[
-            LinkResult.of(
+            results.LinkResult.of(
                 joint=joint,
                 mass=float(inertial[k, 9]),
                 centre=np.divide(inertial[k, 6:9], inertial[k, 9]),
@@ -203,14 +181,14 @@ def consistency_result(model: RobotModel, check: ConsistencyCheck) -> Consistenc
     )
 
 
-def essential_result(choice: EssentialChoice) -> EssentialResult:
+def essential_result(choice: EssentialChoice) -> results.EssentialResult:
     """As it goes into `results.json`."""
     left = choice.elimination.estimate
     columns = left.names, left.units, left.values.tolist(), left.std.tolist()
-    return EssentialResult.of(
+    return results.EssentialResult.of(
         choice.elimination,
         parameters=[
-            EssentialParameter(name=name, unit=unit, estimate=value, std=std)
+            results.EssentialParameter(name=name, unit=unit, estimate=value, std=std)
             for name, unit, value, std in zip(*columns, strict=True)
         ],
         by_spread_left=choice.by_spread.left,
@@ -219,13 +197,13 @@ def essential_result(choice: EssentialChoice) -> EssentialResult:
     )
 
 
-def uncertainty_result(estimation: Estimation) -> UncertaintyResult:
+def uncertainty_result(estimation: Estimation) -> results.UncertaintyResult:
     """Standard deviations by every method that was used."""
     result = estimation.result
     pooled, many = result.pooled, len(result.repetitions) > 1
     by_posterior = estimation.estimator == "prior"
     reported = pooled.std.tolist()
-    return UncertaintyResult(
+    return results.UncertaintyResult(
         reported="posterior" if by_posterior else "phase_clustered",
         method=pooled.method,
         interval_factor=pooled.interval_factor,
@@ -260,7 +238,7 @@ def _period(samples: Samples) -> float:
     return float(np.median(np.diff(samples.motion.time)))
 
 
-def _excitation(prepared: Prepared) -> tuple[ExcitationResult, Array]:
+def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
     """Criteria of what was executed (all repetitions), and of the plan where one was attached.
 
     Of every sample of the motion, resting joints included, as the criteria of a plan see it; and
@@ -276,24 +254,24 @@ def _excitation(prepared: Prepared) -> tuple[ExcitationResult, Array]:
     gram = information(factor)
     most = coupling_index_max(len(gram))
     criteria = Criteria.of_gram(gram, sum(lengths))
-    executed = CriteriaResult.of(criteria, coupling_index_max=most)
+    executed = results.CriteriaResult.of(criteria, coupling_index_max=most)
     planned = _planned(prepared.sources)
     if planned is None:
         duration = lengths[0] * _period(prepared.training[0])
-        return ExcitationResult(
+        return results.ExcitationResult(
             duration=duration, n_via=None, fly=None, planned=None, executed=executed
         ), gram
     trajectory, via_points = planned.trajectory, planned.via_points
     n_via = None
     if via_points is not None:  # without the posture that a closed path begins and ends at
         n_via = len(via_points) - 2 * np.array_equal(via_points[0], via_points[-1])
-    return ExcitationResult(
+    return results.ExcitationResult(
         method=planned.method,
         duration=trajectory.duration,
         n_via=n_via,
         fly=planned.fly,
         n_sines=trajectory.amplitude.shape[1] if isinstance(trajectory, FourierSeries) else None,
-        planned=CriteriaResult.of(planned.criteria, coupling_index_max=most),
+        planned=results.CriteriaResult.of(planned.criteria, coupling_index_max=most),
         executed=executed,
     ), gram
 
@@ -327,7 +305,9 @@ def moving_rows(samples: Samples) -> slice:
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
-def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list[ParameterResult]:
+def _parameters(
+    cell: Cell, estimation: Estimation, truth: Array | None
+) -> list[results.ParameterResult]:
     model, estimate, posterior = cell.model, estimation.result, estimation.posterior
     pooled, many = estimate.pooled, len(estimate.repetitions) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
@@ -350,7 +330,7 @@ def _parameters(cell: Cell, estimation: Estimation, truth: Array | None) -> list
         prior_ratio=known and known.ratio,
         learned=known and known.learned,
     )
-    return [ParameterResult.of(**row) for row in rows]
+    return [results.ParameterResult.of(**row) for row in rows]
 
 
 def _rows(**columns: Any) -> list[dict[str, Any]]:
@@ -369,12 +349,12 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _validation(prepared: Prepared, values: Array) -> list[ValidationResult]:
+def _validation(prepared: Prepared, values: Array) -> list[results.ValidationResult]:
     sources, model = prepared.sources, prepared.sources.cell.model
     errors = prediction_error(model, values, prepared.held_out)
     everywhere = prediction_error(model, values, prepared.held_out, all_rows=True)
     return [
-        ValidationResult.of(
+        results.ValidationResult.of(
             archive=source.name,
             duration=float(source.recording.time[-1] - source.recording.time[0]),
             mean_abs_error=error.mean_absolute,
@@ -389,7 +369,7 @@ def _validation(prepared: Prepared, values: Array) -> list[ValidationResult]:
     ]
 
 
-def _fitted(prepared: Prepared, values: Array) -> FittedResult:
+def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
     """In-sample errors: of the torque as recorded, and as it was fitted where that differs."""
 
     def error(samples: Sequence[Samples], *, all_rows: bool = True) -> PredictionError:
@@ -400,7 +380,7 @@ def _fitted(prepared: Prepared, values: Array) -> FittedResult:
     everywhere = error(prepared.training)
     paper = prepared.settings.preprocessing.smooth_torque
     smoothed = error(prepared.fitted) if paper else None
-    return FittedResult.of(
+    return results.FittedResult.of(
         relative_error=moving.relative,
         overall_relative_error=moving.overall,
         all_rows_relative_error=everywhere.overall,
@@ -410,29 +390,29 @@ def _fitted(prepared: Prepared, values: Array) -> FittedResult:
     )
 
 
-def _delays(prepared: Prepared) -> DelaysResult | None:
+def _delays(prepared: Prepared) -> results.DelaysResult | None:
     found = prepared.delays
     if found is None:
         return None
     half = found.interval_factor * found.std
-    return DelaysResult.of(
+    return results.DelaysResult.of(
         found=np.where(found.determined, found.delays, np.nan),
         interval=np.where(found.determined, half, np.nan),
         applied=prepared.assumed_delay,
     )
 
 
-def _coverage(values: Array, std: Array, truth: Array) -> CoverageResult:
+def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult:
     """Of the parameters that the data determine and whose truth is known."""
     determined = np.isfinite(std) & np.isfinite(truth)
     distance, std = np.abs(values - truth)[determined], std[determined]
     within_2, within_3 = (int((distance <= limit * std).sum()) for limit in (2.0, 3.0))
-    return CoverageResult(within_2=within_2, within_3=within_3, total=len(std))
+    return results.CoverageResult(within_2=within_2, within_3=within_3, total=len(std))
 
 
 def _judgement(
     joint_names: Sequence[str], evidence: Evidence, verdict: Verdict, nominal: str | None
-) -> JudgementResult:
+) -> results.JudgementResult:
     """What the verdict rests on."""
     checks, around, error = evidence.residuals, evidence.surroundings, evidence.held_out
     assert checks is not None
@@ -453,12 +433,12 @@ def _judgement(
         controller_inertia=None if inertia is None else inertia.ratio,
         controller_inertia_spread=None if inertia is None else inertia.spread,
     )
-    return JudgementResult.of(
+    return results.JudgementResult.of(
         in_sample=evidence.in_sample,
         nominal=None if evidence.nominal is None else nominal,
         findings=verdict.findings,
         next_steps=verdict.next_steps,
-        joints=[JointJudgement.of(**row) for row in rows],
+        joints=[results.JointJudgement.of(**row) for row in rows],
         speed=_profiles(checks.speed),
         position=_profiles(checks.position),
         lag=colour.lag[::step],
@@ -468,6 +448,8 @@ def _judgement(
     )
 
 
-def _profiles(profile: Profile) -> list[ProfileResult]:
+def _profiles(profile: Profile) -> list[results.ProfileResult]:
     columns = zip(profile.centres, profile.bins.mean, profile.bins.std, strict=True)
-    return [ProfileResult.of(centre=centre, mean=mean, std=std) for centre, mean, std in columns]
+    return [
+        results.ProfileResult.of(centre=centre, mean=mean, std=std) for centre, mean, std in columns
+    ]

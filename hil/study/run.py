@@ -19,40 +19,15 @@ from hil.simulation import planted_values, simulated_link, simulated_provenance
 from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
-from .campaigns import (
-    ABLATION,
-    B0,
-    EFFECTS,
-    LABELS,
-    LONGEST,
-    NO_EFFECTS,
-    A,
-    B,
-    Plans,
-    Search,
-    execute_all,
-    plan_study,
-    run_searches,
-    searches,
-)
+from . import campaigns, tables
 from .page import write_outcome
 from .records import PLANTED, FitRecord, Reader, ScoreRecord
 from .results import MotionRow, SearchResult, StudyResults
 from .settings import StudyFolder, StudySettings
-from .tables import (
-    Condition,
-    Evidence,
-    ablations,
-    condition_result,
-    estimates_of,
-    parameters_of,
-    printed_rows,
-    study_results,
-)
 
 _WORDS: Final = {
-    NO_EFFECTS: "without unmodelled effects",
-    EFFECTS: "with unmodelled effects",
+    campaigns.NO_EFFECTS: "without unmodelled effects",
+    campaigns.EFFECTS: "with unmodelled effects",
 }
 
 
@@ -86,15 +61,15 @@ def run_study(
     else:
         simulated_link(cell)  # refuses real hardware before anything is searched
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
-    with folder.locked(), LocalWorkers(workers, timeout=LONGEST) as processes:
+    with folder.locked(), LocalWorkers(workers, timeout=campaigns.LONGEST) as processes:
         folder.begin(settings)
-        wanted = searches(settings, len(cell.joint_names))
+        wanted = campaigns.searches(settings, len(cell.joint_names))
         with _stage("searches", times):
-            found = run_searches(folder, cell, wanted, reporter, workers)
+            found = campaigns.run_searches(folder, cell, wanted, reporter, workers)
         with _stage("plans", times):
-            plans = plan_study(folder, cell, settings, found)
+            plans = campaigns.plan_study(folder, cell, settings, found)
         with _stage("campaigns", times):
-            plans = plans.without(execute_all(plans.all, reporter, processes))
+            plans = plans.without(campaigns.execute_all(plans.all, reporter, processes))
         with _stage("estimates and predictions", times):
             reader = Reader(folder.fits, reporter, processes)
             results = _simulated(root, cell, settings, plans, found, reader)
@@ -115,40 +90,50 @@ def _simulated(
     root: Path,
     cell: Cell,
     settings: StudySettings,
-    plans: Plans,
-    found: Mapping[str, Search],
+    plans: campaigns.Plans,
+    found: Mapping[str, campaigns.Search],
     reader: Reader,
 ) -> StudyResults:
     """Read all archives that were not read before, and make the tables."""
     truth = planted_values(cell)
-    parameters, conditions = parameters_of(cell, truth), []
+    parameters, conditions = tables.parameters_of(cell, truth), []
     fits, scores = dict[str, dict[str, FitRecord]](), dict[str, dict[str, ScoreRecord]]()
     for name, some in plans.executions.items():
         roots = {key: one.root for key, one in some.items()}
         within = replace(reader, fits=reader.fits / name)
         fits[name] = within.fit(roots)
-        if name == ABLATION:
+        if name == campaigns.ABLATION:
             continue
-        scores[name] = within.score(roots, estimates_of(fits[name]) | {PLANTED: truth})
-        effects = tuple(json.loads(simulated_provenance(cell, name == EFFECTS)["effects"]))
-        condition = Condition(name, _WORDS[name], effects, drifts=name == EFFECTS)
-        conditions.append(condition_result(condition, LABELS, fits[name], scores[name], parameters))
-    sines, sizes, main = plans.searched[A], preset("b").search, fits[NO_EFFECTS]
-    evidence = Evidence(fits[ABLATION], main, scores[NO_EFFECTS], truth, sines)
-    varied, ranges = ablations(settings, evidence)
-    return study_results(
+        scores[name] = within.score(roots, tables.estimates_of(fits[name]) | {PLANTED: truth})
+        drifts = name == campaigns.EFFECTS
+        effects = tuple(json.loads(simulated_provenance(cell, drifts)["effects"]))
+        condition = tables.Condition(name, _WORDS[name], effects, drifts)
+        conditions.append(
+            tables.condition_result(
+                condition, campaigns.LABELS, fits[name], scores[name], parameters
+            )
+        )
+    sines, sizes, main = plans.searched[campaigns.A], preset("b").search, fits[campaigns.NO_EFFECTS]
+    evidence = tables.Evidence(
+        fits[campaigns.ABLATION], main, scores[campaigns.NO_EFFECTS], truth, sines
+    )
+    varied, ranges = tables.ablations(settings, evidence)
+    return tables.study_results(
         root,
         cell,
         truth,
         simulated=True,
         quick=settings.effort_b.tried < sizes.population * sizes.generations,
         settings=settings,
-        searches=[_search_result(one, chosen=key in (sines, B, B0)) for key, one in found.items()],
+        searches=[
+            _search_result(one, chosen=key in (sines, campaigns.B, campaigns.B0))
+            for key, one in found.items()
+        ],
         table1=[
             _row(key, found[plans.searched[key]].notes, one.plan.excitation, main[key])
-            for key, one in plans.executions[NO_EFFECTS].items()
+            for key, one in plans.executions[campaigns.NO_EFFECTS].items()
         ]
-        + printed_rows(cell),
+        + tables.printed_rows(cell),
         conditions=conditions,
         ablations=varied,
         ranges=ranges,
@@ -170,7 +155,7 @@ def _row(key: str, words: str, excitation: Excitation, record: FitRecord) -> Mot
     )
 
 
-def _search_result(search: Search, *, chosen: bool) -> SearchResult:
+def _search_result(search: campaigns.Search, *, chosen: bool) -> SearchResult:
     found, one = {"key": search.key, "words": search.words, "chosen": chosen}, search.excitation
     if one is None:
         return SearchResult.of(**found)
