@@ -28,6 +28,7 @@ from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.options import Options
+from hil.identify.sources import apart
 from hil.progress import Reporter
 from identification import RobotModel
 
@@ -227,10 +228,12 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
     for one in of.values():
         if one.arm != first.arm:
             here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
+            why = "one of them is a simulation, or their controllers state other drives"
+            if differing := apart(here.cell, there.cell):
+                why = f"they differ in {' and '.join(differing)}"
             raise InputError(
                 one.campaign,
-                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): "
-                f"{apart(here.cell, there.cell)}",
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): {why}",
                 remedy="compare campaigns of one arm",
             )
     if len(of) < 2:
@@ -240,20 +243,6 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
 def _cell(ref: ArchiveRef) -> Cell:
     with opened(ref) as archive:
         return cell_in(archive)
-
-
-def apart(one: Cell, other: Cell) -> str:
-    """What two arms differ in, in words."""
-    robots = [each.file.robot.model_dump(exclude={"payload"}) for each in (one, other)]
-    differ = {
-        "robot.urdf": one.urdf != other.urdf,
-        "[robot]": robots[0] != robots[1],
-        "[drive_train]": one.file.drive_train != other.file.drive_train,
-    }
-    words = " and ".join(name for name, differs in differ.items() if differs)
-    if not words:
-        return "one of them is a simulation, or their controllers state other drives"
-    return f"they differ in {words}"
 
 
 def compare_campaigns(gathered: Gathered) -> Comparison:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import file_digest
@@ -24,7 +23,7 @@ from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.settings import samples_of
-from hil.identify.sources import cell_of, gather_sources
+from hil.identify.sources import archives_in, cell_of, gather_sources
 from hil.progress import Reporter
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor
@@ -35,21 +34,20 @@ from .result import fingerprint
 Array = NDArray[np.float64]
 
 _MOTIONS: Final = ("excitation", "imported", "validation")
-_KINDS: Final = (*_MOTIONS, "standstill")
 
 
 def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowledge:
     """Identify from archives, and return what they say about each parameter.
 
     Args:
-        paths: one campaign folder, or archives.
+        paths: archives, or folders of them, of campaigns the whole ones.
         cell: for which a motion is going to be designed.
         reporter: shows how far it is, and of joints about whose noise nothing is known.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.
     """
-    archives = _archives(paths)
+    archives = list(archives_in(paths))
     _refuse_another_robot(archives, cell)
     # Of all that was recorded: nothing has to be predicted here. The law is that of the cell, whose
     # parameters the design is for.
@@ -93,22 +91,6 @@ def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tupl
             samples += share * float(factor.samples.max())
             task.advance(1, source.name)
     return gram, max(1, round(samples))
-
-
-def _archives(paths: Sequence[Path]) -> list[Path]:
-    """The archives of a folder, or those named."""
-    if len(paths) == 1 and paths[0].is_dir():
-        folder = CampaignFolder(paths[0])
-        found = [path for kind in _KINDS for path in folder.completed(kind)]
-        if found := found or sorted(paths[0].glob("*.mcap")):
-            return found
-        remedy = "name a campaign folder, or archives"
-        raise InputError(paths[0], "holds no whole archive", remedy=remedy)
-    for path in paths:
-        if path.is_dir():
-            remedy = "name one campaign folder, or files"
-            raise InputError(path, "is a folder among archives", remedy=remedy)
-    return list(paths)
 
 
 def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import (
@@ -28,7 +27,7 @@ from identification.model.robot import RobotModel
 from .options import Options
 from .prepared import prepare_sources
 from .settings import samples_of, signals_of
-from .sources import aligned, archives_in, gather_sources, refuse_duplicates
+from .sources import aligned, apart, archives_in, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
 
@@ -220,7 +219,11 @@ def find_payload(
         kind: gather_sources(paths, Options().split, in_sample=True)
         for kind, paths in sides.items()
     }
-    _refuse_other_arm(found[False].cell, found[True].cell, sides[True][0])
+    bare_cell, loaded_cell = found[False].cell, found[True].cell
+    if differing := apart(bare_cell, loaded_cell):
+        problem = f"is of another arm than {bare_cell.path}: {' and '.join(differing)} differ"
+        remedy = "name bare and loaded recordings of one arm"
+        raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
     paths = {path.name: path for path in (*sides[False], *sides[True])}
     training = (*found[False].training, *found[True].training)
     for source in training:
@@ -228,7 +231,7 @@ def find_payload(
             problem = "holds no joint torques, and a payload is weighed in their unit"
             remedy = "give drive.torque_constant in the column map"
             raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
-    cell = found[False].cell.without_payload()
+    cell = bare_cell.without_payload()
     if found[False].plan is None and found[True].plan is None:
         training, _ = aligned(training)
     first, last = training[: len(found[False].training)], training[len(found[False].training) :]
@@ -279,22 +282,6 @@ def flange_of(model: RobotModel) -> str:
     }
     named = next((name for name in _FLANGES if name in last), None)
     return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))
-
-
-def _refuse_other_arm(bare: Cell, loaded: Cell, path: Path) -> None:
-    """One arm with one drive train; only what it carries may differ."""
-    mine, other = (
-        {
-            "robot.urdf": cell.urdf,
-            "[robot]": cell.without_payload().file.robot,
-            "[drive_train]": cell.file.drive_train,
-        }
-        for cell in (bare, loaded)
-    )
-    if differing := [name for name in mine if mine[name] != other[name]]:
-        problem = f"is of another arm than {bare.path}: {' and '.join(differing)} differ"
-        remedy = "name bare and loaded recordings of one arm"
-        raise ArchiveError(path, problem, field="--loaded", remedy=remedy)
 
 
 def _mixed(found: Difference, path: Path) -> InputError:

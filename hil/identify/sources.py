@@ -93,6 +93,17 @@ def cell_of(archive: Archive) -> Cell:
     return Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
 
 
+def apart(one: Cell, other: Cell) -> list[str]:
+    """What two cells describe differently of the arm; what it carries may differ."""
+    parts = (
+        {"robot.urdf": cell.urdf, "[robot]": cell.without_payload().file.robot}
+        | {"[drive_train]": cell.file.drive_train}
+        for cell in (one, other)
+    )
+    mine, theirs = parts
+    return [name for name in mine if mine[name] != theirs[name]]
+
+
 def gather_sources(
     paths: Sequence[Path], split: float, predict: Sequence[Path] = (), *, in_sample: bool = False
 ) -> Sources:
