@@ -11,15 +11,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.identify.estimating import fit_of
+from hil.identify.estimating import centre_of, fit_of
 from hil.identify.settings import Settings
 from identification import IdentificationError
-from identification.estimators.consistent import (
-    Shrinkage,
-    SolverError,
-    consistent_estimate,
-    fit_shrunk,
-)
+from identification.estimators.consistent import Shrinkage, fit_shrunk
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.least_squares import no_narrower
 from identification.factor.factor import (
@@ -103,14 +98,7 @@ class Estimator:
             raise IdentificationError(nothing_usable(self.model))
         if self._shrinkage.strength == 0.0:
             return None
-        weight = self._shrinkage.prior_weight
-        try:
-            found = consistent_estimate(
-                self.model, total, weights=joint_weights(total), prior_weight=weight
-            )
-        except SolverError:
-            return None  # least squares, as `hil identify` does it
-        return found.estimate.values
+        return centre_of(self.model, total, self._shrinkage)[0]
 
     def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
         """The estimate from one archive alone, shrunk towards the centre of all.
@@ -118,13 +106,9 @@ class Estimator:
         Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
         repetitions is about noise. A summary has no blocks of time: the covariance of what is
         shrunk is that of the free estimate, shrunk alike.
-
-        Raises:
-            ValueError: the archive was not fitted.
         """
         own, total = summary.fit, summary.total.total
-        if own is None:
-            raise ValueError(f"{summary.ref.location} was not fitted")
+        assert own is not None, "it was fitted"
         if centre is None or math.isinf(self._shrinkage.strength):
             return own
         shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)

@@ -42,7 +42,7 @@ from identification.estimators.prior import (
     nominal_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.factor.factor import QR_CONDITION, Estimate, nothing_usable
+from identification.factor.factor import QR_CONDITION, Estimate, Factor, nothing_usable
 from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
@@ -235,6 +235,17 @@ def fit_of(
     return fit
 
 
+def centre_of(
+    model: RobotModel, total: Factor, shrinkage: Shrinkage
+) -> tuple[Array | None, list[str]]:
+    """The consistent solution, which estimates are shrunk towards (p,); warnings where none is."""
+    try:
+        found = consistent_estimate(model, total, prior_weight=shrinkage.prior_weight)
+    except SolverError as error:
+        return None, [f"least squares is reported, for {error}"]
+    return found.estimate.values, []
+
+
 def _by_factor(
     model: RobotModel,
     fitted: Sequence[Samples],
@@ -242,16 +253,12 @@ def _by_factor(
     shrinkage: Shrinkage,
     prior: GaussianPrior | str,
 ) -> tuple[RepeatedEstimate, list[str]]:
-    centre, warnings, free = None, list[str](), name == "consistent"
+    centre, warnings = None, list[str]()
     if name == "auto" and shrinkage.strength > 0.0:
-        total = total_phase(model, fitted).total
-        try:
-            found = consistent_estimate(model, total, prior_weight=shrinkage.prior_weight)
-            centre, free = found.estimate.values, math.isinf(shrinkage.strength)
-        except SolverError as error:
-            warnings = [f"least squares is reported, for {error}"]
+        centre, warnings = centre_of(model, total_phase(model, fitted).total, shrinkage)
     own = required(prior) if name == "prior" else None
     fit = fit_of(model, name, shrinkage, centre, own)
+    free = name == "consistent" or (centre is not None and math.isinf(shrinkage.strength))
     try:
         # The scatter over repetitions is about noise: no need of a program for each.
         each = fit_of(model, "wls") if free else fit

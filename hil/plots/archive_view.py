@@ -25,19 +25,7 @@ from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
 from hil.plots.plan_picture import broken
-from hil.report.drawing import (
-    FIRST,
-    INK,
-    ROUTES,
-    SECOND,
-    Caption,
-    Panel,
-    Plot,
-    label,
-    runs,
-    time_panel,
-)
-from hil.report.drawing import Trace as Line
+from hil.report import drawing
 from hil.report.rendering import environment, page_bytes
 from hil.terminal_text import plural
 from identification.errors import ModelError
@@ -64,11 +52,11 @@ _FIELDS: Final = (
 )  # fmt: skip
 _SECONDS: Final = "time since the first sample [s]"
 _COLOURS: Final = {
-    "position": (FIRST, style.POSITION),
-    "speed": (SECOND, style.VELOCITY),
-    "motor current": (ROUTES[3], style.ACCELERATION),
-    "torque at the joint": (INK, "#5b3a8c"),
-    "following error": (ROUTES[0], style.INK),
+    "position": (drawing.FIRST, style.POSITION),
+    "speed": (drawing.SECOND, style.VELOCITY),
+    "motor current": (drawing.ROUTES[3], style.ACCELERATION),
+    "torque at the joint": (drawing.INK, "#5b3a8c"),
+    "following error": (drawing.ROUTES[0], style.INK),
 }
 """Of the lines on the page, and in the picture."""
 # px, of the page
@@ -315,7 +303,7 @@ def _collect(
     with np.errstate(over="ignore", invalid="ignore"):
         for name, values in scales.shown(columns):
             for line, joint in zip(lines[name], joints, strict=True):
-                for t, v in runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
+                for t, v in drawing.runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
                     if line and t[0] - line[-1][0][-1] > leap:
                         line.append((np.array([np.nan]), np.array([np.nan])))
                     line.append((t, v))
@@ -389,23 +377,23 @@ def _stretches(recorded: Trace) -> list[tuple[Array, Array]]:
     return [(t, v) for t, v in finite if t.size]
 
 
-def _panel(view: ArchiveView, j: int) -> Panel:
+def _panel(view: ArchiveView, j: int) -> drawing.Panel:
     length = max(view.stop - view.start, 1e-9)
     most = max((q.traces[j].time.size for q in view.quantities), default=0)
     grid = np.linspace(view.start, view.start + length, 2 * max(1, min(_BINS, most // 2)))
     plots, shares = [], []
     for k, quantity in enumerate(view.quantities):
         recorded, name = quantity.traces[j], quantity.title.partition(" [")[0]
-        line = Line(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
+        line = drawing.Trace(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
         box = (_LEFT, _TOP + k * _STEP, _WIDTH - _LEFT - _RIGHT, _PLOT)
-        plots.append(Plot(box, quantity.title, [line], recorded.limits))
+        plots.append(drawing.Plot(box, quantity.title, [line], recorded.limits))
         shares += [f"{name} {share}"] if (share := _share(recorded)) else []
     note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
     what = ", ".join(plot.heading for plot in plots)
-    caption = Caption(f"a{j}", label(view.joint_names[j]), note, what)
+    caption = drawing.Caption(f"a{j}", drawing.label(view.joint_names[j]), note, what)
     height = _TOP + max(1, len(plots)) * _STEP + _BOTTOM
     marks = [*(time for time, _, _, _ in view.events), *view.gaps[:_MOST_GAPS].tolist()]
-    return time_panel(
+    return drawing.time_panel(
         height, grid, plots, caption, grid.size, width=_WIDTH, foot=_SECONDS, marks=marks
     )
 
@@ -459,7 +447,7 @@ def draw_archive(view: ArchiveView) -> Figure:
                 share = f"{share} % of limit" if (share := _share(trace)) else ""
                 axes.set_title("\n".join(filter(None, (title, share))), loc="left")
                 axes.set_xlabel(_SECONDS if j == rows - 1 else "")
-                axes.set_ylabel("" if k else broken(label(view.joint_names[j])))
+                axes.set_ylabel("" if k else broken(drawing.label(view.joint_names[j])))
         simulated = "SIMULATED" if facts.metadata.get("simulated") == "yes" else ""
         packets = view.missed and f"packets: {view.missed}"
         parts = (simulated, view.frame, packets, facts.lost, facts.damage, "red dashes: limits")

@@ -10,27 +10,14 @@ import numpy as np
 
 from hil.files import write_together
 from hil.progress import Reporter
-from hil.report.drawing import (
-    FIRST,
-    ROUTES,
-    SECOND,
-    WIDE,
-    Caption,
-    Panel,
-    Plot,
-    Trace,
-    box_panel,
-    panel,
-    ruled,
-    time_panel,
-)
+from hil.report import drawing
 from hil.report.figures import matrix_panel
 from hil.report.numbers import significant
 from hil.report.rendering import environment, page_bytes
 
 from .results import ConditionResult, StudyResults
 
-COLOURS: Final = (FIRST, SECOND, ROUTES[3], ROUTES[0])
+COLOURS: Final = (drawing.FIRST, drawing.SECOND, drawing.ROUTES[3], drawing.ROUTES[0])
 _VARIABLES: Final = ("--first", "--second", "--route-3", "--route-0")
 
 
@@ -70,24 +57,24 @@ def study_page(results: StudyResults) -> bytes:
     return page_bytes(text)
 
 
-def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
+def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """Position of each joint in each excitation, on scales in common (Fig. 1)."""
-    panels: list[Panel] = []
+    panels: list[drawing.Panel] = []
     for j, name in enumerate(joint_names):
         spans = [
             f"{one.label} {math.degrees(min(one.position[j])):.0f}° to"
             f" {math.degrees(max(one.position[j])):.0f}°"
             for one in condition.methods
         ]
-        caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
-        with panel(panels, 170.0, caption, "position [rad]", "time [s]") as axes:
+        caption = drawing.Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
+        with drawing.panel(panels, 170.0, caption, "position [rad]", "time [s]") as axes:
             for k, one in enumerate(condition.methods):
                 axes.plot(one.time, one.position[j], color=COLOURS[k % 4], linewidth=1.3)
-            ruled(axes, "both", x_ticks=6)
+            drawing.ruled(axes, "both", x_ticks=6)
     return panels
 
 
-def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
+def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """Mean |e| on fly-by motions, a box for each estimate and a panel for each joint (Fig. 3)."""
     found = next(one for one in condition.classes if one.motion_class == "fly-by")
     errors = [np.array(found.mean_abs[one.key]) for one in condition.methods]
@@ -98,33 +85,37 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
             f"{one.label} {significant(float(np.median(own[:, j])))}"
             for one, own in zip(condition.methods, errors, strict=True)
         )
-        caption = Caption(f"b{condition.key}{j}", name, f"medians {medians}", "mean |e| in N·m")
+        caption = drawing.Caption(
+            f"b{condition.key}{j}", name, f"medians {medians}", "mean |e| in N·m"
+        )
         columns, colours = [own[:, j] for own in errors], COLOURS[: len(errors)]
-        panels.append(box_panel(caption, columns, colours, "mean |e| [N·m]", labels))
+        panels.append(drawing.box_panel(caption, columns, colours, "mean |e| [N·m]", labels))
     return panels
 
 
-def _examples(condition: ConditionResult, joint_names: list[str]) -> list[Panel]:
+def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
     """One held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
     (example,) = condition.examples
     time, panels = np.array(example.time), []
     for j, name in enumerate(joint_names):
         measured = np.array(example.measured[j])
         lines = [
-            Trace(np.array(series[j]), COLOURS[k], 1.1, condition.labels[key], dashed=k == 1)
+            drawing.Trace(
+                np.array(series[j]), COLOURS[k], 1.1, condition.labels[key], dashed=k == 1
+            )
             for k, (key, series) in enumerate(example.predicted.items())
         ]
         errors = [measured - one.values for one in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-        both = [Trace(measured, WIDE, 4.0, "measured"), *lines]
-        plots, rms = [Plot((46.0, 20.0, 314.0, 128.0), "torque [N·m]", both)], []
+        both = [drawing.Trace(measured, drawing.WIDE, 4.0, "measured"), *lines]
+        plots, rms = [drawing.Plot((46.0, 20.0, 314.0, 128.0), "torque [N·m]", both)], []
         # A row for each error: where there is noise, one line over another would hide it.
         for row, (one, error) in enumerate(zip(lines, errors, strict=True)):
             box, heading = (46.0, 172.0 + 72.0 * row, 314.0, 48.0), f"measured − {one.name} [N·m]"
-            trace = Trace(error, one.colour, 1.0, one.name)
-            plots.append(Plot(box, heading, [trace], reach=reach))
+            trace = drawing.Trace(error, one.colour, 1.0, one.name)
+            plots.append(drawing.Plot(box, heading, [trace], reach=reach))
             rms.append(f"{one.name} {significant(float(np.sqrt(np.mean(error**2))))}")
         note, what = f"RMS error {', '.join(rms)} N·m", "measured and predicted torque"
-        caption = Caption(f"e{condition.key}{j}", name, note, what)
-        panels.append(time_panel(188.0 + 72.0 * len(errors), time, plots, caption))
+        caption = drawing.Caption(f"e{condition.key}{j}", name, note, what)
+        panels.append(drawing.time_panel(188.0 + 72.0 * len(errors), time, plots, caption))
     return panels
