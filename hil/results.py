@@ -46,6 +46,18 @@ class Frozen(BaseModel):
             }
         )
 
+    @classmethod
+    def rows(cls, **columns: Any) -> list[Self]:
+        """One for each entry of columns, the first of which is there; a column of None is None."""
+        lists = {
+            name: values.tolist() if isinstance(values, np.ndarray) else values
+            for name, values in columns.items()
+        }
+        return [
+            cls.of(**{name: values and values[k] for name, values in lists.items()})
+            for k in range(len(next(iter(lists.values()))))
+        ]
+
     def to_json(self) -> str:
         """As indented JSON, the text of a file."""
         return self.model_dump_json(indent=1) + "\n"

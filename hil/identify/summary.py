@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,30 +167,25 @@ def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.Co
         unconstrained_in_sample=found.unconstrained_relative_error,
         shift=found.shift,
         status=found.status,
-        links=[
-            results.LinkResult.of(
-                joint=joint,
-                mass=float(inertial[k, 9]),
-                centre=np.divide(inertial[k, 6:9], inertial[k, 9]),
-                rotor_inertia=standard.get(f"I{k + 1}m"),
-                room=float(check.room[k]),
-                reference=found.reference[k],
-            )
-            for k, joint in enumerate(model.joint_names)
-        ],
+        links=results.LinkResult.rows(
+            joint=model.joint_names,
+            mass=inertial[:, 9],
+            centre=inertial[:, 6:9] / inertial[:, 9:],
+            rotor_inertia=[standard.get(f"I{k + 1}m") for k in range(model.n_joints)],
+            room=check.room,
+            reference=found.reference,
+        ),
     )
 
 
 def essential_result(choice: EssentialChoice) -> results.EssentialResult:
     """As it goes into `results.json`."""
     left = choice.elimination.estimate
-    columns = left.names, left.units, left.values.tolist(), left.std.tolist()
     return results.EssentialResult.of(
         choice.elimination,
-        parameters=[
-            results.EssentialParameter(name=name, unit=unit, estimate=value, std=std)
-            for name, unit, value, std in zip(*columns, strict=True)
-        ],
+        parameters=results.EssentialParameter.rows(
+            name=left.names, unit=left.units, estimate=left.values, std=left.std
+        ),
         by_spread_left=choice.by_spread.left,
         by_spread_held_out=choice.by_spread.held_out,
         blind=choice.blind,
@@ -314,7 +309,7 @@ def _parameters(
     printed = {row.pivot or row.parameter: row.id for row in TABLE2}
     ours = cell.urdf != URDF_PATH.read_text(encoding="utf-8")
     known = None if isinstance(posterior, str) else posterior
-    rows = _rows(
+    return results.ParameterResult.rows(
         name=model.parameter_names,
         expression=[*model.base.expressions(), *model.parameter_names[len(model.base.names) :]],
         unit=model.units,
@@ -330,23 +325,6 @@ def _parameters(
         prior_ratio=known and known.ratio,
         learned=known and known.learned,
     )
-    return [results.ParameterResult.of(**row) for row in rows]
-
-
-def _rows(**columns: Any) -> list[dict[str, Any]]:
-    """A record for each entry of columns of equal length, the first of which is there.
-
-    Arrays give Python's own numbers; a column that is None gives None throughout.
-    """
-    lists = {
-        name: values.tolist() if isinstance(values, np.ndarray) else values
-        for name, values in columns.items()
-    }
-    count = len(next(iter(lists.values())))
-    return [
-        {name: None if values is None else values[k] for name, values in lists.items()}
-        for k in range(count)
-    ]
 
 
 def _validation(prepared: Prepared, values: Array) -> list[results.ValidationResult]:
@@ -414,11 +392,16 @@ def _judgement(
     joint_names: Sequence[str], evidence: Evidence, verdict: Verdict, nominal: str | None
 ) -> results.JudgementResult:
     """What the verdict rests on."""
+
+    def profile(one: Profile) -> list[results.ProfileResult]:
+        bins = one.bins
+        return results.ProfileResult.rows(centre=one.centres, mean=bins.mean, std=bins.std)
+
     checks, around, error = evidence.residuals, evidence.surroundings, evidence.held_out
     assert checks is not None
     colour, drift, inertia = checks.colour, checks.drift, around.controller_inertia
     step = max(1, -(-len(colour.lag) // _LAGS))
-    rows = _rows(
+    joints = results.JointJudgement.rows(
         joint=joint_names,
         unit=["N·m" if evidence.revolute(j) else "N" for j in range(len(joint_names))],
         rms=error.rms,
@@ -438,18 +421,11 @@ def _judgement(
         nominal=None if evidence.nominal is None else nominal,
         findings=verdict.findings,
         next_steps=verdict.next_steps,
-        joints=[results.JointJudgement.of(**row) for row in rows],
-        speed=_profiles(checks.speed),
-        position=_profiles(checks.position),
+        joints=joints,
+        speed=profile(checks.speed),
+        position=profile(checks.position),
         lag=colour.lag[::step],
         autocorrelation=colour.correlation[::step].T,
         effective_rows=np.nan_to_num(colour.effective_rows),
         friction_over_time=None if drift is None else drift.share.T,
     )
-
-
-def _profiles(profile: Profile) -> list[results.ProfileResult]:
-    columns = zip(profile.centres, profile.bins.mean, profile.bins.std, strict=True)
-    return [
-        results.ProfileResult.of(centre=centre, mean=mean, std=std) for centre, mean, std in columns
-    ]
