@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Final
@@ -89,8 +90,10 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
     """
     columns, names = archive.columns, archive.joint_names
     stamp = np.asarray(columns["stamp"], np.int64)
-    begin = _recorded_at(archive)
-    shift = 0 if begin is None else begin - int(stamp[0])
+    shift = 0
+    with suppress(ValueError):  # virtual time has no date
+        begin = datetime.fromisoformat(archive.header.recorded_at or "").timestamp()
+        shift = round(begin) * 10**9 - int(stamp[0])
     first = int(stamp[0]) + shift
     words = {"position": "position", "velocity": "velocity", "effort": "torque"}
     states = {schema.MEASURED: (stamp, {w: columns[c] for w, c in words.items() if c in columns})}
@@ -121,11 +124,3 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
         writer.flush()
     writer.finish()
     return b"".join(content)
-
-
-def _recorded_at(archive: Archive) -> int | None:
-    """Time of day at which it began [ns since 1970]; None of virtual time."""
-    try:
-        return round(datetime.fromisoformat(archive.header.recorded_at or "").timestamp()) * 10**9
-    except ValueError:
-        return None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 import numpy as np
 
@@ -112,7 +112,11 @@ def _series_bytes(series: ReportSeries) -> bytes:
 def _load_series(path: Path, n_joints: int) -> ReportSeries:
     try:
         with opened(path) as stream:
-            _require_bounded(stream)
+            with zipfile.ZipFile(stream) as members:
+                size = sum(member.file_size for member in members.infolist())
+            if size > _LARGEST:
+                raise ValueError(f"it would take {size} bytes")
+            stream.seek(0)
             with np.load(stream, allow_pickle=False) as found:
                 arrays = {name: found[name] for name in found.files}
         words = {name: str(one) for name, one in arrays.items() if name in _WORDS}
@@ -122,15 +126,6 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
         problem = f"does not hold the series of a report ({error})"
         remedy = "identify again from the archives (`hil identify`)"
         raise InputError(path, problem, remedy=remedy) from error
-
-
-def _require_bounded(stream: BinaryIO) -> None:
-    """Refuse a file that would become much larger than any of ours."""
-    with zipfile.ZipFile(stream) as members:
-        size = sum(member.file_size for member in members.infolist())
-    if size > _LARGEST:
-        raise ValueError(f"it would take {size} bytes")
-    stream.seek(0)
 
 
 URDF = "identified.urdf"

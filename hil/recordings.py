@@ -90,6 +90,11 @@ def recording_of(archive: Archive) -> Recording:
             remedy="record it again",
         )
     imported, own = archive.kind == "imported", archive.header.controllers_own
+    provenance = {"archive": archive.path.name, **archive.header.entries}
+    for key, value in (archive.outcome.entries if archive.outcome else {}).items():
+        provenance[key if key == "outcome" else f"outcome.{key}"] = value
+    if archive.missing is not None:
+        provenance["missing"] = archive.missing
     return Recording(
         time=_time(archive),
         position=columns["position"],
@@ -102,7 +107,7 @@ def recording_of(archive: Archive) -> Recording:
         commanded_position=columns.get("target_position" if own else "commanded_position"),
         gap_before=_gaps(archive),
         held_joints=archive.header.held_joints,
-        provenance=_provenance(archive),
+        provenance=provenance,
     )
 
 
@@ -142,12 +147,3 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
 def _known(torque: Array | None) -> Array | None:
     """None where the recording has no torque at all."""
     return None if torque is None or np.isnan(torque).all() else torque
-
-
-def _provenance(archive: Archive) -> dict[str, str]:
-    provenance = {"archive": archive.path.name, **archive.header.entries}
-    for key, value in (archive.outcome.entries if archive.outcome else {}).items():
-        provenance[key if key == "outcome" else f"outcome.{key}"] = value
-    if archive.missing is not None:
-        provenance["missing"] = archive.missing
-    return provenance

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -263,7 +264,12 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
         for own in gathered.repetitions
     ]
     values = [(one.values, one.std) for one in campaigns]
-    prediction = _prediction(campaigns)
+    prediction = np.full((len(campaigns), len(campaigns)), np.nan)
+    for (row, one), (column, motion) in product(enumerate(campaigns), repeat=2):
+        # What a model cannot know may be needed there.
+        if motion.unseen is not None and np.isfinite(one.std).all():
+            left, torque = errors(motion.unseen, one.values)
+            prediction[row, column] = relative_error(left, torque, motion.unseen.samples)
     changed = [axes[j].joint for j in np.flatnonzero(friction.changed.any(axis=1))]
     slight = [axes[j].joint for j in np.flatnonzero(friction.slight.any(axis=1))]
     parts = [f"friction of {', '.join(changed)}"] if changed else []
@@ -309,17 +315,6 @@ def _known(
             for k in range(len(pooled[0][0]))
         ]
     )
-
-
-def _prediction(campaigns: Sequence[LevelEstimate]) -> Array:
-    found = np.full((len(campaigns), len(campaigns)), np.nan)
-    for column, motion in enumerate(campaigns):
-        for row, one in enumerate(campaigns):
-            # What a model cannot know may be needed there.
-            if motion.unseen is not None and np.isfinite(one.std).all():
-                left, torque = errors(motion.unseen, one.values)
-                found[row, column] = relative_error(left, torque, motion.unseen.samples)
-    return found
 
 
 def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:

@@ -48,7 +48,13 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
         InputError: archives that cannot be identified from, or of another robot.
     """
     archives = list(archives_in(paths))
-    _refuse_another_robot(archives, cell)
+    recorded = cell_of(open_archive(archives[0]))
+    theirs, ours = fingerprint(recorded), fingerprint(cell)
+    for part in ("urdf", "robot"):  # else the parameters are other ones
+        if theirs[part] != ours[part]:
+            problem = f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}"
+            remedy = "name archives of this robot, in the same description"
+            raise InputError(archives[0], problem, field="--earlier", remedy=remedy)
     # Of all that was recorded: nothing has to be predicted here. The law is that of the cell, whose
     # parameters the design is for.
     sources = gather_sources(archives, FIXED.split, in_sample=True)
@@ -91,17 +97,6 @@ def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tupl
             samples += share * float(factor.samples.max())
             task.advance(1, source.name)
     return gram, max(1, round(samples))
-
-
-def _refuse_another_robot(archives: Sequence[Path], cell: Cell) -> None:
-    """The parameters of archives and cell are the same ones."""
-    recorded = cell_of(open_archive(archives[0]))
-    theirs, ours = fingerprint(recorded), fingerprint(cell)
-    for part in ("urdf", "robot"):
-        if theirs[part] != ours[part]:
-            problem = f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}"
-            remedy = "name archives of this robot, in the same description"
-            raise InputError(archives[0], problem, field="--earlier", remedy=remedy)
 
 
 def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:

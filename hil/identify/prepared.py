@@ -62,7 +62,12 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was asked for and there is not one usable row.
     """
-    notes = _time_bases(sources)
+    notes = []
+    for source in (*sources.training, *sources.held_out):
+        notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
+        base = time_base(source.recording.time, source.recording.gap_before)
+        if not base.uniform or base.gaps:  # not as even as a filter would like it
+            notes.append(f"{source.name}: {'; '.join(base.describe())}")
     sources, noise = with_noise(sources)
     sources = with_torques(sources)
     decided = decide(sources, options, reporter)
@@ -101,17 +106,6 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         rows=rows,
         notes=(*notes, noise, *decided.notes, *_left_out(sources, masked, rows)),
     )
-
-
-def _time_bases(sources: Sources) -> list[str]:
-    """A sentence for each recording whose clock is not as even as a filter would like it."""
-    notes = []
-    for source in (*sources.training, *sources.held_out):
-        notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
-        base = time_base(source.recording.time, source.recording.gap_before)
-        if not base.uniform or base.gaps:
-            notes.append(f"{source.name}: {'; '.join(base.describe())}")
-    return notes
 
 
 def _left_out(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: int) -> list[str]:

@@ -112,6 +112,7 @@ def samples_of(
         RecordingError: the recording cannot be prepared.
     """
     recording, start = source.context or (source.recording, 0)
+    driven = cell.file.drive_train is not None
     whole = prepare(
         recording,
         model or cell.model,
@@ -119,7 +120,7 @@ def samples_of(
         torque_variance=_array(settings.torque_variance),
         options=settings.preprocessing,
         origin=source.origin,
-        current_limit=_current_limit(cell),
+        current_limit=np.array(cell.drive_table.current_limit) if driven else None,
     )
     if source.context is None:
         return whole
@@ -137,11 +138,6 @@ def judged_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
 
 def _array(figures: tuple[float, ...] | None) -> Array | None:
     return None if figures is None else np.array(figures)
-
-
-def _current_limit(cell: Cell) -> Array | None:
-    """Largest current of each motor (n,) [A]; None where no drive train is known."""
-    return None if cell.file.drive_train is None else np.array(cell.drive_table.current_limit)
 
 
 MOST_READ: Final = 32
@@ -192,10 +188,21 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     settings, found = stated, _delays(sources, stated, options, reporter)
     suggested: tuple[float, ...] = ()
     if found is not None and options.delay == "auto":
-        settings, notes = _compensated(stated, found)
-    elif found is not None and options.delay is None and _other(sources, found):
         notes = _described(found)
-        suggested = (found.common,) if found.significant else ()
+        if found.significant and found.agree:  # one delay moves the motion, several the torques
+            settings = stated.preprocessed(torque_delay=found.common)
+            notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
+        elif found.significant:
+            applied = tuple(found.applied.tolist())
+            settings = replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0)
+            notes.append("each axis was compensated by its own delay")
+    elif found is not None and options.delay is None:
+        # That of a controller is known: only what is well determined and differs by more than the
+        # estimate errs in closed loop is another one.
+        far = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+        if sources.cell.file.controller is None or (far and found.determined.all()):
+            notes = _described(found)
+            suggested = (found.common,) if found.significant else ()
     assumed = settings.preprocessing.torque_delay
     chosen = _chosen(sources, settings, suggested, options, reporter)
     how = chosen.preprocessing
@@ -348,26 +355,3 @@ def _described(found: DelayEstimate) -> list[str]:
     if not found.significant:
         notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
     return notes
-
-
-def _compensated(stated: Settings, found: DelayEstimate) -> tuple[Settings, list[str]]:
-    """Settings that compensate delays: one moves the motion, several the torques; and words."""
-    notes = _described(found)
-    if not found.significant:
-        return stated, notes
-    if found.agree:
-        notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
-        return stated.preprocessed(torque_delay=found.common), notes
-    notes.append("each axis was compensated by its own delay")
-    applied = tuple(found.applied.tolist())
-    return replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0), notes
-
-
-def _other(sources: Sources, found: DelayEstimate) -> bool:
-    """Whether a delay that was found replaces the cell's.
-
-    That of a controller is known: only what is well determined and differs by more than the
-    estimate errs in closed loop is another one.
-    """
-    apart = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
-    return sources.cell.file.controller is None or (apart and bool(found.determined.all()))
