@@ -168,12 +168,17 @@ def draw_plan(
                 if show:
                     _number(axes, number, time)
         figure.align_ylabels([row[0] for row in rows])
+        duration, stopping = plan.duration, plan.duration_with_stops
+        share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""
+        count = np.unique([target.how for target in plan.targets[:-1]], return_counts=True)
+        passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
+        headline = " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))
         legend = (
             "red dashes: limits; shaded: corners; line at each numbered target: solid flown by as "
             "asked, dashed less than asked, dotted stop; circles: targets"
         )
         for text, at, size, colour in (
-            (_headline(plan, title), 0.3, style.TITLE, style.INK),
+            (headline, 0.3, style.TITLE, style.INK),
             (legend, 0.52, style.SMALL + 0.5, style.MUTED),
         ):
             figure.text(0.08, 1.0 - at / height, text, fontsize=size, color=colour)
@@ -208,11 +213,3 @@ def save(figure: Figure, path: Path) -> None:
         write_atomically(path, content.getvalue())
     except OSError as error:
         raise InputError(path, f"cannot be written ({error.strerror})") from error
-
-
-def _headline(plan: MotionPlan, title: str) -> str:
-    duration, stopping = plan.duration, plan.duration_with_stops
-    share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""
-    count = np.unique([target.how for target in plan.targets[:-1]], return_counts=True)
-    passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
-    return " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))

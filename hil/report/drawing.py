@@ -111,14 +111,6 @@ def place(figure: Figure, left: float, top: float, width: float, height: float) 
     return axes
 
 
-def plot_panel(
-    height: float, *, left: float = 46.0, right: float = 10.0, bottom: float = 40.0
-) -> tuple[Figure, Axes]:
-    """A figure of the page's usual width with one plot, and the room for its labels [px]."""
-    figure = blank(PANEL_WIDTH, height)
-    return figure, place(figure, left, _TOP, PANEL_WIDTH - left - right, height - _TOP - bottom)
-
-
 def log_ticks(axis: Axis, locator: Locator) -> None:
     """Ticks of a logarithmic axis as decimal numbers, and none between them."""
     axis.set_major_locator(locator)
@@ -352,20 +344,18 @@ def panel(
     caption: Caption,
     heading: str = "",
     foot: str = "",
-    **room: float,
+    *,
+    left: float = 46.0,
+    right: float = 10.0,
+    bottom: float = 40.0,
 ) -> Iterator[Axes]:
-    """Axes of a :func:`plot_panel` to draw on; what was drawn is then added to some panels.
+    """Axes to draw on, of the page's usual width; what was drawn is then added to some panels.
 
-    Args:
-        panels: it becomes the last of them.
-        height: of the figure [px].
-        caption: of the panel.
-        heading: above the axes: the quantity and its unit.
-        foot: below the axes.
-        room: for labels, see :func:`plot_panel`.
+    Above the axes stands the quantity and its unit; beside them there is room for labels [px].
     """
     with drawing():
-        figure, axes = plot_panel(height, **room)
+        figure = blank(PANEL_WIDTH, height)
+        axes = place(figure, left, _TOP, PANEL_WIDTH - left - right, height - _TOP - bottom)
         yield axes
         if heading:
             headed(axes, heading)

@@ -218,9 +218,8 @@ _SHOWN: Final = (0.5, 99.5)
 
 def friction_curve_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
     """Friction law of each joint through zero, with the data behind it."""
-    if series.law_speed.size == 0:
-        return []
-    return [_curve(series, one) for one in joints if np.ptp(series.law_speed[:, one.number])]
+    known = joints if series.law_speed.size else ()
+    return [_curve(series, one) for one in known if np.ptp(series.law_speed[:, one.number])]
 
 
 def _curve(series: ReportSeries, joint: Joint) -> Panel:
