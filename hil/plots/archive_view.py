@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -110,6 +109,11 @@ class ArchiveView:
         if not self.states:
             return ""
         return f"missed at {plural(len(self.gaps), 'place')}" if len(self.gaps) else "none missed"
+
+    def marks(self, warning: str, other: str) -> list[tuple[float, str]]:
+        """Events and missed packets [s], each with one of two colours."""
+        events = [(at, warning if warns else other) for at, _, _, warns in self.events]
+        return [*events, *((float(gap), other) for gap in self.gaps[:_MOST_GAPS])]
 
 
 def view_of(
@@ -392,7 +396,7 @@ def _panel(view: ArchiveView, j: int) -> drawing.Panel:
     what = ", ".join(plot.heading for plot in plots)
     caption = drawing.Caption(f"a{j}", drawing.label(view.joint_names[j]), note, what)
     height = _TOP + max(1, len(plots)) * _STEP + _BOTTOM
-    marks = [*(time for time, _, _, _ in view.events), *view.gaps[:_MOST_GAPS].tolist()]
+    marks = view.marks(drawing.OUTSIDE_3, drawing.MUTED)
     return drawing.time_panel(
         height, grid, plots, caption, grid.size, width=_WIDTH, foot=_SECONDS, marks=marks
     )
@@ -406,29 +410,11 @@ def archive_page(view: ArchiveView) -> bytes:
     return page_bytes(text)
 
 
-def _surround(axes: Axes, view: ArchiveView, recorded: Trace) -> None:
-    """Limits that are within reach, events, and packets that were missed."""
-    low, high = axes.get_ylim()
-    least = 1e-3 * max(abs(low), abs(high), 1e-6)
-    if high - low < least:  # noise at rest does not fill the page
-        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
-    for bound in recorded.limits:
-        if low <= bound <= high:
-            axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
-    for at, _, _, warns in view.events:
-        colour = style.LIMIT if warns else style.MUTED
-        axes.axvline(at, color=colour, linewidth=0.8, linestyle=(0, (1, 2)))
-    for gap in view.gaps[:_MOST_GAPS]:
-        axes.axvline(gap, color=style.MUTED, linewidth=0.6, alpha=0.7)
-    axes.set_ylim(low, high)
-    axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
-    axes.ticklabel_format(axis="y", useOffset=False)
-
-
 def draw_archive(view: ArchiveView) -> Figure:
     """A picture with one row per joint and one column per quantity."""
     rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
     width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
+    marks = view.marks(style.LIMIT, style.MUTED)
     with style.page():
         figure = Figure(figsize=(width, height))
         grid = figure.add_gridspec(
@@ -440,7 +426,8 @@ def draw_archive(view: ArchiveView) -> Figure:
             for j, trace in enumerate(quantity.traces):
                 axes = figure.add_subplot(grid[j, k])
                 axes.plot(trace.time, trace.value, color=colour, linewidth=1.0)
-                _surround(axes, view, trace)
+                drawing.marked(axes, trace.limits, style.LIMIT, marks)
+                axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
                 style.bare(axes)
                 axes.tick_params(labelbottom=j == rows - 1)
                 title = quantity.title if j == 0 else ""

@@ -364,6 +364,22 @@ def panel(
         panels.append(to_panel(figure, caption))
 
 
+def marked(
+    axes: Axes, limits: Sequence[float], colour: str, marks: Sequence[tuple[float, str]]
+) -> None:
+    """Dashed lines at limits that are within reach of the values, dotted ones at instants."""
+    low, high = axes.get_ylim()
+    if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:  # noise at rest does not fill the page
+        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
+    for limit in limits:
+        if low <= limit <= high:
+            axes.axhline(limit, color=colour, linewidth=0.9, linestyle=(0, (5, 2)))
+    for mark, own in marks:
+        axes.axvline(mark, color=own, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.set_ylim(low, high)
+    axes.ticklabel_format(axis="y", useOffset=False)
+
+
 def time_panel(
     height: float,
     time: Array,
@@ -373,11 +389,11 @@ def time_panel(
     *,
     width: float = PANEL_WIDTH,
     foot: str = "time [s]",
-    marks: Sequence[float] = (),
+    marks: Sequence[tuple[float, str]] = (),
 ) -> Panel:
     """Plots over the same time, one above the other, with their samples to zoom into.
 
-    At `marks` dotted lines are drawn [s].
+    At `marks` dotted lines are drawn: time [s] and colour.
     """
     with drawing():
         figure = blank(width, height)
@@ -397,25 +413,17 @@ def time_panel(
             if plot.reach is not None:
                 axes.set_ylim(-plot.reach, plot.reach)
             headed(axes, plot.heading)
-            low, high = axes.get_ylim()
-            if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:
-                # Noise at rest does not fill the page.
-                axes.set_ylim(0.5 * (low + high - least), 0.5 * (low + high + least))
-            for limit in plot.limits:
-                if low <= limit <= high:
-                    axes.axhline(limit, color=OUTSIDE_3, linewidth=0.9, linestyle=DASHED)
-            for mark in marks:
-                axes.axvline(mark, color=MUTED, linewidth=0.8, linestyle=(0, (1, 2)))
+            marked(axes, plot.limits, OUTSIDE_3, marks)
             values = np.concatenate([one.values for one in plot.traces])
             if np.nanmin(values, initial=0.0) < 0.0 < np.nanmax(values, initial=0.0):
                 axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1.5)
             ruled(axes, "both", x_ticks=6, y_ticks=3 if k else 4)
-            axes.ticklabel_format(axis="y", useOffset=False)
             axes.set_xlim(float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9))
             axes.tick_params(labelbottom=plot is plots[-1])
             if plot is plots[-1]:
                 footed(axes, foot)
-        return to_panel(figure, caption, traces_text(time, plots, points=points, marks=marks))
+        at = [mark for mark, _ in marks]
+        return to_panel(figure, caption, traces_text(time, plots, points=points, marks=at))
 
 
 def box_panel(
