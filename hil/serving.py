@@ -17,25 +17,16 @@ from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
 from hil.reading import port_number
-from sim_fixtures import ControllerSettings, SimulatedController
+from sim_fixtures import ControllerSettings, SimulatedController, serve
 from sim_fixtures.errors import PlantDiverged
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import (
-    KNOCK_INTERVAL,
-    PATIENCE,
-    FarEnd,
-    Request,
-    Tally,
-    UdpFarEnd,
-    serve,
-)
 
 _PR_SET_TIMERSLACK: Final = 29
 
 
 def open_far_end(
     udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
-) -> FarEnd:
+) -> serve.FarEnd:
     """The controller's end of the link a person names.
 
     `udp` is "HOST:PORT" of the PC program, `can` "INTERFACE:CHANNEL", ":fd" or ":classic" behind
@@ -55,10 +46,10 @@ def open_far_end(
     if not host or port is None:
         remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
         raise InputError(None, f"--udp {udp!r} is not an address", remedy=remedy)
-    return UdpFarEnd(host, port)
+    return serve.UdpFarEnd(host, port)
 
 
-def _bus(text: str, settings: ControllerSettings, n_axes: int) -> FarEnd:
+def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.FarEnd:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
     if profile not in ("fd", "classic"):
@@ -90,12 +81,12 @@ class Buttons:
         self._until = None if duration is None else time.monotonic() + duration
         self._pressed: set[int] = set()
 
-    def request(self) -> Request:
+    def request(self) -> serve.Request:
         """Go on; or end, by a signal or because the time is over; or give up."""
         if self._at_once:
-            return Request.GIVE_UP
+            return serve.Request.GIVE_UP
         over = self._until is not None and time.monotonic() >= self._until
-        return Request.END if self.interrupted or over else Request.GO_ON
+        return serve.Request.END if self.interrupted or over else serve.Request.GO_ON
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
         """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
@@ -159,7 +150,7 @@ class Served:
     """How a session on a real link came out: controller and counts are of the last start."""
 
     controller: SimulatedController
-    summary: Tally
+    summary: serve.Tally
     intervals: int  #: how often all axes have been open
     starts: int  #: how often the start was begun
     foreign: int  #: datagrams from elsewhere; 0 where the link cannot tell
@@ -167,13 +158,13 @@ class Served:
 
 def serve_session(
     build: Callable[[], SimulatedController],
-    far_end: FarEnd,
+    far_end: serve.FarEnd,
     pressed: Buttons,
     *,
     faults: FaultyLink | None = None,
-    patience: float = PATIENCE,
+    patience: float = serve.PATIENCE,
     stretch: float = 0.0,
-    watch: Callable[[SimulatedController, Tally], None] = lambda *_: None,
+    watch: Callable[[SimulatedController, serve.Tally], None] = lambda *_: None,
 ) -> Served:
     """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
 
@@ -197,7 +188,7 @@ def serve_session(
         phases = [controller.phase]
 
         def observe(
-            tally: Tally,
+            tally: serve.Tally,
             controller: SimulatedController = controller,
             phases: list[Phase] = phases,
         ) -> None:
@@ -207,7 +198,7 @@ def serve_session(
             watch(controller, tally)
 
         try:
-            summary = serve(
+            summary = serve.serve(
                 controller, far_end, faults=faults, request=pressed.request, watch=observe,
                 patience=patience, stretch=stretch,
             )  # fmt: skip
@@ -216,9 +207,9 @@ def serve_session(
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
         begun = Phase.DRIVE_OFF in phases[1:]
-        if begun or not summary.ended or pressed.request() is not Request.GO_ON:
+        if begun or not summary.ended or pressed.request() is not serve.Request.GO_ON:
             opened, foreign = phases[1:].count(Phase.OPEN), getattr(far_end, "foreign", 0)
             return Served(controller, summary, opened, starts, foreign)
-        until = time.monotonic() + KNOCK_INTERVAL
-        while time.monotonic() < until and pressed.request() is Request.GO_ON:
+        until = time.monotonic() + serve.KNOCK_INTERVAL
+        while time.monotonic() < until and pressed.request() is serve.Request.GO_ON:
             time.sleep(0.05)

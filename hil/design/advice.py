@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 from hil.cell import AngleFrame, Cell
 from hil.errors import UnsafeError
 from hil.motion_checks import always_so, violation_text
-from identification.excitation import (
-    CRITERIA,
-    CollisionChecker,
-    NoFeasibleMotionError,
-    Objective,
-    Problem,
-    midpoints,
-    sampled,
-)
+from identification import excitation
 from planner import Trajectory
 
 from .settings import DesignSettings
@@ -39,16 +31,16 @@ _MOST_NAMES: Final = 6
 
 def criteria_text(measures: Iterable[float], digits: int = 2) -> str:
     """Return values of `CRITERIA` in words."""
-    named = zip(CRITERIA.values(), measures, strict=True)
+    named = zip(excitation.CRITERIA.values(), measures, strict=True)
     return ", ".join(f"{one.label} {value:.{digits}f}" for one, value in named)
 
 
-def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
+def margins(cell: Cell, problem: excitation.Problem, trajectory: Trajectory) -> str:
     """How near a motion comes to limits that its search looked at, "" if to none.
 
     Nothing is said of shapes that the arm's construction keeps close to each other.
     """
-    constraints, motion, parts = problem.constraints, sampled(trajectory), list[str]()
+    constraints, motion, parts = problem.constraints, excitation.sampled(trajectory), list[str]()
     if (currents := constraints.currents) is not None:
         share = np.abs(currents.current(currents.torque(motion))) / currents.current_limit
         largest = share.max(axis=0)
@@ -61,7 +53,7 @@ def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
         margin = max(_WIDEST, cell.workspace.margin)
         workspace = replace(cell.workspace, margin=margin)
         folders = cell.mesh_folders
-        wide = CollisionChecker(
+        wide = excitation.CollisionChecker(
             cell.urdf, workspace, limits=cell.joint_limits, mesh_folders=folders
         )
         near = wide.deepest_contact(motion.position)
@@ -72,13 +64,13 @@ def margins(cell: Cell, problem: Problem, trajectory: Trajectory) -> str:
     return "; ".join(parts)
 
 
-def weakest(objective: Objective, trajectory: Trajectory) -> tuple[str, ...]:
+def weakest(objective: excitation.Objective, trajectory: Trajectory) -> tuple[str, ...]:
     """Return the parameters that a motion separates least, those concerned most first.
 
     They are the largest entries of the weakest eigenvector of the Gram matrix with columns of unit
     length, or the parameters that are not excited at all.
     """
-    gram = objective.information(midpoints(trajectory))
+    gram = objective.information(excitation.midpoints(trajectory))
     chosen = objective.parameters
     names = objective.model.parameter_names
     judged = names if chosen is None else tuple(names[k] for k in chosen)
@@ -126,9 +118,9 @@ class NoExcitationError(UnsafeError):
 
 
 def no_excitation(
-    error: NoFeasibleMotionError,
+    error: excitation.NoFeasibleMotionError,
     frame: AngleFrame,
-    checker: CollisionChecker | None,
+    checker: excitation.CollisionChecker | None,
     settings: DesignSettings,
 ) -> NoExcitationError:
     """Return the error for a person: what forbids every motion, and what could be changed."""
@@ -139,13 +131,13 @@ def no_excitation(
     return NoExcitationError(f"{sentence}. What can be changed: {advice}" if advice else sentence)
 
 
-def forbidden(error: NoFeasibleMotionError, frame: AngleFrame) -> str:
+def forbidden(error: excitation.NoFeasibleMotionError, frame: AngleFrame) -> str:
     """Return what forbids every motion, in angles of a frame."""
     return error.sentence(partial(violation_text, frame=frame))
 
 
 def _advice(
-    error: NoFeasibleMotionError, settings: DesignSettings, always: str | None
+    error: excitation.NoFeasibleMotionError, settings: DesignSettings, always: str | None
 ) -> Iterator[str]:
     """Yield what could be changed about each kind that forbids more than half of the motions."""
     known = _VIA_POINTS if settings.sines is None else _SINES

@@ -15,18 +15,7 @@ from hil.files import exclusive_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
 from hil.reading import opened
-from identification.excitation import (
-    Design,
-    Journal,
-    JournalError,
-    NoFeasibleMotionError,
-    Population,
-    Problem,
-    Progress,
-    most_evaluations,
-    sampled,
-    search,
-)
+from identification import excitation
 from planner.toml_text import to_text
 
 from .advice import criteria_text, forbidden, no_excitation
@@ -150,8 +139,8 @@ def require_same(asked: DesignSettings, there: DesignSettings, path: Path) -> No
 class Designed:
     """A search that came to an end, and what was written down of it."""
 
-    problem: Problem
-    design: Design
+    problem: excitation.Problem
+    design: excitation.Design
     result: DesignResult
 
 
@@ -163,7 +152,7 @@ def run_search(
     workers: int = 2,
     known: Knowledge | None = None,
     stop: Callable[[], bool] = lambda: False,
-) -> Design:
+) -> excitation.Design:
     """Search a motion for a cell.
 
     The result does not depend on the number of `workers`, processes that score motions. The motion
@@ -214,9 +203,9 @@ def run_design(
         else:
             folder.begin(settings, force=force)
         earlier = {} if known is None else dict(archives) | {"repetitions": known.repetitions}
-        search = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": earlier}
+        identity = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": earlier}
         with folder.opened_journal() as file:
-            journal = _journal(file, search, reporter)
+            journal = _journal(file, identity, reporter)
             try:
                 design = _searched(problem, cell, settings, reporter, workers, stop, journal)
             finally:
@@ -229,7 +218,7 @@ def run_design(
                 "resumed from it scores them anew"
             )
         trajectory = design.excitation.trajectory  # as it is going to be run
-        broken = problem.constraints.violations(trajectory, sampled(trajectory))
+        broken = problem.constraints.violations(trajectory, excitation.sampled(trajectory))
         if broken:
             reason = violation_text(broken[0], AngleFrame.of(cell))
             raise UnsafeError(f"the motion found does not pass its last check: {reason}")
@@ -241,20 +230,23 @@ def run_design(
 
 
 def _searched(
-    problem: Problem,
+    problem: excitation.Problem,
     cell: Cell,
     asked: DesignSettings,
     reporter: Reporter,
     workers: int,
     stop: Callable[[], bool],
-    journal: Journal | None = None,
-) -> Design:
+    journal: excitation.Journal | None = None,
+) -> excitation.Design:
     settings, checker = search_settings(asked), problem.constraints.checker
-    frame, total = AngleFrame.of(cell), most_evaluations(settings)
+    frame, total = AngleFrame.of(cell), excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
     done, note, troubled = 0, "scoring the first motions", False
-    with reporter.task("designing (motions)", total) as task, Population(problem, workers) as found:
+    with (
+        reporter.task("designing (motions)", total) as task,
+        excitation.Population(problem, workers) as found,
+    ):
         task.advance(0, note)
 
         def scored(count: int) -> None:
@@ -262,7 +254,7 @@ def _searched(
             done += count
             task.advance(count, note)
 
-        def entered(progress: Progress) -> None:
+        def entered(progress: excitation.Progress) -> None:
             """A generation is scored, or was in the journal."""
             nonlocal note, troubled
             note = _note(progress)
@@ -275,10 +267,10 @@ def _searched(
                 )
 
         try:
-            design = search(
+            design = excitation.search(
                 found, settings, journal=journal, progress=entered, scored=scored, stop=stop
             )
-        except NoFeasibleMotionError as error:
+        except excitation.NoFeasibleMotionError as error:
             if error.stopped:
                 raise OperatorStopError(
                     "stopped before there was a motion that keeps every constraint: "
@@ -296,7 +288,7 @@ def _searched(
     return design
 
 
-def _note(progress: Progress) -> str:
+def _note(progress: excitation.Progress) -> str:
     where = {
         "sample": "looking at random motions",
         "search": f"generation {progress.generation} of {progress.generations}",
@@ -307,10 +299,10 @@ def _note(progress: Progress) -> str:
     return f"{where}, {criteria_text(progress.best, 1)}"
 
 
-def _journal(file: BinaryIO, search: Mapping[str, Any], reporter: Reporter) -> Journal:
+def _journal(file: BinaryIO, identity: Mapping[str, Any], reporter: Reporter) -> excitation.Journal:
     try:
-        journal = Journal(file, search)
-    except JournalError as error:
+        journal = excitation.Journal(file, identity)
+    except excitation.JournalError as error:
         remedy = "resume with the same cell, settings and archives, or begin anew (--force)"
         raise InputError(file.name, str(error), remedy=remedy) from error
     except OSError as error:
