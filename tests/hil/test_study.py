@@ -501,7 +501,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: C
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hil.study.run.execute_all", one_and_ctrl_c)
+        patch.setattr("hil.study.campaigns.execute_all", one_and_ctrl_c)
         with pytest.raises(KeyboardInterrupt):
             run_study(root, small, Silent(), workers=1, cell=arm)
     assert not (root / "results.json").exists()
