@@ -83,10 +83,7 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
 
     Times are those of the day where the archive knows the day.
 
-    Args:
-        archive: whole or torn.
-        prediction: ``time`` since the first sample (m,) [s], and the ``effort`` predicted at it
-            (m, n).
+    The prediction has ``time`` since the first sample (m,) [s], and the ``effort`` at it (m, n).
     """
     columns, names = archive.columns, archive.joint_names
     stamp = np.asarray(columns["stamp"], np.int64)

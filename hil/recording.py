@@ -36,16 +36,9 @@ def record(
 ) -> Recorded:
     """Record what the controller does, from its first cycle on. No motion is ever requested.
 
-    Args:
-        link: to the controller.
-        cell: travels in the archive.
-        path: of the archive, which must not exist.
-        kind: one of `KINDS`.
-        stop: ends the recording.
-        duration: s of the controller's time; None: until `stop`, or the session's end.
-        wait: s that the controller is waited for; None: for ever.
-        watch: receives the progress.
-        durable: wait at each flush until the disk has the data.
+    The cell travels in the archive, which must not exist and is of a kind of `KINDS`. It lasts for
+    a `duration` of the controller's time [s], or until `stop` or the session's end; the controller
+    is waited for as long as `wait` says [s]. If `durable`, each flush waits for the disk.
 
     Raises:
         ControllerFault: the controller did not come in time, or is not the cell's.
@@ -67,12 +60,9 @@ def archive_spec(
 ) -> ArchiveSpec:
     """An archive of a cell's arm, which needs nothing else to be identified from.
 
-    Args:
-        cell: travels in the archive, with its URDF and drive train.
-        path: of the archive, which must not exist.
-        metadata: beside the cell's name.
-        plan: the motion that was planned; None for one of the controller's own.
-        durable: wait at each flush until the disk has the data.
+    The cell travels in it with URDF and drive train, and the plan, None for a motion of the
+    controller's own; metadata stand beside the cell's name. If `durable`, each flush waits for the
+    disk.
     """
     attachments = {
         "cell.toml": cell.text.encode(),
@@ -124,10 +114,8 @@ def origin_of(
 ) -> dict[str, str]:
     """As metadata: where, when and with what it was recorded; virtual time has no date.
 
-    Args:
-        cell: its own link says what is left out.
-        only_simulated: of the link that is really used: whether only a simulated arm can move.
-        virtual: whether time is, on that link.
+    Of the link that is really used: whether only a simulated arm can move, and whether time is
+    virtual; what is left out is as the cell's own link says.
     """
     if only_simulated is None:
         only_simulated = cell.only_simulated

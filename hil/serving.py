@@ -168,14 +168,9 @@ def serve_session(
 ) -> Served:
     """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
 
-    Args:
-        build: a controller that has just been switched on.
-        far_end: its link.
-        pressed: the buttons.
-        faults: what the link does to packets, counted from each start.
-        patience: for the arm to come to rest at the end [s].
-        stretch: by which a cycle may be made longer to wait for its answer [s].
-        watch: called every cycle with the counts so far.
+    `build` makes a controller that has just been switched on. Faults are counted from each start.
+    The arm has `patience` to come to rest at the end, and a cycle may be made longer by `stretch`
+    to wait for its answer [s]. `watch` is called every cycle with the counts so far.
 
     Raises:
         InputError: the link cannot carry the session.

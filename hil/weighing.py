@@ -76,12 +76,9 @@ def weigh(
     The recordings are two campaigns below the folder of the campaign, with its cell, its plan and,
     where it was passed, its rehearsal. What is there already is not recorded again.
 
-    Args:
-        campaign: whose excitation is run; its repetitions are the most pairs.
-        name: of the payload, and of the folder.
-        run: records.
-        mount: whether the payload was mounted (True) or taken off (False); no ends the recording.
-        reporter: of each pair.
+    The campaign's repetitions are the most pairs; the name is that of the payload and of the
+    folder. `mount` says whether the payload was mounted (True) or taken off (False); no ends the
+    recording.
 
     Raises:
         InputError: the name is no name of a folder.

@@ -53,10 +53,8 @@ class ClusterError(HilError):
 class DaskWorkers(Workers):
     """The workers of a Dask cluster.
 
-    Args:
-        address: of its scheduler, such as ``tcp://host:8786``.
-        timeout: longest time for one task [s].
-        patience: longest time to wait for a scheduler, and for a worker [s].
+    The scheduler has an address such as ``tcp://host:8786``; a task may last for `timeout`, and
+    scheduler and worker are waited for with `patience` [s].
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers at the address.
@@ -242,10 +240,7 @@ def differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -
 def perform(task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]) -> T | Broken:
     """Do a task in a child process.
 
-    Args:
-        task: the work.
-        timeout: longest time for it [s].
-        expected: `software` of whoever asks.
+    It may last for `timeout` [s]; `expected` is the `software` of whoever asks.
 
     Raises:
         WorkerSoftwareError: other software runs here.

@@ -54,13 +54,9 @@ def reidentify(
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
     They do not depend on the order in which archives are found, nor on who computes what.
 
-    Args:
-        roots: folders, archives, or URLs of either.
-        options: as of `hil identify`, with a `BatchEstimator`; a single recording is never split.
-        workers: who does the work on archives.
-        reporter: of progress.
-        where: what archives contribute is cached.
-        check: given the archives that were found, before their samples are read; may refuse them.
+    Roots are folders, archives, or URLs of either; options have a `BatchEstimator`, and a single
+    recording is never split. `check` is given the archives that were found, before their samples
+    are read, and may refuse them.
 
     Raises:
         InputError: a place does not exist, or there is not one archive that can be fitted.

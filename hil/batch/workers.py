@@ -66,18 +66,14 @@ class Workers(ABC):
 
         A task that fails, ends its process or takes too long has a `Broken` in its place.
 
-        Args:
-            tasks: the work.
-            done: called with a number of tasks whenever so many more are finished.
+        `done` is called with a number of tasks whenever so many more are finished.
         """
 
 
 class LocalWorkers(Workers):
     """Child processes of this one; they are started when there is something to do.
 
-    Args:
-        count: how many; by default one for each core this process may use.
-        timeout: longest time for one task [s].
+    By default one for each core that this process may use; a task may last for `timeout` [s].
     """
 
     near = True

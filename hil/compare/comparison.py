@@ -162,11 +162,7 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
 
     By least squares, which draw no change towards anything.
 
-    Args:
-        places: campaign folders, or folders with campaigns below; the `results.json` of a campaign
-            stands for its folder.
-        workers: read the archives.
-        reporter: of progress.
+    The `results.json` of a campaign stands for its folder.
 
     Raises:
         InputError: there is one campaign only, or campaigns are of different arms.
@@ -415,11 +411,8 @@ def _axis_finding(axis: Axis, friction: Tested, j: int, k: int, names: list[str]
 def known(value: float, variance: float, freedom: float, repetitions: Array) -> Known:
     """A figure from its estimate and from the estimates of single repetitions.
 
-    Args:
-        value: of the pooled estimate.
-        variance: by its covariance; infinite if undetermined.
-        freedom: of that covariance.
-        repetitions: of each repetition, in order (m,); NaN where one does not determine it.
+    The variance is that of the estimate's covariance, infinite if undetermined, with its degrees of
+    freedom; the repetitions (m,) are in order, NaN where one does not determine the figure.
     """
     if not np.isfinite(variance):
         return Known(float("nan"), float("nan"), 1.0)

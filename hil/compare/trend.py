@@ -316,12 +316,9 @@ def chart(
     side: they are a new level, by which later ones are judged. A value that belongs to an earlier
     level has returned to it. Scatter is that about all levels.
 
-    Args:
-        values: in order of time (n,); NaN where there is none.
-        stds: standard deviations that they came with (n,).
-        share: of values beyond the limits if nothing has changed.
-        least: smallest departure from the centre that matters.
-        rise_only: whether only values above the history count.
+    Values (n,) are in order of time, NaN where there is none, and came with standard deviations
+    (n,). If nothing has changed `share` of them lie beyond the limits. A departure from the centre
+    matters from `least` on; with `rise_only` only upwards.
     """
     share = 2.0 * share if rise_only else share
     members, now, away = [list[int]()], 0, list[int]()

@@ -39,10 +39,8 @@ _MOTIONS: Final = ("excitation", "imported", "validation")
 def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowledge:
     """Identify from archives, and return what they say about each parameter.
 
-    Args:
-        paths: archives, or folders of them, of campaigns the whole ones.
-        cell: for which a motion is going to be designed.
-        reporter: shows how far it is, and of joints about whose noise nothing is known.
+    Archives, or folders of them, of campaigns the whole ones; a motion for the cell is going to be
+    designed.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.

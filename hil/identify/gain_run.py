@@ -44,11 +44,8 @@ def find_gains(
 
     An archive whose cell has a payload was recorded with it.
 
-    Args:
-        archives: recordings as their cells say.
-        loaded: further recordings, each with what the robot carried.
-        reporter: receives the progress.
-        delay: time by which currents lag positions [s]; "stated" takes it from the cell.
+    The `loaded` recordings carried what is named with each. Currents lag positions by `delay` [s];
+    "stated" takes it from the cell.
 
     Raises:
         InputError: an archive cannot be used, or not together with the others.

@@ -197,13 +197,9 @@ def find_payload(
     Settings are chosen on the bare recordings. What `[robot.payload]` of a cell states is left out
     of account: the payload is all that the loaded recordings carry and the bare ones do not.
 
-    Args:
-        bare: archives or folders of them, or campaign folders, without it.
-        loaded: the same with it.
-        reporter: of progress.
-        frame: link of the URDF in whose frame it is; see `flange_of` if left out.
-        box: edges [m] of the reference body along the frame's axes; None for a point.
-        options: how recordings become samples.
+    Either side is archives, folders of them, or campaign folders. The figures are in the `frame` of
+    a link, see `flange_of` if left out; `box` has the edges [m] of the reference body along the
+    axes of that frame, None for a point.
 
     Raises:
         InputError: archives cannot be used, are of two arms, carry two payloads or none.

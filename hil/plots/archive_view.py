@@ -125,11 +125,7 @@ def view_of(
 ) -> ArchiveView:
     """Read what is drawn of an archive.
 
-    Args:
-        path: of the archive.
-        start: s since its first sample; its beginning if left out.
-        stop: s since its first sample; its end if left out.
-        joints: names or numbers from 1 of the joints wanted; all if empty.
+    Times are s since its first sample; joints are names or numbers from 1, all if empty.
 
     Raises:
         ArchiveError: it cannot be read, or holds no sample in that time.

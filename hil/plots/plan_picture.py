@@ -43,13 +43,8 @@ def draw_motion(
 ) -> None:
     """Draw one row per joint: position, velocity and, in a third column, acceleration.
 
-    Args:
-        rows: two or three axes per joint.
-        trajectory: what to draw.
-        limits: its limits, URDF angles.
-        joint_names: one per joint.
-        frame: which angles to show.
-        postures: times that are numbered (k,) [s].
+    Each row has two or three axes. Limits are URDF angles, shown in the angles of the frame; the
+    times of `postures` (k,) [s] are numbered.
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
