@@ -1,13 +1,8 @@
 """Results of archives between runs: small files, checked, replaced as a whole.
 
-```
-.hil-cache/           beside the archives, if their folder can be written to
-    5f/5fd0...        by its key: what an archive is, a reduced bundle, settings, texts of a cell
-```
-
-A key is a digest of everything the content depends on, so nothing is ever out of date. An entry
-whose checksum fails, or that was written for another key, counts as absent; one that is whole is
-our own and trusted.
+Below a folder ``.hil-cache`` beside the archives a file is named by its key, a digest of everything
+the content depends on, so nothing is ever out of date. An entry whose checksum fails, or that was
+written for another key, counts as absent; one that is whole is our own and trusted.
 """
 
 from __future__ import annotations

@@ -157,12 +157,7 @@ class DaskWorkers(Workers):
         return found
 
     def _result(self, future: Any) -> Any:
-        """What came of a task; `_LOST` if every worker that took it up died.
-
-        Raises:
-            ClusterError: it was dropped.
-            Exception: what the call raised.
-        """
+        """What came of a task, or what it raised; `_LOST` if every worker that took it up died."""
         from distributed import KilledWorker
 
         self._wait(future)

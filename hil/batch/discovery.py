@@ -226,11 +226,7 @@ def examined(place: Place, where: Where) -> ArchiveRef:
 
 
 def _known(place: Place, where: Where) -> ArchiveRef | None:
-    """What is known of an archive without opening it; None if nothing.
-
-    Raises:
-        ArchiveError: there is no such file.
-    """
+    """What is known of an archive without opening it, if its file is there; None if nothing."""
     stamp = place.stamp
     if stamp is None and not place.version:  # only its bytes show a change
         return None

@@ -1,8 +1,6 @@
-"""Archives in an object store or behind a web server, through fsspec.
+"""Archives in an object store or behind a web server, at any address that fsspec knows.
 
-Any address fsspec knows is good (``s3://``, ``gs://``, ``http://``, ``file://``, ``memory://``...);
-some need a package of their own, which the error names. fsspec is imported when such an address is
-given, and not before.
+Some need a package of their own, which the error names. fsspec is imported with the first address.
 """
 
 from __future__ import annotations

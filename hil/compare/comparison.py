@@ -1,11 +1,8 @@
-"""Campaigns of one arm, from their archives, and what changed from one to another.
+"""Campaigns of one arm, and what changed from one to another; the rules are in `docs/compare.md`.
 
-A campaign knows a figure twice: by the covariance of its estimate, which sees the noise of the
-torques, and by how its repetitions scatter. The larger variance counts. Repetitions that follow one
-another are not independent while friction drifts: n of them, correlated by ρ from one to the next,
-are worth n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946), ρ being corrected for the bias of its
-estimate (Marriott and Pope 1954). Differences are tested by Welch's t, all together by Holm's
-procedure.
+A campaign's variance of a figure is the larger of that of its estimate and that of its repetitions,
+of which n correlated by ρ are worth n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946), ρ corrected
+for bias (Marriott and Pope 1954). Differences: Welch's t, all together by Holm's procedure.
 """
 
 from __future__ import annotations
@@ -213,11 +210,7 @@ def _absolute(place: str) -> str:
 
 
 def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
-    """Friction and mass of another arm are another arm's, and one campaign has nothing beside it.
-
-    Raises:
-        InputError: names two campaigns and what their arms differ in, or the only one.
-    """
+    """Another arm has its own friction and mass, and one campaign has nothing beside it."""
     of = {ref.key: ref for ref in found if ref.use == "excitation"}
     if not of:
         return  # and that is refused

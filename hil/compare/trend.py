@@ -1,11 +1,8 @@
-"""What became of an arm: friction, torque error, parameters and payload from campaign to campaign.
+"""What became of an arm from campaign to campaign; the rules are in `docs/batch.md`.
 
-A robust control chart asks of each figure of an axis whether it belongs to the values before it:
-location is their median, scale their Qn (Rousseeuw and Croux 1993), so that an odd value neither
-moves the centre nor widens the limits. The limits are Student's: Qn of n normal values is as
-uncertain as a standard deviation of about 0.6 (n - 1) + 0.5 values, found by simulation (n = 5 to
-30, tail 1e-2 and 1e-3, on the safe side). Drift is Kendall's rank correlation with time (Mann
-1945), with the slope of Theil and Sen (Sen 1968). What counts as a change is in `docs/batch.md`.
+A robust control chart of each figure of an axis: median and Qn (Rousseeuw and Croux 1993) with
+limits by Student's t, for which Qn of n normal values has about 0.6 (n - 1) + 0.5 values, found by
+simulation (n = 5 to 30, tail 1e-2 and 1e-3, on the safe side). Drift: Mann 1945, Sen 1968.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """What earlier archives say already, for a design that concentrates on what is still uncertain.
 
-The paper designs one motion. Information adds up: the Gram matrix of what was recorded joins that
-of the motion to be designed, each joint weighted by what its torque noise turned out to be. What
-an identification holds out to test itself on says as much as what it fits, so everything counts
-here that the arm moved in.
+The Gram matrix of all that the arm moved in, held out or not, joins that of the motion to be
+designed, each joint weighted by what its torque noise turned out to be.
 """
 
 from __future__ import annotations

@@ -127,10 +127,7 @@ def _trend(arm: ArmTrend, key: str) -> dict[str, Any]:
 def _panel(
     panels: list[Panel], arm: ArmTrend, axis: AxisTrend, watched: Watched, key: str, what: str
 ) -> None:
-    """A figure of an axis over the campaigns with 95 % intervals, limits, and its drift.
-
-    Those that depart are squares.
-    """
+    """An axis over the campaigns: 95 % intervals, limits, drift; those that depart are squares."""
     values, half = watched.values, _INTERVAL * np.nan_to_num(watched.stds)
     known, judged = np.isfinite(values), np.isfinite(watched.limits[:, 0])
     if not known.any():
