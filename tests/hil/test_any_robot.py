@@ -129,55 +129,6 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz_columns_in_another_order(tmp_
     assert "1 gaps" in said
 
 
-def test_motor_side_with_coupled_motors_in_a_transposed_npz(tmp_path: Path) -> None:
-    simulated = simulate(UR5, np.arange(0.0, 20.0, 1e-3))
-    turns = np.diag([101.0, -100.0, 80.0, 60.0, 50.0, 50.0])
-    turns[5, 4], turns[4, 3] = -50.0, 25.0
-    np.savez(
-        tmp_path / "log.npz",
-        theta=(simulated.position @ turns.T).T,
-        tau=np.linalg.solve(turns.T, simulated.torque.T),
-    )
-    rows = ", ".join(str(row) for row in turns.tolist())
-    columns = f"""
-        sample_rate = 1000.0
-        [position]
-        columns = "theta"
-        side = "motor"
-        [torque]
-        columns = "tau"
-        side = "motor"
-        [drive]
-        motor_from_joint = [{rows}]
-        """
-    found = identify(tmp_path, simulated, "log.npz", columns)
-    model = found.prepared.sources.cell.model
-    assert model.coupling is not None  # the map couples motors: the model may have them share
-    assert found.held_out_error < 1.5 * TORQUE_NOISE
-
-
-def test_text_matrices_at_5_khz_with_joints_along_rows_and_fortran_exponents(
-    tmp_path: Path,
-) -> None:
-    simulated = simulate(UR5, 3.0 + np.arange(0.0, 3.0, 2e-4), pace=2.0)
-
-    def fortran(value: float) -> str:
-        return f"{value:.9E}".replace("E", "D")
-
-    for name, values in (("q", simulated.position), ("tau", simulated.torque)):
-        lines = ["  ".join(fortran(cell) for cell in row) for row in values.T]
-        (tmp_path / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    (tmp_path / "t.txt").write_text("\n".join(fortran(t) for t in simulated.time))
-    columns = """
-        [time]
-        file = "t.txt"
-        [position]
-        [torque]
-        file = "tau.txt"
-        """
-    assert_found(identify(tmp_path, simulated, "q.txt", columns), simulated)
-
-
 def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path) -> None:
     """One array per joint, mA; gains, one of them negative, are found again where weight acts."""
     simulated = simulate(UR5, np.arange(0.0, 30.0, 2e-3))
@@ -205,94 +156,6 @@ def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path
     doubts = " ".join(found.prepared.sources.warnings)
     assert "only currents were recorded" in doubts
     assert "shoulder_pan_joint" in doubts  # its axis is vertical: no weight
-
-
-def test_positions_and_currents_with_decimal_commas_and_torque_constants(tmp_path: Path) -> None:
-    """Semicolons, motor revolutions, a sensor with an offset, signs per joint."""
-    simulated = simulate(UR5, np.arange(0.0, 20.0, 4e-3))
-    ratio = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
-    constant = np.array([0.12, 0.12, 0.1, 0.06, 0.05, 0.04])
-    revolutions = simulated.position * ratio / (2.0 * np.pi)
-    current = simulated.torque / (ratio * constant) + 0.05
-    table = np.column_stack([simulated.time, revolutions, current])
-    text = "t;" + ";".join([*(f"n{j}" for j in range(1, 7)), *(f"i{j}" for j in range(1, 7))])
-    body = "\n".join(";".join(f"{cell:.8f}" for cell in row) for row in table).replace(".", ",")
-    (tmp_path / "log.csv").write_text(f"{text}\n{body}\n")
-    columns = f"""
-        [time]
-        column = "t"
-        [position]
-        columns = "n{{}}"
-        unit = "rev"
-        side = "motor"
-        [motor_current]
-        columns = "i{{}}"
-        offset = -0.05
-        [drive]
-        gear_ratio = {ratio.tolist()}
-        torque_constant = {constant.tolist()}
-        """
-    assert_found(identify(tmp_path, simulated, "log.csv", columns), simulated)
-
-
-def test_a_delay_of_the_torque_is_noticed_and_on_demand_compensated(tmp_path: Path) -> None:
-    time = np.arange(0.0, 20.0, 2e-3)
-    simulated = simulate(UR5, time, noise=0.3)
-    late = 0.009
-    shifted = np.column_stack(
-        [np.interp(time - late, time, column) for column in simulated.torque.T]
-    )
-    table = np.column_stack([time, simulated.position, shifted])[10:]
-    write(tmp_path / "log.csv", "", table)
-    columns = """
-        [time]
-        column = 0
-        [position]
-        columns = [1, 2, 3, 4, 5, 6]
-        [torque]
-        columns = [7, 8, 9, 10, 11, 12]
-        """
-    plain = replace(PLAIN, delay=0.0)
-    unaware = identify(tmp_path, simulated, "log.csv", columns, options=plain)
-    noticed = unaware.prepared.delays
-    assert noticed is not None
-    assert noticed.delays[noticed.determined] == pytest.approx(late, abs=1e-3)
-    assert (unaware.prepared.assumed_delay == 0.0).all()
-    (tmp_path / "log.mcap").unlink()
-    aware = identify(tmp_path, simulated, "log.csv", columns, options=replace(plain, delay="auto"))
-    delays = aware.prepared.delays
-    assert delays is not None
-    known = delays.determined
-    assert known.sum() >= 4
-    assert delays.delays[known] == pytest.approx(late, abs=1e-3)
-    assert aware.held_out_error < unaware.held_out_error
-    assert_found(aware, simulated)
-
-
-def test_a_clipped_torque_is_left_out_and_told(tmp_path: Path) -> None:
-    """A drive at its limit says nothing of the load; with its rows the mass would be too small."""
-    simulated = simulate(UR5, np.arange(0.0, 30.0, 4e-3))
-    torque, limit = simulated.torque.copy(), 0.7 * np.abs(simulated.torque[:, 1]).max()
-    clipped = np.abs(torque[:, 1]) > limit
-    assert 0.02 < clipped.mean() < 0.5
-    torque[:, 1] = np.clip(torque[:, 1], -limit, limit)
-    np.savez(tmp_path / "log.npz", q=simulated.position, tau=torque)
-    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
-    found = identify(tmp_path, simulated, "log.npz", columns)
-    model = found.prepared.sources.cell.model
-    truth = planted(model, simulated)
-    far = np.abs(found.fit.values - truth) > 5.0 * found.fit.std + 0.02 * np.abs(truth)
-    assert not far.any(), np.array(model.parameter_names)[far]
-    (told,) = (
-        rows
-        for reason, rows in found.prepared.masked.items()
-        if "satur" in reason or "limit" in reason
-    )
-    assert told[1] > 0
-    assert not np.delete(told, 1).any()
-    (fitted,) = found.prepared.fitted
-    kept = fitted.usable[:, 1] & clipped[: len(fitted.usable)]
-    assert kept.sum() < 0.01 * clipped.sum(), kept.sum()  # a single sample is no flat top
 
 
 def test_currents_of_a_robot_without_masses_are_refused_with_a_remedy(tmp_path: Path) -> None:
@@ -341,14 +204,6 @@ def test_a_standstill_gives_the_noise_and_other_recordings_are_predicted(tmp_pat
 
     unread = gather_sources(paths[:1], 0.7, predict=paths[1:2])
     assert [one.name for one in unread.held_out] == ["b.mcap"]
-
-
-def test_a_log_without_time_finds_the_parameters(tmp_path: Path) -> None:
-    simulated = simulate(UR5, np.arange(0.0, 20.0, 4e-3))
-    np.savez(tmp_path / "log.npz", q=simulated.position, tau=simulated.torque)
-    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[torque]\ncolumns = "tau"\n'
-    options = Options(torque_bandwidth=None)
-    assert_found(identify(tmp_path, simulated, "log.npz", columns, options=options), simulated)
 
 
 ROOT = Path(__file__).resolve().parents[2]

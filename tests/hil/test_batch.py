@@ -8,8 +8,7 @@ import os
 import shutil
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -28,12 +27,12 @@ from hil.batch.discovery import Discovery, discover
 from hil.batch.estimates import warning_lines
 from hil.batch.factors import cached, opened, reduced
 from hil.batch.run import reidentify
-from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult, Broken, ChangedError
+from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult, ChangedError
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.cli import app
-from hil.cli.reidentify import alarm_lines, skipped_line
+from hil.cli.reidentify import alarm_lines
 from hil.compare.trend import Trends
 from hil.errors import InputError
 from hil.identify import Options, identify_campaign
@@ -255,37 +254,6 @@ class TestNumbers:
         assert same_bits(alone, batch(folder, where=cached))
 
 
-# What is reported meanwhile
-
-
-class Listening(Silent):
-    """Keeps how far each task came; one at a time, as bars are."""
-
-    def __init__(self) -> None:
-        self.done: dict[str, float] = {}
-        self.totals: dict[str, float] = {}
-        self._open = ""
-
-    @contextmanager
-    def task(self, title: str, total: float) -> Iterator[Listening]:
-        assert not self._open
-        self._open, self.totals[title] = title, total
-        yield self
-        self._open = ""
-
-    def advance(self, units: float, note: str = "") -> None:
-        self.done[self._open] = self.done.get(self._open, 0.0) + units
-
-
-@pytest.mark.parametrize("near", [True, False])
-def test_all_work_on_archives_is_reported_to_its_end(near: bool, folder: Path) -> None:
-    seen = Listening()
-    reidentify([str(folder)], FIXED, Here(near=near), seen, where=UNCACHED)
-    assert seen.done == pytest.approx(seen.totals)
-    assert seen.totals["looking into archives"] == len(list(folder.rglob("*.mcap")))
-    assert seen.totals["reading archives and estimating"] == 5  # all but the standstill
-
-
 class TestCache:
     def test_opens_no_archive_for_another_estimator(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -320,22 +288,6 @@ class TestCache:
     def test_of_other_settings_is_another(self, folder: Path) -> None:
         batch(folder, where=Where())
         assert batch(folder, where=Where(), delay=0.002).read == 5
-
-    def test_is_made_anew_where_it_is_damaged(self, folder: Path) -> None:
-        whole = batch(folder, where=Where())
-        files = [path for path in (folder / "archives" / ".hil-cache").rglob("*") if path.is_file()]
-        random = np.random.default_rng(1)
-        for path in files:
-            data = bytearray(path.read_bytes())
-            data[random.integers(len(data))] ^= 1 << random.integers(8)
-            path.write_bytes(data)
-        again = batch(folder, where=Where())
-        assert again.read == 5
-        assert same_bits(whole, again)
-        for path in files:
-            if path.exists():
-                path.write_bytes(path.read_bytes()[:-1])
-        assert same_bits(whole, batch(folder, where=Where()))
 
     def test_of_a_read_only_folder_lies_elsewhere(
         self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -463,21 +415,6 @@ class TestCommand:
         calm = trend_of(steady, 2)
         (line,) = alarm_lines(Trends((calm, arm), (), "wls", 4))
         assert line.startswith("arm: The payload has changed")
-
-    def test_sums_up_what_is_left_alone_by_reason(self) -> None:
-        reasons = [
-            "is a move",
-            "is a move",
-            "ended aborted",
-            "attempt 2 took its place",
-            "attempt 3 took its place",
-            "holds the same as /data/line/excitation_000_a1.mcap",
-        ]
-        line = skipped_line([Broken(f"{k}.mcap", one) for k, one in enumerate(reasons)])
-        assert line == (
-            "left alone, as not meant to be fitted: 2 moves; 2: a later attempt took its place;"
-            " 1: ended aborted; 1: holds the same as another"
-        )
 
 
 # What is said of archives: warnings, and what their cells state

@@ -145,13 +145,11 @@ class TestCache:
             assert where.store(here) != where.store(str(tmp_path / "sub" / "a.mcap"))
         assert Where().store(here).folder == tmp_path / ".hil-cache"
         remote = Where(str(tmp_path)).store("s3://bucket/one/a.mcap")
-        assert remote.folder is not None
         assert remote.folder.parent == tmp_path
 
     def test_a_file_in_place_of_the_folder_is_left_alone(self, tmp_path: Path) -> None:
         (tmp_path / ".hil-cache").write_text("not a folder")
         store = Where().store(str(tmp_path / "excitation_000_a1.mcap"))
-        assert store.folder is not None
         assert tmp_path not in store.folder.parents
 
     def test_settings_are_cached_to_the_last_bit(self, tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from hil.campaign import MotionRefusedError
 from hil.campaign.intervals import at_limit, way
 from hil.motion_checks import MotionChecks
 from hil.move import straight_way
-from hil.testing import faulty_link
 from planner import TrajectoryPlayer
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
@@ -109,14 +108,6 @@ class TestExistOk:
             Campaign.create(tmp_path / "mine", designed.cell, designed.plan, exist_ok=True)
         made = Campaign.create(tmp_path / "new", designed.cell, designed.plan, exist_ok=True)
         assert made.folder.plan.exists()
-
-
-def test_what_is_shown_at_a_prompt_is_one_line(designed: Campaign) -> None:
-    root = designed.folder.root
-    assert repr(designed) == f"Campaign({str(root)!r}, cell 'fast')"
-    link = faulty_link(designed.cell)
-    for shown in (repr(designed.cell), repr(link)):
-        assert "'fast'" in shown and len(shown) < 200
 
 
 def test_the_errors_are_there_after_import_hil() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -168,52 +167,6 @@ def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict
     assert "--force" in again.stderr
 
 
-def test_identify_works_on_a_campaign_folder_and_on_loose_archives(
-    campaign: Campaign, tmp_path: Path
-) -> None:
-    archives = [*campaign.folder.completed("excitation"), *campaign.folder.completed("validation")]
-    loose = hil("identify", *archives, "--json", "--output", tmp_path)
-    assert loose.returncode == 0, loose.stderr
-    assert json.loads(loose.stdout)["good"] is True
-    assert Results.load(tmp_path / "results.json").verdict.good
-    whole = hil("identify", campaign.folder.root, "--quiet", "--output", tmp_path)
-    assert whole.stdout.strip() == Results.load(tmp_path / "results.json").verdict.line
-
-
-@pytest.mark.slow
-def test_a_bag_becomes_an_archive_and_a_model(shared_data: Path, tmp_path: Path) -> None:
-    """The UR10 recording: as good as the comparators, from the command line alone."""
-    robots = pytest.importorskip("importlib.metadata").files("example-robot-data")
-    urdf = next(Path(str(f.locate())) for f in robots if f.name == "ur10_robot.urdf")
-    bag = shared_data / "ur10_unisa" / "ur10_exciting_trajectory.db3"
-    archive = tmp_path / "ur10.mcap"
-    friction = "coulomb,viscous,offset,quadratic"
-    made = hil("import", "rosbag2", bag, "--urdf", urdf, "--friction", friction, "-o", archive)
-    assert made.returncode == 0, made.stderr
-    done = hil("identify", archive, "--output", tmp_path)
-    assert done.returncode == 0, done.stderr
-    (run,) = Results.load(tmp_path / "results.json").validation
-    assert run.all_rows_relative_error <= 0.068
-
-
-def test_a_log_with_a_column_map_becomes_an_archive(tmp_path: Path) -> None:
-    header = ",".join(["t", *(f"q{i}" for i in range(1, 7)), *(f"u{i}" for i in range(1, 7))])
-    rows = [",".join(f"{0.004 * k + j:.6f}" for j in range(13)) for k in range(100)]
-    (tmp_path / "log.csv").write_text("\n".join([header, *rows]) + "\n")
-    (tmp_path / "map.toml").write_text(
-        'time = { column = "t" }\nposition = { columns = "q{}", unit = "deg" }\n'
-        'torque = { columns = "u{}" }\n'
-    )
-    source, output = tmp_path / "log.csv", tmp_path / "log.mcap"
-    done = hil(
-        "import", "csv", source, "--map", tmp_path / "map.toml", "--urdf", URDF_PATH, "-o", output
-    )
-    assert done.returncode == 0, done.stderr
-    archive = open_archive(output)
-    assert archive.n_samples == 100
-    assert archive.columns["position"][0, 0] == pytest.approx(0.0174532925)
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -301,5 +254,4 @@ def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Pa
     last = sorted((folder / "archives").iterdir(), key=lambda path: path.stat().st_mtime)[-1]
     archive = open_archive(last)
     assert archive.complete
-    assert archive.outcome is not None
     assert archive.outcome.entries["outcome"] == "stopped"

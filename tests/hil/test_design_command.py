@@ -223,30 +223,6 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
     assert not list(copied.glob("*.tmp"))
 
 
-@pytest.mark.slow
-def test_a_disk_that_is_full_costs_journal_and_picture_but_no_motion(tmp_path):
-    """As full for every file as it can be made without a disk of its own."""
-    settings = tmp_path / "my.toml"
-    settings.write_text(SETTINGS.replace("generations = 2", "generations = 12"))
-    script = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (25000, 25000)); "
-    script += "from hil.__main__ import main; main()"
-    out = tmp_path / "out"
-    given = [CELL_PATH, "--settings", settings, "--kinematic", "-o", out, "--workers", 1]
-    done = subprocess.run(
-        [sys.executable, "-c", script, "design", *map(str, given)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "the journal cannot be written (File too large); the search goes on" in done.stdout
-    assert "the journal lacks the last motions" in done.stdout
-    assert "warning: " in done.stderr and "Traceback" not in done.stderr
-    names = {"excitation.toml", "settings.toml", "search.journal"}
-    assert {path.name for path in out.iterdir()} == names
-    half = (out / "excitation.toml").read_bytes()
-    again = CliRunner().invoke(app_of(design), [str(CELL_PATH), "--resume", "-o", str(out)])
-    assert again.exit_code == 0
-    assert (out / "excitation.toml").read_bytes() == half
-
-
 def test_a_search_that_ends_early_says_why(invoke, settings, tmp_path):
     settings.write_text(SETTINGS + "crossover = 0.0\nmutation = 0.0\n")
     given = (CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")

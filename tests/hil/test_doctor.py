@@ -41,7 +41,6 @@ from hil.doctor.diagnosis import (
     examine,
     judge,
     measure,
-    obtained,
     remedies,
     run_probe,
     show,
@@ -67,43 +66,29 @@ def test_a_stall_costs_as_many_cycles_as_it_is_long() -> None:
 
 @given(samples, st.floats(0.0, 0.01))
 def test_one_more_latency_never_makes_a_cycle_fit(values: list[float], more: float) -> None:
+    """Nor a shorter cycle; the worse of two measurements decides."""
     before, after = judge([latency(*values)], 1), judge([latency(*values, more)], 1)
     assert after.late_cycles >= before.late_cycles
-    assert judge([latency(*values), latency(more)], 1).fit <= before.fit
+    both = judge([latency(*values), latency(more)], 1)
+    assert both.fit <= before.fit <= judge([latency(*values)], 2).fit
+    assert both == judge([latency(more), latency(*values)], 1)
 
 
-@given(samples)
-def test_what_is_fit_at_1_ms_is_fit_at_2_ms(values: list[float]) -> None:
-    assert judge([latency(*values)], 1).fit <= judge([latency(*values)], 2).fit
-
-
-def test_a_quiet_pc_is_fit_and_what_cannot_be_excluded_is_said() -> None:
+def test_cycles_are_judged_by_late_and_by_usual_latency() -> None:
     quiet = judge([latency(*np.full(60_000, 60e-6))], 1)
     assert quiet.fit
     # A mean of ln 20 = 2.996 late cycles in 60 s shows none with 5 % probability.
     assert quiet.late_per_hour_upper_95 == pytest.approx(60 * np.log(20), abs=1e-4)
     assert "fewer than 180 an hour" in quiet.reason
-
-
-def test_one_late_cycle_in_the_measurement_is_not_fit() -> None:
     rare = judge([latency(*np.full(60_000, 60e-6), 1.2e-3)], 1)
     assert not rare.fit
     assert rare.late_cycles == 1
     assert "some 60 an hour" in rare.reason
     # (1 + m) exp(-m) = 5 % for m = 4.744: the bound lies well above what was seen.
     assert rare.late_per_hour_upper_95 == pytest.approx(60 * 4.744, rel=1e-3)
-
-
-def test_a_pc_that_is_always_slow_is_not_fit_though_nothing_was_late() -> None:
     slow = judge([latency(*np.full(1000, 450e-6))], 1)
     assert (slow.fit, slow.late_cycles) == (False, 0)
     assert "55 % of the cycle" in slow.reason
-
-
-def test_the_worse_of_two_measurements_decides() -> None:
-    good, poor = latency(20e-6, name="wake-up"), latency(3e-3)
-    assert "turnaround" in judge([good, poor], 1).reason
-    assert judge([good, poor], 1) == judge([poor, good], 1)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +100,10 @@ def test_the_worse_of_two_measurements_decides() -> None:
     ],
 )
 def test_the_verdict_is_a_sentence(one: bool, two: bool, words: str) -> None:
-    assert Diagnosis((), (), (verdict(1, one), verdict(2, two)), 1, 60.0).line.startswith(words)
+    """A cycle of 2 ms is advised only where it is fit."""
+    found = Diagnosis((), (latency(3e-3),), (verdict(1, one), verdict(2, two)), 1, 60.0)
+    assert found.line.startswith(words)
+    assert ("use 2 ms" in page(found)) is (two and not one)
 
 
 def verdict(cycle_ms: int, fit: bool) -> Fitness:
@@ -155,39 +143,21 @@ def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
 
 
 def test_remedies_come_worst_first_and_each_command_once() -> None:
-    checks = (
-        warn("slow", "make it fast"),
-        ok("good"),
-        PORT,
-        bad("", "sudo ss -lunp"),
-    )
+    checks = (warn("slow", "make it fast"), ok("good"), PORT, bad("", "sudo ss -lunp"))
     commands = [line.strip() for line in remedies(checks) if line.startswith("    ")]
     assert commands == ["sudo ss -lunp", "make it fast"]
 
 
-def test_the_page_shows_brackets_as_they_are_and_every_bar() -> None:
+def page(found: Diagnosis) -> str:
     console = Console(record=True, width=100, file=io.StringIO())
-    show(diagnosis(PORT), console)
-    text = console.export_text()
-    assert "in use [by] a" in text
-    assert "it is the port" in text
+    show(found, console)
+    return console.export_text()
+
+
+def test_page_and_json_say_the_same() -> None:
+    text, found = page(diagnosis(PORT)), json.loads(json.dumps(as_json(diagnosis(PORT))))
+    assert "in use [by] a" in text and "it is the port" in text
     assert "2000-5000 µs        1 █" in text
-
-
-def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit() -> None:
-    def page(two: bool) -> str:
-        console = Console(record=True, width=100, file=io.StringIO())
-        verdicts = verdict(1, False), verdict(2, two)
-        show(Diagnosis((), (latency(3e-3),), verdicts, 1, 60.0), console)
-        return console.export_text()
-
-    assert "use 2 ms" in page(two=True)
-    assert "Neither 1 ms nor 2 ms is fit." in page(two=False)
-    assert "use 2 ms" not in page(two=False)
-
-
-def test_the_json_says_what_the_page_says() -> None:
-    found = json.loads(json.dumps(as_json(diagnosis(PORT))))
     assert found["fit"] is False
     assert found["checks"][0]["remedy"] == ["sudo ss -lunp"]
     assert found["latency"]["turnaround"]["late_cycles_1ms"] == 3
@@ -230,14 +200,6 @@ def test_a_question_never_answered_counts_its_whole_wait_and_the_next_is_asked(
     assert np.median(np.delete(took, 3)) < 0.05
 
 
-def test_wake_ups_are_measured_at_absolute_deadlines() -> None:
-    began = time.perf_counter()
-    late = probe.wake_ups(0.01, 0.1)
-    assert 0.1 <= time.perf_counter() - began < 5.0
-    assert 1 <= len(late) <= 10
-    assert (late >= 0).all()
-
-
 def test_a_process_that_slept_through_deadlines_shows_it_as_one_long_latency(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -266,13 +228,9 @@ def test_a_probe_that_fails_or_hangs_gives_nothing(monkeypatch: pytest.MonkeyPat
 
 def test_the_disk_is_tried_where_the_archives_will_be(tmp_path: Path) -> None:
     trial = disk_trial(tmp_path / "runs" / "mine")
-    assert trial is not None
     assert trial.folder == str(tmp_path)
     assert len(trial.seconds) > 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_place_that_takes_no_files_is_bad() -> None:
     checks = disk_checks(Path("/proc"), disk_trial(Path("/proc")))
     assert checks[-1].status is Status.BAD
 
@@ -330,12 +288,6 @@ def test_every_remedy_can_be_typed_as_it_stands(tmp_path: Path) -> None:
         for command in check.remedy:
             checked = subprocess.run(["bash", "-n", "-c", command], capture_output=True, text=True)
             assert checked.returncode == 0, (command, checked.stderr)
-
-
-def test_what_was_really_given_is_reported() -> None:
-    given = obtained()
-    assert given is not None
-    assert given.scheduling
 
 
 # --- judgements: files in place of /proc and /sys, canned answers of commands -----------------
@@ -491,7 +443,6 @@ JUDGED = [
         (card(duplex="half"), BAD, "half"),
         (card(speed="10"), BAD, "10 Mbit/s"),
         (card(speed="-1", duplex="unknown"), OK, "speed not stated"),
-        (card(speed="gibberish"), OK, "speed not stated"),
         (card(wireless__x=""), BAD, "wireless"),
         (card(), WARN, "shared with other traffic", ip({"dst": "default", "dev": "eth1"})),
     ),
@@ -517,10 +468,8 @@ JUDGED = [
         ({}, OK, "no packet filter"),
         ({"/proc/net/netfilter/nf_log": ""}, UNKNOWN, "neither nft nor iptables"),
         ({}, OK, "no rule", says(0, "", command="nft")),
-        ({}, OK, "no rule", says(0, CHAIN % ("accept", ""), command="nft")),
         ({}, WARN, "drop", says(0, CHAIN % ("drop", ""), command="nft")),
         ({}, WARN, "drop", says(0, CHAIN % ("accept", "udp dport 1000 drop "), command="nft")),
-        ({}, OK, "no rule", says(0, "-P INPUT ACCEPT\n", command="iptables")),
         ({}, WARN, "drop", says(0, "-P INPUT DROP\n", command="iptables")),
         ({}, WARN, "drop", says(0, UFW, command="iptables")),
         ({}, OK, "no rule", says(0, UFW.replace("DROP", "ACCEPT"), command="iptables")),
@@ -535,11 +484,9 @@ JUDGED = [
         (BUS | {"/sys/class/net/can0/operstate": "down"}, BAD,
          "bitrate 1000000 dbitrate 5000000 fd on"),
         (BUS, OK, "5000000", rates(1_000_000, 5_000_000)),
-        (BUS, BAD, "500000", rates(500_000, 5_000_000)),
         (BUS, BAD, "2000000", rates(1_000_000, 2_000_000)),
         (BUS, BAD, "1000000", rates(1_000_000, None)),
         (BUS, UNKNOWN, "not stated", ip()),
-        (BUS, UNKNOWN, "not stated", {"ip": Answer(0, "not json")}),
         (BUS, OK, "virtual bus", ip({"linkinfo": {"info_kind": "vcan"}})),
     ),
     *of(lambda s: link.can_check(CanTable(interface="slcan", channel="/dev/ttyACM0"), s),
@@ -622,7 +569,6 @@ def test_a_command_that_is_not_there_or_hangs_gives_no_answer(
     assert run_command(["no-such-command"]) is None
     assert run_command(["sleep", "5"]) is None
     answer = run_command(["true"])
-    assert answer is not None
     assert answer.status == 0
 
 
@@ -649,12 +595,9 @@ def test_the_way_to_the_controller_is_judged(
     assert len(others) == (4 if "directly" in first.found else 0)
 
 
-def test_who_has_the_port_is_named(tree: Tree) -> None:
+def test_a_port_is_tried_and_who_has_it_is_named(tree: Tree) -> None:
     who = Answer(0, 'UNCONN 0 0 0.0.0.0:1000 0.0.0.0:* users:(("orchestra",pid=42,fd=4))\n')
     found = link.port_check("", 1000, errno.EADDRINUSE, tree.system(ss=who)).found
     assert "orchestra (process 42)" in found
-
-
-def test_a_port_is_tried() -> None:
     assert link.try_port("127.0.0.1", 0) == 0
     assert link.try_port("192.0.2.77", 0) == errno.EADDRNOTAVAIL

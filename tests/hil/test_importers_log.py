@@ -413,6 +413,5 @@ def test_tx40_positions_and_torques_in_two_files(tmp_path: Path, shared_data: Pa
     q[:, 5] -= q[:, 4]
     q += [0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0]
     assert recording.position == pytest.approx(q, abs=1e-12)
-    assert recording.torque is not None
     assert recording.torque[:, 3] == pytest.approx(-48.0 * torque[:, 3])
     assert recording.torque[:, 4] == pytest.approx(45.0 * torque[:, 4] + 32.0 * torque[:, 5])

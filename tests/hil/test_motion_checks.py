@@ -245,7 +245,6 @@ def test_a_design_keeps_the_limit_too(cell: Cell) -> None:
         problem_of(limited(cell, torque), preset("b"))
     roomy = limited(cell, [1e4] * 6)
     currents = problem_of(roomy, preset("b")).constraints.currents
-    assert currents is not None
     np.testing.assert_array_equal(currents.torque_limit, [1e4] * 6)
 
 

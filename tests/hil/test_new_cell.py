@@ -292,23 +292,6 @@ def test_an_archive_whose_cell_names_no_arm_is_of_the_first(arm: str, tmp_path: 
     assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
 
 
-def test_namespace_and_encoding_of_the_urdf_change_nothing(
-    two_joints: Path, tmp_path: Path
-) -> None:
-    follows = '<mimic joint="hip" offset="0.3"/><limit effort="60" velocity="0"/>'
-    plain = TWO_JOINTS.replace('<limit effort="60" velocity="0"/>', follows)
-    drakes = plain.replace("<robot ", '<robot xmlns="http://drake.mit.edu" ')
-    drakes = drakes.replace('version="1.0"', 'version="1.0" encoding="GB2312"')
-    written = []
-    for text in (plain, drakes):
-        two_joints.write_text(text)
-        new(two_joints, tmp_path / "cell.toml", "--force")
-        copy = (tmp_path / "cell.urdf").read_text()
-        assert [*pin.buildModelFromXML(copy).names][1:] == ["hip"]
-        written.append((tmp_path / "cell.toml").read_text())
-    assert written[0] == written[1]
-
-
 def test_whoever_names_a_pipe_is_told_to_write_it_to_a_file(tmp_path: Path) -> None:
     """As `hil new --urdf <(xacro robot.xacro)` does."""
     reading, writing = os.pipe()

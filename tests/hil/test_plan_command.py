@@ -83,17 +83,6 @@ def test_degrees_are_the_teach_pendants_and_end_up_in_the_frame_of_the_urdf(run,
     np.testing.assert_allclose(frame.shown(frame.urdf(pendant)), pendant)
 
 
-def test_a_wider_fly_is_faster_and_misses_by_more(run, via):
-    outs = [json.loads(run("--via", via, "--json", "--fly", fly)) for fly in (0, 25, 50, 100)]
-    durations = [out["duration"] for out in outs]
-    missed = [out["targets"][0]["distance_deg"] for out in outs]
-    assert durations == sorted(durations, reverse=True) and len(set(durations)) == 4
-    assert missed == sorted(missed) and missed[0] == 0.0 < missed[1]
-    assert outs[0]["duration"] == pytest.approx(outs[0]["duration_with_stops"])
-    assert {target["how"] for target in outs[0]["targets"]} == {"stopped"}
-    assert all(out["worst_limit_ratio"] <= 1.0 for out in outs)
-
-
 def test_fly_by_distance_and_slower_moves(run, via):
     out = json.loads(run("--via", via, "--json", "--fly-distance", 1.5))
     assert 0.0 < out["targets"][0]["distance_deg"] <= 1.5
@@ -195,27 +184,6 @@ def test_a_byte_order_mark_is_no_part_of_the_start(run, via, tmp_path):
     plain.write_text(VIA.split("\n", 2)[2])
     marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
     assert run("--via", marked) == run("--via", plain) == run("--via", via)
-
-
-@pytest.fixture
-def planning_nothing(monkeypatch):
-    """Planning is an error: what cannot be written is refused before it."""
-
-    def planned(*arguments: object) -> None:
-        raise AssertionError("planned")
-
-    monkeypatch.setattr("hil.cli.plan.isolated", planned)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [["--output", "plan.yaml"], ["--picture", "plan.bmp"], ["--rate", "-1"]],
-)
-def test_what_cannot_be_written_is_refused_before_planning(app, via, planning_nothing, arguments):
-    with pytest.raises(InputError, match=r"no plan file|no format|no table"):
-        CliRunner().invoke(
-            app, [str(CELL_PATH), "--via", str(via), *arguments], catch_exceptions=False
-        )
 
 
 @pytest.mark.parametrize("suffix", ["toml", "json"])

@@ -74,7 +74,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
 def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(recorded: Path) -> None:
     archive = open_archive(recorded)
     assert archive.complete
-    assert archive.outcome is not None
     assert archive.outcome.entries["records_lost"] == "0"
     columns = archive.columns
     assert np.all(np.diff(columns["cycle"]) == 1)
@@ -99,7 +98,6 @@ def test_the_recording_alone_gives_the_planted_parameters(recorded: Path) -> Non
     found = identify_archives([recorded], Silent())
     assert found.verdict.good, found.verdict.line
     coverage = found.results.coverage
-    assert coverage is not None
     # 95 % of 58 parameters are within two standard deviations where the model is the plant's;
     # what smoothing leaves of the controller's jerk costs some of them.
     assert coverage.within_3 >= 0.9 * coverage.total
@@ -140,7 +138,6 @@ def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> N
     archive = open_archive(tmp_path / NAME)
     assert {*np.diff(archive.columns["cycle"]).tolist()} == {1, 2}
     assert archive.columns["gap"].sum() == 1
-    assert archive.outcome is not None
     assert archive.outcome.entries["lost_packets"] == "1"
 
 
@@ -261,7 +258,6 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
         running(*own_motion(path, port)) as controller,
         recorder_of(path, "--duration", "1.5", "--json") as recorder,
     ):
-        assert recorder.stderr is not None
         assert "recording complete; still answering" in recorder.stderr.readline()
         assert open_archive(tmp_path / "a.mcap").complete
         time.sleep(1.5)
@@ -279,7 +275,6 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     assert summary["outcome"] == "completed"
     assert summary["records_lost"] == summary["events_lost"] == 0
     assert summary["cycles"] == archive.n_samples
-    assert archive.outcome is not None
     assert archive.outcome.entries["late_answers"] == str(summary["late"])
     assert archive.outcome.entries["answers_not_taken"] == str(summary["not_accepted"])
     cycles = archive.columns["cycle"]
@@ -341,7 +336,6 @@ def test_a_session_that_ends_before_the_duration_is_over_is_told(
     assert "of 60 s" in words
     assert "a.mcap" in words
     archive = open_archive(tmp_path / "a.mcap")
-    assert archive.outcome is not None
     assert archive.outcome.entries["outcome"] == "completed"
 
 
@@ -370,7 +364,6 @@ def test_a_killed_exchange_ends_a_recording_as_lost(
     assert "the exchange process ended" in errors
     assert "a.mcap" in errors
     outcome = open_archive(archive).outcome
-    assert outcome is not None
     assert (outcome.outcome, outcome.reason) == ("lost", "the exchange process ended")
 
 
@@ -413,7 +406,6 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(
 ) -> None:
     path, _ = on_udp
     with recorder_of(path) as recorder:
-        assert recorder.stdout is not None
         assert "waiting for the controller" in recorder.stdout.readline()
         assert "nothing heard from 127.0.0.1 (0 packets from elsewhere)" in until_heard(recorder)
         recorder.send_signal(signal.SIGINT)

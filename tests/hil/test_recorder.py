@@ -96,12 +96,7 @@ def bytes_of_an_init() -> bytes:
     return init
 
 
-def test_torques_are_those_of_the_drive_train_in_force(recorder: Recorder) -> None:
-    recorder.take(cycles(0, 10), [])
-    assert read(recorder).columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0)
-
-
-def test_an_interval_is_over_when_its_motion_came_to_rest(recorder: Recorder) -> None:
+def test_a_motion_that_ends_or_a_silent_link_is_noticed(recorder: Recorder) -> None:
     recorder.take(cycles(0, 100), [MotionStarted(0, 10)])
     assert not recorder.over
     recorder.take(cycles(100, 50), [ended("completed", 140)])
@@ -134,26 +129,16 @@ def test_a_controller_that_starts_anew_has_no_place_in_the_same_file(recorder: R
     assert [event.name for event in archive.events] == ["MotionEnded", "InitReceived"]
 
 
-def test_a_silent_link_is_noticed(recorder: Recorder) -> None:
+def test_a_silent_link_and_lost_records_are_noticed(recorder: Recorder) -> None:
     recorder.take(cycles(0, 10), [LinkLost(1.2, State.CLOSED)])
     assert recorder.link_lost
-    assert "nothing heard for 1.200 s" in read(recorder).events[0].text
-
-
-def test_lost_records_are_an_event_and_in_the_outcome(recorder: Recorder) -> None:
-    recorder.take(cycles(0, 10), [])
     recorder.take(cycles(17, 10), [], lost=7)
     archive = read(recorder)
-    assert archive.outcome is not None
     assert archive.outcome.entries["records_lost"] == "7"
-    assert [event.text for event in archive.events] == ["7 records overwritten"]
-
-
-def test_a_spec_gains_what_is_known_later(spec: ArchiveSpec) -> None:
-    more = spec.with_more({"accepted_init": "yes"}, {"init_packet.bin": b"x"})
-    assert more.metadata == {"simulated": "yes", "accepted_init": "yes"}
-    assert more.attachments == {"init_packet.bin": b"x"}
-    assert spec.attachments == {}
+    silent, lost = (event.text for event in archive.events)
+    assert "nothing heard for 1.200 s" in silent
+    assert lost == "7 records overwritten"
+    assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
 
 
 def at(*numbers: int) -> NDArray[np.void]:
@@ -255,7 +240,12 @@ def test_a_recording_on_the_simulated_link_keeps_every_packet_of_both_ends(
 ) -> None:
     path = recorded(tmp_path, keeping_packets(cell))
     archive = open_archive(path)
-    assert archive.outcome is not None
+    part = {"start": 0.25, "stop": 0.35}
+    cycles = open_archive(path, topics=[CYCLE], **part).columns["cycle"]
+    some = open_archive(path, topics=[PACKETS], **part).columns["cycle"]
+    assert some.tolist() == np.repeat(cycles, 2).tolist()
+    with pytest.raises(ValueError, match="open one at a time"):
+        open_archive(path, topics=[CYCLE, PACKETS])
     assert_decoded_packets_are_the_cycles(archive, path)
     packets = packets_of(path)
     inits = [place for place, packet in enumerate(packets) if is_init(packet[3])]
@@ -267,21 +257,6 @@ def test_a_recording_on_the_simulated_link_keeps_every_packet_of_both_ends(
     assert archive.outcome.entries["packets"] == str(len(packets))
     assert archive.outcome.entries["packets_lost"] == "0"
     assert check_archive(path).keeps, check_archive(path).faults
-
-
-def test_the_cycles_are_those_of_an_archive_without_packets(tmp_path: Path, cell: Cell) -> None:
-    with_them, without = tmp_path / "with", tmp_path / "without"
-    with_them.mkdir()
-    without.mkdir()
-    rich = open_archive(recorded(with_them, keeping_packets(cell)))
-    poor = open_archive(recorded(without, cell))
-    assert poor.outcome is not None
-    assert poor.outcome.packets is None
-    for name, column in poor.columns.items():
-        assert column.tobytes() == rich.columns[name].tobytes(), name
-    assert poor.events == rich.events
-    with pytest.raises(ValueError, match="open one at a time"):
-        open_archive(rich.path, topics=[CYCLE, PACKETS])
 
 
 def test_a_packet_that_was_lost_is_not_there_and_those_around_it_keep_their_cycles(
@@ -306,20 +281,11 @@ def test_a_recording_over_udp_keeps_every_packet_of_both_ends(tmp_path: Path, ce
         )
     assert done.outcome == "completed"
     archive = open_archive(path)
-    assert archive.outcome is not None
     assert archive.outcome.entries["packets_lost"] == "0"
     assert_decoded_packets_are_the_cycles(archive, path)
     first = next(packet for packet in packets_of(path) if len(packet[3]) == INIT_LENGTH)
     assert first[3] == archive.attachments["init_packet.bin"]
     assert check_archive(path).keeps, check_archive(path).faults
-
-
-def test_packets_of_a_range_of_times_are_those_of_its_cycles(tmp_path: Path, cell: Cell) -> None:
-    path = recorded(tmp_path, keeping_packets(cell))
-    part = {"start": 0.25, "stop": 0.35}
-    cycles = open_archive(path, topics=[CYCLE], **part).columns["cycle"]
-    packets = open_archive(path, topics=[PACKETS], **part).columns["cycle"]
-    assert packets.tolist() == np.repeat(cycles, 2).tolist()
 
 
 def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
@@ -335,18 +301,6 @@ def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
     assert after
     assert before[: len(after)] == after
     assert open_archive(repaired.output).complete
-
-
-def test_a_ring_says_how_many_packets_were_overwritten_and_keeps_the_newest() -> None:
-    ring = PacketRing(4)
-    for number in range(10):
-        ring.put(number, 0.5, number % 2 == 1, bytes([number]) * 30)
-    kept = ring.drain()
-    assert ring.overflow == 6
-    assert kept["cycle"].tolist() == [6, 7, 8, 9]
-    assert kept["sent"].tolist() == [0, 1, 0, 1]
-    assert kept["data"][0, :31].tolist() == [6] * 30 + [0]
-    assert ring.drain().size == 0
 
 
 def test_of_a_packet_too_long_for_a_controller_the_first_bytes_are_kept() -> None:

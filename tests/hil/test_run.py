@@ -204,7 +204,6 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
         *(one.trajectory for one in campaign.plan.validation),
     ]
     found = DryRun.load(campaign.folder)
-    assert found is not None
     assert (found.warnings, found.gravity_not_seen) == ((), ()), "torques of a right cell"
     for name, motion in zip(sorted(found.archives), motions, strict=True):
         archive = open_archive(campaign.folder.archives / name)
@@ -220,8 +219,6 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
     rest = campaign.run(accept_dry_run=True)
     assert kinds(rest) == ["move", "standstill", "excitation", "validation", "move"]
     accepted = DryRun.load(campaign.folder)
-    assert accepted is not None
-    assert accepted.accepted is not None
     assert accepted.accepted.by
     assert rest.complete
     assert campaign.run().archives == (), "accepted once, and nothing is missing"
@@ -353,7 +350,6 @@ def test_a_slowed_repetition_is_rejected_and_run_again(
     assert entry.reason == rejected.reason
     archive = open_archive(campaign.folder.archives / rejected.archive)
     assert archive.complete
-    assert archive.outcome is not None
     assert archive.outcome.entries["outcome"] == "rejected"
     assert archive.outcome.entries["reason"] == rejected.reason
     # Whoever names all files of the folder does not pool it either.
@@ -546,7 +542,6 @@ def test_friction_is_measured_without_knowing_the_arm_exactly(
 def rested(campaign: Campaign, seconds: float) -> None:
     """The arm moved last so many seconds ago."""
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert found is not None
     assert found.moved_at == pytest.approx(time.time(), abs=60.0)
     replace(found, moved_at=time.time() - seconds).save(campaign.folder.warmup)
 
@@ -565,7 +560,6 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(
     assert kinds(first)[1:] == [*["warmup"] * 5, "standstill", *["excitation"] * 2, "validation",
                                 "move"]  # fmt: skip
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert found is not None
     curve = found.curve
     assert curve.friction.shape == (5, 2)
     assert np.all(curve.friction[-1] < curve.friction[0]), "friction falls as the gears warm up"
@@ -582,26 +576,7 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(
     cold = campaign.run(simulated_link(campaign.cell, effects=True), unrehearsed=True)
     assert kinds(cold) == ["move", *["warmup"] * 5, "excitation", "move"]
     later = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert later is not None
     assert [len(later.earlier), len(later.motions)] == [5, 5]
-
-
-def test_a_warm_up_that_takes_too_long_goes_on_and_says_so(make: Make) -> None:
-    campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=4)
-    result = campaign.run(simulated_link(campaign.cell, effects=True), unrehearsed=True)
-    assert result.warm_up == "not warm"
-    assert kinds(result).count("warmup") == 4
-    assert result.complete
-
-
-def test_a_damaged_record_of_a_warm_up_or_a_dry_run_is_named(make: Make) -> None:
-    campaign = make()
-    campaign.folder.dry_run.write_text("{}", "utf-8")
-    with pytest.raises(CampaignFolderError, match=r"dry_run\.json is damaged"):
-        campaign.run(accept_dry_run=True)
-    campaign.folder.warmup.write_text("{}", "utf-8")
-    with pytest.raises(CampaignFolderError, match=r"warmup\.json is damaged"):
-        campaign.run(unrehearsed=True)
 
 
 # --- What a run does not take for granted: files that were edited, copied, torn or half written
@@ -893,7 +868,6 @@ def test_a_plan_that_failed_with_another_seed_says_so(
     campaign = make()
     good = Rehearsal.load(campaign.folder)
     pass_rehearsal(campaign.folder, passed=False)
-    assert good is not None
     other = good.model_copy(update={"seed": 7})
     monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: other)
     told = "passed with seed 7, but failed with seed 1"
@@ -1103,11 +1077,11 @@ def test_a_warm_up_motion_that_was_slowed_tells_nothing_of_friction(make: Make) 
     result = campaign.run(operator=slowed_once("warm-up"), unrehearsed=True)
     assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert found is not None
     assert [one.archive for one in found.motions] == [
         "warmup_000_a2.mcap", "warmup_001_a1.mcap", "warmup_002_a1.mcap"
     ]  # fmt: skip
     assert any("not warm" in note for note in result.notes)
+    assert result.warm_up == "not warm" and result.complete
 
 
 def test_a_warm_up_motion_that_was_not_noted_is_adopted(
@@ -1116,7 +1090,6 @@ def test_a_warm_up_motion_that_was_not_noted_is_adopted(
     campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
     campaign.run(unrehearsed=True)
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    assert found is not None
     entries = json.loads((campaign.folder.root / "manifest.json").read_text())
     later = ("warmup_002", "standstill", "excitation", "validation", "move_001")
     entries["archives"] = [e for e in entries["archives"] if not e["name"].startswith(later)]

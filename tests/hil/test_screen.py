@@ -175,18 +175,6 @@ def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
         assert (len(rows) > 1) is terminal
 
 
-def test_a_bar_is_as_long_as_its_share() -> None:
-    assert layout.bar(0.5, 10).plain == "█████·····"
-    assert layout.bar(0.0, 4).plain == "····"
-    assert layout.bar(1.0, 4).plain == "████"
-    assert layout.bar(1.01, 4).plain == "███▶"
-    assert layout.bar(float("nan"), 4).plain == "?   "
-    assert [layout.percent(share) for share in (0.004, 0.0994, 0.0996, 0.5, 1.3)] == [
-        "0.4%", "9.9%", " 10%", " 50%", "130%",
-    ]  # fmt: skip
-    assert layout.curve([0.0, 1.0, 2.0, float("nan"), 4.0], 3) == "▃▅█"
-
-
 def test_a_plain_line_says_the_same() -> None:
     line = layout.status_line(status())
     assert layout.status_line(status(), "0:42 left").endswith(", 0:42 left")

@@ -160,7 +160,6 @@ class TestErrors:
         short = fitted(np.ones((6, 4)))
         fits = {"a": fitted(np.arange(24.0).reshape(6, 4), 20.0), "b": short}  # 120 s and 48 s
         equal = equal_data(fits)
-        assert equal is not None
         assert (equal.cut, equal.repetitions, equal.seconds) == ("a", 2, 40.0)
         assert (equal.other, equal.other_seconds) == ("b", 48.0)
         assert estimates_of(fits)["a-equal"].tolist() == [2.0, 3.0, 4.0, 5.0]
@@ -201,7 +200,6 @@ class TestSpread:
         logs = np.random.default_rng(3).normal(0.1, 0.3, 12)
         same = np.ones((12, 4, 4))
         found = spread(same, same * np.exp(2.0 * logs)[:, None, None], drifts=False, seed=0)
-        assert found is not None
         assert found[1] == pytest.approx(11.0)
         # A standard deviation of 4000 draws is known to about 1 %.
         assert found[0] == pytest.approx(stats.sem(logs), rel=0.05)
@@ -215,7 +213,6 @@ class TestSpread:
             )
             for m in (10, 160)
         )
-        assert few is not None and many is not None
         assert many[0] > 0.5 * few[0]  # over motions alone it would fall to a quarter
 
     @pytest.mark.parametrize("repetitions", [3, 10])
@@ -250,7 +247,6 @@ class TestSpread:
         other = 1.0 + random.standard_normal((27, 4))
         inner = forms.torque_kernels(1.0 + slow), forms.torque_kernels(other)
         single, blocks = (spread(*inner, drifts=drifts, seed=0) for drifts in (False, True))
-        assert single is not None and blocks is not None
         assert blocks[0] > 1.1 * single[0]
         assert blocks[1] < single[1]
 

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import ast
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
-
-from hil.campaign import Campaign
-from hil.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
 SHELL = sorted((ROOT / "hil" / "cli").glob("*.py"))
 OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
-TERMINAL = ("typer", "click", "rich")
 ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvxpy", "clarabel",
            "matplotlib", "mcap", "zstandard", "lz4", "isal", "rosbags", "can", "serial", "pydantic",
            "jinja2", "foxglove", "distributed", "fsspec", "pyarrow")  # fmt: skip
@@ -108,63 +100,3 @@ def test_nothing_that_a_script_uses_knows_the_command_line() -> None:
                 continue
             names = list(imported(ast.parse(path.read_text("utf-8"))))
             assert not [n for n in names if n.startswith(("hil.cli", "typer", ".cli"))], path
-
-
-class Face:
-    """Stands for `hil.Campaign`: keeps what it is asked, and answers with words."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[str, dict[str, Any]]] = []
-        self.folder = SimpleNamespace(root=Path("c"))
-        controller = SimpleNamespace(transport="simulated")
-        self.cell = SimpleNamespace(
-            joint_names=("one", "two"), controller=controller, only_simulated=True
-        )
-
-    def _note(self, name: str, words: dict[str, Any], answer: Any) -> Any:
-        self.asked.append((name, words))
-        return answer
-
-    def rehearse(self, **words: Any) -> Any:
-        answer = SimpleNamespace(line="passed by the face", criteria=[], not_seen=[], passed=True)
-        return self._note("rehearse", words, answer)
-
-    def run(self, *_: Any, **words: Any) -> Any:
-        answer = SimpleNamespace(to_dict=lambda: {"ran": "by the face"})
-        return self._note("run", words, answer)
-
-    def status(self) -> Any:
-        return self._note("status", {}, SimpleNamespace(to_dict=lambda: {"stands": "by the face"}))
-
-    def report(self, **words: Any) -> Any:
-        return self._note("report", words, "made by the face")
-
-
-@pytest.mark.parametrize(
-    ("line", "asked", "told"),
-    [
-        ("rehearse c --seed 3 -q", ("rehearse", {"seed": 3, "again": False}), "passed by the face"),
-        ("status c --json", ("status", {}), {"stands": "by the face"}),
-        ("report c -q", ("report", {}), "made by the face"),
-        (
-            "run c --no-identify --json --accept-dry-run",
-            ("run", {"accept_dry_run": True, "dry_run_only": False, "live": None}),
-            {"ran": "by the face", "verdict": None},
-        ),
-    ],
-)
-def test_a_command_of_a_campaign_is_one_call_and_its_answer(
-    line: str,
-    asked: tuple[str, dict[str, Any]],
-    told: str | dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    face = Face()
-    monkeypatch.setattr(Campaign, "open", classmethod(lambda *_: face))
-    result = CliRunner().invoke(app, line.split())
-    assert result.exit_code == 0, result.output
-    ((name, words),) = face.asked
-    assert name == asked[0]
-    assert {key: words[key] for key in asked[1]} == asked[1]
-    output = result.stdout.strip()
-    assert (json.loads(output) if isinstance(told, dict) else output) == told

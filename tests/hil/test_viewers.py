@@ -32,10 +32,8 @@ from hil.identify import Identification, identify_campaign
 from hil.identify.options import FIXED
 from hil.plots.archive_view import (
     ArchiveView,
-    Trace,
     archive_page,
     draw_archive,
-    even,
     view_of,
 )
 from hil.progress import Silent
@@ -346,21 +344,6 @@ def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
     assert content["marks"] == [round(time, 6) for time, _, _, _ in view.events]
     assert content["plots"][2]["limits"] == pytest.approx(view.quantities[2].traces[0].limits)
     assert "Zoom over time" in page and "MotionEnded" in page
-
-
-def test_an_even_line_keeps_samples_peaks_and_gaps() -> None:
-    time = np.arange(100) * 0.01
-    value = np.sin(9.0 * time)
-    assert even(Trace(time, value), time) == pytest.approx(value)
-    value[[20, 71]] = 5.0, -5.0
-    coarse = even(Trace(time, value), np.linspace(0.0, time[-1], 20))
-    assert coarse.max() == 5.0 and coarse.min() == -5.0
-    broken = Trace(
-        np.concatenate([time[:40], [np.nan], time[60:]]),
-        np.concatenate([value[:40], [np.nan], value[60:]]),
-    )
-    there = np.isfinite(even(broken, time))
-    assert there.tolist() == [True] * 40 + [False] * 20 + [True] * 40
 
 
 def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:

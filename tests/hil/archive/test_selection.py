@@ -48,23 +48,13 @@ class TestTimes:
         assert [event.data["start"] for event in archive.events] == inside.tolist()
         assert archive.complete != torn
 
-    def test_what_describes_the_archive_is_there_all_the_same(self, written):
-        archive = open_archive(written.path, start=50.1, stop=50.2)
-        whole = open_archive(written.path)
-        assert archive.attachments == whole.attachments
-        assert archive.header.entries == whole.header.entries
-        assert archive.outcome == whole.outcome
-        assert archive.complete
-
-    def test_chunks_outside_the_range_are_not_read(self, written, path):
+    def test_damage_is_missed_inside_the_range_alone(self, written, path):
         """A damage there stops a full reading, but not this one."""
         path.write_bytes(written.changed(written.chunks[1], -5))
         assert open_archive(path).n_samples == 10
         archive = open_archive(path, start=50.2)
         assert archive.complete
         assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:])
-
-    def test_a_damage_inside_the_range_is_said(self, written, path):
         path.write_bytes(written.changed(written.chunks[3], -5))
         archive = open_archive(path, start=50.2)
         assert not archive.complete
@@ -81,22 +71,16 @@ class TestTimes:
 
 
 class TestChannels:
-    def test_the_commanded_motion_can_be_read_alone(self, written):
+    def test_one_can_be_read_alone(self, written):
         archive = open_archive(written.path, topics=["/joint_states_commanded"])
         assert set(archive.columns) == {"stamp", "position", "velocity"}
         assert np.array_equal(archive.columns["position"], written.rows["commanded_position"])
         assert archive.events == ()
-
-    def test_events_can_be_read_alone(self, written):
         archive = open_archive(written.path, topics=["/hil/events"])
         assert [event.data["start"] for event in archive.events] == [0, 15, 30]
         assert archive.n_samples == 0
-
-    def test_a_channel_that_is_not_there_is_refused_with_those_that_are(self, written):
         with pytest.raises(ArchiveError, match=r"/wheel: has no such channel; it has /hil/cycle,"):
             open_archive(written.path, topics=["/wheel"])
-
-    def test_channels_with_the_same_columns_are_opened_one_at_a_time(self, written):
         with pytest.raises(ValueError, match="have the same names"):
             open_archive(written.path, topics=["/joint_states", "/hil/cycle"])
 
@@ -128,13 +112,10 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_reading_one_column_takes_little_more_than_the_column(long):
+def test_reading_a_part_takes_little_more_than_the_part(long):
     column = CYCLES * 8
     assert CONTENT > 2.5 * WORK
     assert peak(lambda: open_archive(long, fields=["cycle"])) < 3 * column + WORK
-
-
-def test_a_range_takes_little_whatever_the_length(long):
     assert peak(lambda: open_archive(long, start=1.0, stop=1.1)) < WORK
 
 
