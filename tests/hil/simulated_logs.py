@@ -141,5 +141,6 @@ def column_map(**entries: object) -> ColumnMap:
 def imported(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:
     """The columns of a log's archive, which lies beside it; entries as of `column_map`."""
     path = source.with_suffix(".mcap")
+    path.unlink(missing_ok=True)
     import_log(source, path, robot=robot, columns=column_map(**entries))
     return dict(open_archive(path).columns)

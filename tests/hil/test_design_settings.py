@@ -23,8 +23,6 @@ from identification.excitation import (
     CollisionChecker,
     NoFeasibleMotionError,
     Objective,
-    SineGenome,
-    ViaPointGenome,
     Violation,
     check_motion,
     sampled,
@@ -71,17 +69,15 @@ def test_presets_are_files_with_all_constraints_on(method, tmp_path):
 
 
 def test_a_file_may_leave_out_what_its_method_says_already():
+    """Sines can be searched by any method, via points by method A."""
     assert settings_of({"method": "b"}) == preset("b")
     assert settings_of({}) == preset("front")
     mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
-    assert mine.via_points is not None and mine.via_points.n_via == 9
+    assert mine.via_points.n_via == 9
     assert mine.via_points.fly == 0.5 and mine.search == preset("b").search
-
-
-def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
     front = settings_of({"method": "front", "sines": {"harmonics": 5}})
     assert front.via_points is None
-    assert front.sines is not None and front.sines.harmonics == 5 and front.sines.length == 20.0
+    assert front.sines.harmonics == 5 and front.sines.length == 20.0
     a = settings_of({"method": "a", "via_points": {}})
     assert a.sines is None and a.via_points == preset("b").via_points
 
@@ -92,34 +88,25 @@ def test_sines_can_be_searched_by_any_method_and_via_points_by_method_a():
         ('metod = "b"', ["metod", "is not a field", "known are", "method"]),
         ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
         ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),
-        ('[search]\npopulation = "many"', ["search.population = 'many'", "4 to 10000"]),
         ('[search]\npopulation = "24"', ["search.population = '24'", "4 to 10000"]),
-        ('[search]\nmutation = "0.1"', ["search.mutation = '0.1'", "0 to 1"]),
         ("[search]\npopulation = true", ["search.population = True", "4 to 10000"]),
         ('[constraints]\nclosed = "yes"', ["constraints.closed = 'yes'", "true or false"]),
         ("[search]\nmutation = 1.5", ["search.mutation = 1.5", "0 to 1"]),
-        ("[search]\nmutation = nan", ["search.mutation", "0 to 1"]),
         ("[search]\nweights = [0.7, 0.7]", ["search", "1.4", "add up to 1"]),
         ("[search]\nweights = [1.0]", ["search.weights", "log det"]),
         ("[via_points]\nn = 6", ["via_points.n", "known are", "n_via"]),
         ("[via_points]\nslowest = 0.0", ["via_points.slowest = 0.0", "above 0, at most 1"]),
         ("[via_points]\n[sines]", ["both", "[via_points]", "[sines]", "give one"]),
         ("[sines]\nramp = 0.04", ["sines", "a ramp of 0.04 s is a blow", "0.05 s or longer"]),
-        ("[sines]\nramp = -0.1", ["sines.ramp = -0.1", "0 for none"]),
         ("[sines]\nramp = 11.0", ["sines", "two ramps of 11 s", "20 s"]),
         ("[sines]\nfastest = [1.0, -1.0]", ["sines.fastest", "rad/s"]),
         ('[sines]\noffset = "nowhere"', ["sines.offset = 'nowhere'", '"middle"', '"home"']),
         ("[constraints]\nmin_duration = 30.0", ["min_duration = 30 s", "max_duration = 20 s"]),
         ("[constraints]\nmax_duration = inf", ["constraints.max_duration", "above 0"]),
-        ("constraints = 3", ["constraints = 3: is no table", "a table [constraints]"]),
         ("[[search]]\n", ["search", "is no table", "a table [search]"]),
         (
             'method = "a"\n[constraints]\nmax_duration = 10.0',
             ["[sines] length = 20 s is not between [constraints] min_duration = 0 s and max_dur"],
-        ),
-        (
-            "[sines]\nlength = 5.0\nramp = 1.0\n[constraints]\nmin_duration = 6.0",
-            ["[sines] length = 5 s is not between [constraints] min_duration = 6 s"],
         ),
         ("seed = -1", ["seed = -1", "0 or more"]),
         ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
@@ -147,15 +134,15 @@ def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_p
 
 def test_via_points_lead_home_unless_the_path_is_open(cell):
     closed = problem_of(cell, preset("b")).genome
-    assert isinstance(closed, ViaPointGenome) and closed.home is not None
     np.testing.assert_array_equal(closed.home, cell.home)
     open_path = problem_of(cell, preset("b").kinematic())
-    assert isinstance(open_path.genome, ViaPointGenome) and open_path.genome.home is None
+    assert open_path.genome.home is None
     assert open_path.constraints.checker is None and open_path.constraints.currents is None
     assert open_path.genome.n_genes == (6 + 1) * 6  # K via points and a speed, for each joint
 
 
-def test_frequencies_are_the_papers_or_from_the_limits(cell):
+def test_sines_have_the_papers_frequencies_or_those_of_the_limits(cell):
+    """Offsets are in the frame of the limits; a bare series is not asked to rest."""
     settings, limits = preset("a").kinematic(), cell.joint_limits
     slowest, fastest = problem_of(cell, settings).genome.frequency_range
     np.testing.assert_array_equal(slowest, np.full(6, 0.314))
@@ -163,25 +150,23 @@ def test_frequencies_are_the_papers_or_from_the_limits(cell):
     of_limits = problem_of(cell, settings.replaced(sines={"fastest": "from limits"})).genome
     room = (limits.upper - limits.lower) / 2.0
     np.testing.assert_allclose(of_limits.frequency_range[1], np.sqrt(limits.acceleration / room))
-
-
-def test_an_offset_is_read_in_the_frame_of_the_limits(cell):
-    settings = preset("a").kinematic()
     for offset in ("home", [0.0, 0.0, -90.0, 0.0, 90.0, 0.0]):
         genome = problem_of(cell, settings.replaced(sines={"offset": offset})).genome
-        assert isinstance(genome, SineGenome)
         np.testing.assert_array_equal(genome.centre, cell.home)
+    assert problem_of(cell, settings).constraints.at_rest
+    assert not problem_of(cell, settings.replaced(sines={"ramp": 0.0})).constraints.at_rest
+    with pytest.raises(SettingsError, match=r"sines\.fastest.*2 entries.*6 joints.*joint_6"):
+        problem_of(cell, settings.replaced(sines={"fastest": [1.0, 2.0]}))
 
 
-@pytest.mark.parametrize("angle", [120.0, -170.0])
-def test_an_offset_outside_the_limits_is_told_as_it_was_written(cell, angle):
-    offset = [0.0, 0.0, angle, 0.0, 90.0, 0.0]
+def test_an_offset_outside_the_limits_is_named_as_it_was_written(cell):
+    offset = [0.0, 0.0, 120.0, 0.0, 90.0, 0.0]
     with pytest.raises(SettingsError) as caught:
         problem_of(cell, preset("a").kinematic().replaced(sines={"offset": offset}))
-    said = str(caught.value)
-    assert f"sines.offset = {offset}" in said
-    assert f"joint_3 is not inside its limits, -170 to 110 deg, at {angle:g} deg" in said
-    assert "teach pendant angles" in said and "rad" not in said
+    text = str(caught.value)
+    assert f"sines.offset = {offset}" in text
+    assert "joint_3 is not inside its limits, -170 to 110 deg, at 120 deg" in text
+    assert "teach pendant angles" in text and "rad" not in text
 
 
 def test_what_is_not_looked_at_is_named():
@@ -190,14 +175,6 @@ def test_what_is_not_looked_at_is_named():
     assert preset("b").kinematic().unchecked == everything
     bare = preset("a").replaced(sines={"ramp": 0.0}, constraints={"current": False})
     assert bare.unchecked == ("motor currents", "rest at both ends")
-
-
-def test_a_bare_series_is_not_asked_to_rest(cell):
-    settings = preset("a").kinematic()
-    assert problem_of(cell, settings).constraints.at_rest
-    assert not problem_of(cell, settings.replaced(sines={"ramp": 0.0})).constraints.at_rest
-    with pytest.raises(SettingsError, match=r"sines\.fastest.*2 entries.*6 joints.*joint_6"):
-        problem_of(cell, settings.replaced(sines={"fastest": [1.0, 2.0]}))
 
 
 def test_named_parameters_are_the_ones_that_count(cell):
@@ -264,9 +241,6 @@ def test_text_restores_every_bit(angles, numbers, words, key):
     assert repr(back["numbers"]) == repr(numbers)
     assert back["inner"] == data["inner"]
     assert [row["name"] for row in back["many"]] == [words] * len(angles)
-
-
-def test_an_angle_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match=r"turn_deg.*'far'"):
         from_text('turn_deg = [1.0, "far"]')
 
@@ -325,20 +299,28 @@ def advised(*arguments, **more) -> str:
     return said(*arguments, **more).partition("What can be changed: ")[2]
 
 
-def test_sines_get_advice_about_sines(cell):
-    for violation, words in ((CONTACT, "[sines] offset"), (CURRENT, "[sines] slowest, fastest")):
-        advice = advised(cell, SINES, {violation.kind: 1000}, [violation])
-        assert words in advice and "via" not in advice
-        assert "[via_points]" in advised(cell, VIA, {violation.kind: 1000}, [violation])
-
-
-def test_every_kind_that_forbids_more_than_half_gets_advice(cell):
-    both = advised(cell, VIA, {"collision": 900, "current": 501}, [CONTACT, CURRENT])
-    assert "range_share" in both and "current limits" in both
-    one = advised(cell, VIA, {"collision": 900, "current": 500}, [CONTACT, CURRENT])
-    assert "range_share" in one and "current limits" not in one
-    split = advised(cell, VIA, {"collision": 400, "current": 450}, [CONTACT, CURRENT])
-    assert "range_share" not in split and "current limits" in split
+@pytest.mark.parametrize(
+    ("settings", "rejected", "more", "words", "absent"),
+    [
+        # Every kind that forbids more than half.
+        (VIA, {"collision": 900, "current": 501}, {}, ("range_share", "current limits"), ""),
+        (VIA, {"collision": 900, "current": 500}, {}, ("range_share",), "current limits"),
+        (VIA, {"collision": 400, "current": 450}, {}, ("current limits",), "range_share"),
+        (VIA, {"collision": 1000}, {}, ("[via_points]",), "search longer"),
+        (VIA, {"current": 1000}, {}, ("[via_points]",), "search longer"),
+        # About sines for sines, and after a tiny search a longer one.
+        (SINES, {"collision": 1000}, {}, ("[sines] offset",), "via"),
+        (SINES, {"current": 1000}, {}, ("[sines] slowest, fastest",), "via"),
+        (VIA, {"collision": 24}, {"tried": 24}, ("search longer, 24 motions are few",), "nan"),
+        (VIA, {"collision": 100}, {"unexciting": 900}, ("more via points or judge by fewer",),
+         "range_share"),
+    ],
+)  # fmt: skip
+def test_what_forbids_most_gets_advice(cell, settings, rejected, more, words, absent):
+    nearest = [one for one in (CONTACT, CURRENT) if one.kind in rejected]
+    advice = advised(cell, settings, rejected, nearest, **more)
+    assert all(word in advice for word in words)
+    assert not absent or absent not in advice
 
 
 @pytest.mark.parametrize(
@@ -357,29 +339,12 @@ def test_a_duration_is_reported_with_what_is_asked_for(cell, value, asked, words
     assert words in advice and ("search longer" in advice) is longer
 
 
-def test_after_a_tiny_search_a_longer_one_is_advised(cell):
-    assert "search longer, 24 motions are few" in advised(
-        cell, VIA, {"collision": 24}, [CONTACT], tried=24
-    )
-    assert "search longer" not in advised(cell, VIA, {"collision": 1000}, [CONTACT])
-
-
-def test_motions_that_excite_too_little_are_advised_about(cell):
-    advice = advised(cell, VIA, {"collision": 100}, [CONTACT], unexciting=900)
-    assert advice == "take more via points or judge by fewer parameters ([objective] parameters)"
-
-
 def test_the_closest_motion_has_one_violation_of_each_kind(cell):
-    sentence = said(
-        cell,
-        VIA,
-        {"collision": 1000, "current": 1000},
-        [CONTACT, CURRENT],
-        closest=(CONTACT, DEEPER, CURRENT),
-    )
-    closest = sentence.partition("comes closest breaks ")[2]
-    assert closest.count("collision of") == 1 and "link_1 and link_6" in closest
-    assert closest.count("current of") == 1
+    rejected, closest = {"collision": 1000, "current": 1000}, (CONTACT, DEEPER, CURRENT)
+    sentence = said(cell, VIA, rejected, [CONTACT, CURRENT], closest=closest)
+    breaks = sentence.partition("comes closest breaks ")[2]
+    assert breaks.count("collision of") == 1 and "link_1 and link_6" in breaks
+    assert breaks.count("current of") == 1
 
 
 def test_currents_that_home_needs_are_refused_at_once(cell):
@@ -393,9 +358,6 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
     with pytest.raises(NoExcitationError, match=r"where the sines swing about.*\[sines\] offset"):
         problem_of(weak, SINES.replaced(sines={"offset": "home"}))
     problem_of(weak, VIA.kinematic())
-
-
-def test_sines_about_a_contact_are_refused_at_once(cell):
     folded = SINES.replaced(sines={"offset": [0.0, 90.0, -165.0, 0.0, 90.0, 0.0]})
     with pytest.raises(NoExcitationError, match=r"where the sines swing about: collision of"):
         problem_of(cell, folded)
@@ -420,6 +382,7 @@ def test_margins_name_the_motor_and_the_pair(cell):
     currents, pair = found.split("; ")
     assert currents.startswith("current at most ") and "% of its limit (motor of joint_" in currents
     assert pair.startswith("nearest 0.") and "(link_" in pair
+    assert margins(cell, problem_of(cell, preset("b").kinematic()), motion) == ""  # not looked at
 
     # The checks agree: with a limit that little lower, or a margin that little wider, it is broken.
     share = float(currents.split()[3]) / 100.0
@@ -445,10 +408,6 @@ def test_the_nearest_pair_is_no_contact_even_where_the_margin_is_narrow(cell):
     )
     contact = near.deepest_contact(sampled(motion).position)
     assert contact is not None and (contact.first, contact.second) == (first, second)
-
-
-def test_margins_are_of_what_was_looked_at(cell):
-    assert margins(cell, problem_of(cell, preset("b").kinematic()), swinging(cell, [0])) == ""
 
 
 def test_what_a_motion_cannot_tell_apart_is_named(cell):

@@ -139,11 +139,8 @@ def test_any_text_is_a_number_of_some_size_or_none(text: str) -> None:
     assert found is None or (0 <= found < 2**63 and text.lstrip("0") in (str(found), ""))
 
 
-def test_what_is_missing_is_none() -> None:
+def test_ports_and_numbers_that_are_none() -> None:
     assert whole_number(None) is None
     assert whole_number("") is None
-
-
-def test_ports_are_those_that_there_are() -> None:
     assert [port_number(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]
     assert not any(map(port_number, ("", "0", "65536", "-1", "ten", "9" * 5000)))

@@ -54,8 +54,13 @@ def called(*arguments: str) -> Result:
     return CliRunner().invoke(app, [*arguments, "--json"])
 
 
-def test_every_command_is_here() -> None:
+def test_what_was_typed_wrong_is_told_likewise() -> None:
     assert {*FAILING} == {*COMMANDS}
+    for arguments in (("status",), ("bla",), ("plot", "--no-such-option")):
+        result = called(*arguments)
+        assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (2, 2)
+    plain = CliRunner().invoke(app, ["status"])
+    assert (plain.exit_code, plain.stdout) == (2, "")
 
 
 @pytest.mark.parametrize("command", [*FAILING])
@@ -72,15 +77,7 @@ def test_a_command_that_fails_prints_one_object(
     assert [path.name for path in tmp_path.iterdir()] == []
 
 
-def test_what_was_typed_wrong_is_told_likewise() -> None:
-    for arguments in (("status",), ("bla",), ("plot", "--no-such-option")):
-        result = called(*arguments)
-        assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (2, 2)
-    plain = CliRunner().invoke(app, ["status"])
-    assert (plain.exit_code, plain.stdout) == (2, "")
-
-
-def test_an_error_of_input_tells_its_parts() -> None:
+def test_an_error_tells_its_parts_and_its_status() -> None:
     told = as_json(InputError("a.toml", "is empty", field="cell", remedy="fill it"))
     assert told == {
         "error": "a.toml: cell: is empty; fill it",
@@ -91,9 +88,6 @@ def test_an_error_of_input_tells_its_parts() -> None:
         "problem": "is empty",
         "remedy": "fill it",
     }
-
-
-def test_exit_codes_are_those_of_the_errors() -> None:
     found = [exit_code_of(error) for error in (ControllerFault(""), PlannerError(), OSError())]
     assert found == [4, 2, 1]
 

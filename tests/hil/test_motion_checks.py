@@ -13,7 +13,7 @@ from hil.campaign.intervals import hold
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
-from hil.design.advice import NoExcitationError, no_excitation
+from hil.design.advice import NoExcitationError
 from hil.motion_checks import MotionChecks, always_so, collision_checker, violation_text
 from identification.excitation import CollisionChecker, NoFeasibleMotionError, Violation, Workspace
 from identification.model.motion import Motion
@@ -57,11 +57,16 @@ def cell() -> Cell:
     return Cell.load(CELL_PATH)
 
 
-def test_a_posture_is_told_as_the_teach_pendant_shows_it(cell: Cell) -> None:
+def test_postures_are_in_the_angles_of_the_teach_pendant(cell: Cell) -> None:
     told = AngleFrame.of(cell).text_of_angles(cell.home)
     assert told == "J1 0.0, J2 0.0, J3 -90.0, J4 0.0, J5 90.0, J6 0.0 deg, teach pendant angles"
     plain = AngleFrame("urdf", np.ones(2), np.zeros(2))
     assert plain.text_of_angles((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
+    high = cell.text.replace("floor = 0.0", "floor = 1.0")
+    raised = Cell.from_texts(high, cell.urdf, cell.path)
+    with pytest.raises(NoExcitationError, match=r"J3 -90\.0, .* deg, teach pendant angles") as told:
+        problem_of(raised, preset("b"))
+    assert " rad" not in str(told.value)
 
 
 def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
@@ -85,23 +90,7 @@ def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
     assert str(fast) == "joint limit of velocity of joint 1: 3, at most 2.705 is wanted, at 0.500 s"
 
 
-def test_a_blocked_home_is_told_in_these_angles(cell: Cell) -> None:
-    high = cell.text.replace("floor = 0.0", "floor = 1.0")
-    raised = Cell.from_texts(high, cell.urdf, cell.path)
-    with pytest.raises(NoExcitationError, match=r"J3 -90\.0, .* deg, teach pendant angles") as told:
-        problem_of(raised, preset("b"))
-    assert " rad" not in str(told.value)
-
-
-def test_a_search_that_found_nothing_is_told_in_these_angles(cell: Cell) -> None:
-    contact = Violation("collision", "link_2 and floor", 0.01, 0.05, 2.0, tuple(cell.home))
-    error = NoFeasibleMotionError({"collision": 3}, {"collision": contact}, closest=(contact,) * 2)
-    told = str(no_excitation(error, AngleFrame.of(cell), None, preset("b")))
-    assert told.count("J3 -90.0") >= 1
-    assert " rad" not in told
-
-
-def test_a_pair_that_no_posture_parts_asks_for_another_margin() -> None:
+def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
     urdf = wrist(BALL.format(radius=0.05), "", BALL.format(radius=0.437))
     checker = CollisionChecker(urdf, Workspace(floor=None, margin=0.005))
     assert checker.spread("a", "c") == pytest.approx((0.013, 0.013), abs=1e-6)
@@ -115,9 +104,6 @@ def test_a_pair_that_no_posture_parts_asks_for_another_margin() -> None:
     )
     assert deep.pairs == ()  # left out, and told as built in
     assert always_so(contact, deep) is None
-
-
-def test_what_can_come_apart_gets_no_such_advice(cell: Cell) -> None:
     checker = collision_checker(cell)
     contact = Violation("collision", "link_5 and floor", -0.1, 0.05, None, tuple(cell.home))
     assert always_so(contact, checker) is None
@@ -161,15 +147,6 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     assert collision_checker(moved).pairs == collision_checker(found).pairs
 
 
-def test_a_refusal_before_a_motion_is_sent_is_told_in_degrees(cell: Cell) -> None:
-    checks = MotionChecks.of(cell)
-    told = checks._sentence(
-        Violation("joint limit", "velocity of joint 1", 3.0, 2.0, 0.5, (0.0,) * 6)
-    )
-    assert "J2" in told
-    assert "deg/s" in told
-
-
 def test_validation_motions_that_nothing_allows_are_told_in_these_angles(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,16 +175,6 @@ def held_torque(cell: Cell) -> float:
     model = pin.buildModelFromXML(cell.urdf)
     gravity = pin.computeGeneralizedGravity(model, model.createData(), cell.home)
     return (1.0 + cell.nominal.uncertainty) * abs(float(gravity[HELD]))
-
-
-def test_a_cell_without_torque_limits_has_none(cell: Cell) -> None:
-    assert cell.torque_limit is None
-    assert MotionChecks.of(cell).currents.torque_limit is None
-
-
-def test_torque_limits_are_those_of_the_file(cell: Cell) -> None:
-    torque = [1000.0, 900.0, 800.0, 70.0, 60.0, 50.0]
-    np.testing.assert_array_equal(limited(cell, torque).torque_limit, torque)
 
 
 @pytest.mark.parametrize(
@@ -243,6 +210,7 @@ def test_a_design_keeps_the_limit_too(cell: Cell) -> None:
     torque[HELD] = 0.5 * held_torque(cell)
     with pytest.raises(NoExcitationError, match=r"torque of joint_3: .* N·m"):
         problem_of(limited(cell, torque), preset("b"))
+    assert cell.torque_limit is MotionChecks.of(cell).currents.torque_limit is None
     roomy = limited(cell, [1e4] * 6)
     currents = problem_of(roomy, preset("b")).constraints.currents
     np.testing.assert_array_equal(currents.torque_limit, [1e4] * 6)

@@ -26,12 +26,14 @@ from hil.archive import open_archive
 from hil.campaign import Link, Progress, Stop
 from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
+from hil.cli.record import record as record_command
 from hil.demo_link import SIMULATE, free_port
-from hil.errors import ArchiveError, ControllerFault, InputError
+from hil.errors import ArchiveError, ControllerFault, HilError, InputError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from hil.recording import archive_path, record
 from hil.simulation import controller_settings, own_postures, simulated_controller
+from sim_fixtures.ns16 import CELL_PATH
 
 NAME = "excitation_000_a1.mcap"
 
@@ -71,7 +73,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
     return path
 
 
-def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(recorded: Path) -> None:
+def test_every_cycle_is_archived_and_says_whose_motion_it_was(recorded: Path) -> None:
+    """And the recording alone gives the planted parameters."""
     archive = open_archive(recorded)
     assert archive.complete
     assert archive.outcome.entries["records_lost"] == "0"
@@ -82,9 +85,6 @@ def test_every_cycle_from_the_first_on_is_archived_and_none_was_commanded(record
     assert np.isnan(columns["commanded_position"]).all()
     assert np.all(columns["interval"] == -1)
     assert np.all(np.ptp(columns["position"], axis=0) > 0.3)
-
-
-def test_the_archive_says_whose_motion_it_was_and_carries_the_init_packet(recorded: Path) -> None:
     archive = open_archive(recorded)
     assert archive.header.entries["motion"] == "controller"
     assert archive.kind == "excitation"
@@ -92,9 +92,6 @@ def test_the_archive_says_whose_motion_it_was_and_carries_the_init_packet(record
         "cell.toml", "robot.urdf", "drive_train.json", "init_packet.bin"
     }  # fmt: skip
     assert len(archive.attachments["init_packet.bin"]) == INIT_LENGTH
-
-
-def test_the_recording_alone_gives_the_planted_parameters(recorded: Path) -> None:
     found = identify_archives([recorded], Silent())
     assert found.verdict.good, found.verdict.line
     coverage = found.results.coverage
@@ -103,7 +100,7 @@ def test_the_recording_alone_gives_the_planted_parameters(recorded: Path) -> Non
     assert coverage.within_3 >= 0.9 * coverage.total
 
 
-def test_recordings_are_numbered_in_a_folder_and_never_overwritten(tmp_path: Path) -> None:
+def test_recordings_are_numbered_and_know_their_kind(tmp_path: Path, cell: Cell) -> None:
     first = archive_path(tmp_path / "records", "validation")
     assert first.name == "validation_000_a1.mcap"
     first.touch()
@@ -112,25 +109,18 @@ def test_recordings_are_numbered_in_a_folder_and_never_overwritten(tmp_path: Pat
         archive_path(first, "validation")
     with pytest.raises(InputError, match="name of a validation; add --kind validation"):
         archive_path(tmp_path / "validation_007_a1.mcap", "excitation")
-
-
-def test_a_file_of_any_name_knows_its_kind(tmp_path: Path, cell: Cell) -> None:
     path = archive_path(tmp_path / "monday.mcap", "standstill")
     recording_of(cell, path, kind="standstill", duration=0.2)
     assert open_archive(path).kind == "standstill"
 
 
-def test_the_operator_ends_a_recording_and_that_is_its_proper_end(
-    tmp_path: Path, cell: Cell
+@pytest.mark.parametrize(("how", "outcome"), [({}, "completed"), ({"duration": 10.0}, "stopped")])
+def test_the_operator_ends_a_recording_properly_or_early(
+    tmp_path: Path, cell: Cell, how: dict[str, float], outcome: str
 ) -> None:
-    done = recording_of(cell, tmp_path / NAME, **after(500))
-    assert (done.outcome, done.reason) == ("completed", "ended by the operator")
+    done = recording_of(cell, tmp_path / NAME, **how, **after(500))
+    assert (done.outcome, done.reason) == (outcome, "ended by the operator")
     assert done.records == open_archive(tmp_path / NAME).n_samples >= 500
-
-
-def test_a_recording_cut_short_says_so(tmp_path: Path, cell: Cell) -> None:
-    done = recording_of(cell, tmp_path / NAME, duration=10.0, **after(500))
-    assert (done.outcome, done.reason) == ("stopped", "ended by the operator")
 
 
 def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> None:
@@ -251,7 +241,7 @@ def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: 
 
 
 def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
-    tmp_path: Path, on_udp: tuple[Path, int]
+    on_udp: tuple[Path, int],
 ) -> None:
     path, port = on_udp
     with (
@@ -259,7 +249,7 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
         recorder_of(path, "--duration", "1.5", "--json") as recorder,
     ):
         assert "recording complete; still answering" in recorder.stderr.readline()
-        assert open_archive(tmp_path / "a.mcap").complete
+        assert open_archive(path.parent / "a.mcap").complete
         time.sleep(1.5)
         assert recorder.poll() is None, "it left a moving arm alone"
         controller.send_signal(signal.SIGTERM)  # ends its program when the arm stands
@@ -282,15 +272,10 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     assert np.isnan(archive.columns["commanded_position"]).all()
 
 
-def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(
-    tmp_path: Path, on_udp: tuple[Path, int]
-) -> None:
+def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
-    archive = tmp_path / "a.mcap"
-    with (
-        running(*own_motion(path, port)),
-        recorder_of(path) as recorder,
-    ):
+    archive = path.parent / "a.mcap"
+    with running(*own_motion(path, port)), recorder_of(path) as recorder:
         wait_until_recorded(archive, recorder)
         recorder.send_signal(signal.SIGINT)
         assert recorder.stdout is not None
@@ -303,24 +288,18 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(
     assert open_archive(archive).complete
 
 
-def test_an_arm_at_rest_is_left_after_a_second(tmp_path: Path, on_udp: tuple[Path, int]) -> None:
+def test_an_arm_at_rest_is_left_after_a_second(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
-    options = own_motion(path, port, "--intervals", "1")
     # It opens its axes, which are held where they are; only a PC that leaves ends the interval.
-    still = [word for word in options if word != "--own-motion"]
-    with (
-        running(*still),
-        recorder_of(path, "--duration", "1.5", "--json") as recorder,
-    ):
+    still = [one for one in own_motion(path, port, "--intervals", "1") if one != "--own-motion"]
+    with running(*still), recorder_of(path, "--duration", "1.5", "--json") as recorder:
         said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
     assert json.loads(said)["outcome"] == "completed"
 
 
 @pytest.mark.slow
-def test_a_session_that_ends_before_the_duration_is_over_is_told(
-    tmp_path: Path, on_udp: tuple[Path, int]
-) -> None:
+def test_a_session_that_ends_before_the_duration_is_over_is_told(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
     with (
         running(*own_motion(path, port, "--duration", "3")),
@@ -335,7 +314,7 @@ def test_a_session_that_ends_before_the_duration_is_over_is_told(
     assert "the controller ended the session after" in words
     assert "of 60 s" in words
     assert "a.mcap" in words
-    archive = open_archive(tmp_path / "a.mcap")
+    archive = open_archive(path.parent / "a.mcap")
     assert archive.outcome.entries["outcome"] == "completed"
 
 
@@ -348,15 +327,10 @@ def children(pid: int, module: str) -> int:
 
 
 @pytest.mark.slow
-def test_a_killed_exchange_ends_a_recording_as_lost(
-    tmp_path: Path, on_udp: tuple[Path, int]
-) -> None:
+def test_a_killed_exchange_ends_a_recording_as_lost(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
-    archive = tmp_path / "a.mcap"
-    with (
-        running(*own_motion(path, port)),
-        recorder_of(path) as recorder,
-    ):
+    archive = path.parent / "a.mcap"
+    with running(*own_motion(path, port)), recorder_of(path) as recorder:
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "drivers.exchange"), signal.SIGKILL)
         _, errors = recorder.communicate(timeout=60)
@@ -368,11 +342,9 @@ def test_a_killed_exchange_ends_a_recording_as_lost(
 
 
 @pytest.mark.slow
-def test_a_hanging_archive_process_is_ended_and_answers_go_on(
-    tmp_path: Path, on_udp: tuple[Path, int]
-) -> None:
+def test_a_hanging_archive_process_is_ended_and_answers_go_on(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
-    archive = tmp_path / "a.mcap"
+    archive = path.parent / "a.mcap"
     with (
         running(*own_motion(path, port)) as controller,
         recorder_of(path) as recorder,
@@ -392,7 +364,7 @@ def test_a_hanging_archive_process_is_ended_and_answers_go_on(
 
 
 def test_a_controller_that_never_comes_is_waited_for_as_long_as_was_asked(
-    tmp_path: Path, on_udp: tuple[Path, int]
+    on_udp: tuple[Path, int],
 ) -> None:
     path, _ = on_udp
     with recorder_of(path, "--wait", "0.5") as recorder:
@@ -401,10 +373,10 @@ def test_a_controller_that_never_comes_is_waited_for_as_long_as_was_asked(
     assert "nothing heard from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
 
 
-def test_a_recording_without_a_controller_ends_with_a_sentence(
-    tmp_path: Path, on_udp: tuple[Path, int]
-) -> None:
+def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Path, int]) -> None:
     path, _ = on_udp
+    with pytest.raises(HilError, match=r"controller\.transport"):
+        record_command(CELL_PATH, output=path.parent / "a.mcap")
     with recorder_of(path) as recorder:
         assert "waiting for the controller" in recorder.stdout.readline()
         assert "nothing heard from 127.0.0.1 (0 packets from elsewhere)" in until_heard(recorder)
@@ -412,13 +384,4 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 130
     assert "nothing was recorded" in errors.replace("\n", " ")
-    assert not (tmp_path / "a.mcap").exists()
-
-
-def test_a_simulated_cell_has_no_link_to_record_from(tmp_path: Path, cell: Cell) -> None:
-    (tmp_path / "cell.toml").write_text(cell.text)
-    (tmp_path / "ns16.urdf").write_text(cell.urdf)
-    with recorder_of(tmp_path / "cell.toml") as recorder:
-        _, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 2
-    assert "controller.transport" in errors
+    assert not (path.parent / "a.mcap").exists()

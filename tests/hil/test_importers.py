@@ -1,0 +1,1279 @@
+"""Logs of text and arrays become archives; robots by DH parameters; slips of a map are said."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import resource
+import signal
+import struct
+import tomllib
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from click.testing import Result
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.io import savemat
+from typer.testing import CliRunner
+
+from hil.archive import ArchiveHeader, Findings, Samples, open_archive
+from hil.cell import Cell
+from hil.cli import app
+from hil.errors import InputError, SourceError
+from hil.identify.sources import cell_of
+from hil.identify.surroundings import nominal_of
+from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
+from hil.importers import arrays as array_files
+from hil.importers.arrays import ArrayFile
+from hil.importers.column_map import UNITS, Format
+from hil.importers.findings import check_clock, examine
+from hil.importers.robot import _cell_text
+from hil.importers.table import Table
+from hil.recordings import open_recording
+from identification import FrictionLaw
+from identification.model.kinematics import chain_from_urdf
+from tests.hil.simulated_logs import (
+    JOINTS,
+    Simulated,
+    column_map,
+    imported,
+    simulate,
+    three_joint_robot,
+    urdf_path,
+)
+from tests.hil.simulated_logs import imported as read
+from tests.hil.test_importers_rosbag2 import STATE, bag, state
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    return three_joint_robot(tmp_path)
+
+
+def log(path: Path, values: NDArray[np.float64], header: str = "", delimiter: str = ",") -> Path:
+    lines = [header] if header else []
+    lines += [delimiter.join(repr(float(value)) for value in row) for row in values]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+VALUES = np.random.default_rng(0).normal(size=(20, 7))
+HEADER = "t,q1,q2,q3,tau1,tau2,tau3"
+VALUES[:, 0] = 0.01 * np.arange(20)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return log(tmp_path / "a.csv", VALUES, HEADER)
+
+
+class TestColumns:
+    @pytest.mark.parametrize("position", ["q{}", ("q1", "q2", "q3"), (1, 2, 3), ("q1", 2, "q3")])
+    def test_by_pattern_name_and_index(self, file, robot, position):
+        found = read(file, robot, position={"columns": position}, torque={"columns": "tau{}"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+        assert np.array_equal(found["torque"], VALUES[:, 4:])
+        assert "motor_current" not in found
+
+    def test_comments_quotes_and_joints_in_another_order(self, tmp_path, robot):
+        header = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
+        found = read(log(tmp_path / "a.txt", VALUES, header), robot)
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+        # Velocities too.
+        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3,v1,v2,v3")
+        velocity = {"columns": "v{}", "unit": "deg/s"}
+        found = read(file, robot, velocity=velocity, joints=("ankle", "hip", "knee"))
+        assert np.array_equal(found["position"], VALUES[:, [2, 3, 1]])
+        assert found["velocity"] == pytest.approx(np.radians(VALUES[:, [5, 6, 4]]), rel=1e-15)
+
+
+class TestTime:
+    def test_a_sample_rate_counts_samples(self, file, robot):
+        columns = column_map(sample_rate=3000.0)
+        path = import_log(file, file.with_suffix(".mcap"), robot=robot, columns=columns)
+        assert np.array_equal(open_recording(path).time, np.arange(20) * (1 / 3000.0))
+
+    @pytest.mark.parametrize(
+        ("unit", "times", "expected"),
+        [
+            ("s", ["1700000000.123456789", "1700000000.123556790"], [0, 100001]),
+            ("ms", ["0", "0.5"], [0, 500_000]),
+            ("us", ["1e6", "1000001"], [0, 1000]),
+            ("ns", ["1700000000123456789", "1700000000123456791"], [0, 2]),
+            ("s", ["-0.025", "0.05"], [0, 75_000_000]),
+            ("s", ["0", "0.01", "0.013", "0.5", "0.5001"],
+             [0, 10_000_000, 13_000_000, 500_000_000, 500_100_000]),
+        ],
+    )  # fmt: skip
+    def test_a_time_column_is_exact_to_the_nanosecond(self, tmp_path, robot, unit, times, expected):
+        lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
+        (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
+        columns = column_map(time={"column": "t", "unit": unit})
+        path = import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
+        stamp = open_archive(path).columns["stamp"]
+        assert (stamp - stamp[0]).tolist() == expected
+        assert open_recording(path).time.tolist() == pytest.approx(
+            [1e-9 * value for value in expected], abs=1e-16
+        )
+
+
+class TestUnitsAndGears:
+    def test_units_are_converted_to_si(self, file, robot):
+        found = read(
+            file,
+            robot,
+            position={"columns": "q{}", "unit": "deg", "scale": (1, -1, 2)},
+            motor_current={"columns": "tau{}", "unit": "mA"},
+        )
+        expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
+        assert found["position"] == pytest.approx(expected, rel=1e-15)
+        assert found["motor_current"] == pytest.approx(VALUES[:, 4:] / 1000)
+        assert "torque" not in found
+        assert 3000 * UNITS["velocity"]["rpm"] == pytest.approx(2 * np.pi * 50)
+
+    def test_motor_side_goes_to_joint_side_with_power_preserved(self, tmp_path, robot):
+        """Made from joint values by an independent way: ratio by ratio, coupling by hand."""
+        q, qd, tau_motor = np.random.default_rng(8).normal(size=(3, 30, 3))
+        n1, n2, n3, n32 = 100.0, -80.0, 50.0, 25.0
+
+        def motor(x):
+            return np.column_stack([n1 * x[:, 0], n2 * x[:, 1], n3 * x[:, 2] + n32 * x[:, 1]])
+
+        back = read(
+            log(tmp_path / "m.csv", np.hstack([motor(q), motor(qd), tau_motor])),
+            robot,
+            position={"columns": (0, 1, 2), "side": "motor"},
+            velocity={"columns": (3, 4, 5), "side": "motor"},
+            torque={"columns": (6, 7, 8), "side": "motor"},
+            drive={
+                "gear_ratio": (n1, n2, n3),
+                "coupling": ((3, 2, n32),),
+                "joint_offset": (0.5, 0.0, -0.5),
+            },
+        )
+        assert back["position"] == pytest.approx(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
+        assert back["velocity"] == pytest.approx(qd, rel=1e-12)
+        power_motors = np.sum(tau_motor * motor(qd), axis=1)
+        assert np.sum(back["torque"] * qd, axis=1) == pytest.approx(power_motors, rel=1e-9)
+        assert back["torque"][:, 1] == pytest.approx(n2 * tau_motor[:, 1] + n32 * tau_motor[:, 2])
+        # The map couples motors: the model may have them share.
+        cell = cell_of(open_archive(tmp_path / "m.mcap"))
+        assert cell.model.coupling is not None
+
+    def test_constants_and_gears_follow_the_joints_of_the_log(self, file, robot):
+        drive = {"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)}
+        found = read(file, robot, motor_current={"columns": "tau{}"}, drive=drive)
+        assert np.array_equal(found["motor_current"], VALUES[:, 4:])
+        assert found["torque"] == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
+        found = read(
+            file,
+            robot,
+            position={"columns": "q{}", "side": "motor"},
+            joints=("ankle", "hip", "knee"),
+            drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
+        )
+        expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
+        assert found["position"] == pytest.approx(expected)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("entries", "sentence"),
+        [
+            (
+                {"position": {"columns": "pos{}"}},
+                "no column 'pos1' for hip, joint 1 of 3.*--lock-others.*its columns are t, q1, q2",
+            ),
+            ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
+            ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
+            ({"torque": {"columns": "tau"}}, "no place for the joint's number"),
+            ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
+            ({"drive": {"gear_ratio": (1, 2)}}, "drive.gear_ratio: has 2 entries"),
+            ({"drive": {"gear_ratio": (1, 0, 2)}}, "would not be moved by any motor"),
+            ({"time": {"column": "time"}}, "time: there is no column 'time'"),
+            ({"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
+        ],
+    )
+    def test_a_map_that_does_not_fit_is_refused_with_what_would(
+        self, file, robot, entries, sentence
+    ):
+        with pytest.raises(SourceError, match=sentence):
+            read(file, robot, **entries)
+        assert not file.with_suffix(".mcap").exists()
+
+    @pytest.mark.parametrize(
+        ("line", "found"),
+        [
+            ("0.1,1,x,3,4,5,6", "'x'"),
+            ("0.1,1", "nothing"),
+            ("0.1,1,,3,4,5,6", "nothing"),
+            ("0.1,1,nan,3,4,5,6", "'nan'"),
+            ("0.1,1,inf,3,4,5,6", "'inf'"),
+        ],
+    )
+    def test_a_cell_that_is_no_number_is_named_by_line_and_column(self, file, robot, line, found):
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
+        with pytest.raises(SourceError, match=f"line 12 has {found} in column q2, not a number"):
+            read(file, robot)
+
+    @pytest.mark.parametrize("time", ["", "soon", "nan", "inf"])
+    def test_a_time_that_is_no_number_is_named(self, tmp_path, robot, time):
+        (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
+        with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
+            read(tmp_path / "a.csv", robot, time={"column": "t"})
+
+    def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
+        """Which of the numbers have no name cannot be known: the first, as pandas writes them?"""
+        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3")
+        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; give the others"):
+            read(file, robot)
+
+    def test_files_of_no_row_or_another_length_are_refused(self, tmp_path, file, robot):
+        log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
+        with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
+            read(file, robot, torque={"columns": "tau{}", "file": "tau.csv"})
+        (tmp_path / "b.csv").write_text("t,q1\n")
+        with pytest.raises(SourceError, match="has no row of numbers"):
+            read(tmp_path / "b.csv", robot)
+
+
+QUANTITIES = {
+    "position": {"files": "q_{}.txt", "columns": (1,)},
+    "torque": {"files": "tau{}.dat"},
+}
+
+
+class TestFilePerJoint:
+    """Quantities with one file per joint, beside the log or in the folder that is named."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        place = tmp_path / "run"
+        place.mkdir()
+        for joint in range(3):
+            np.savetxt(place / f"q_{joint + 1}.txt", VALUES[:, [0, joint + 1]], fmt="%.17g")
+            np.savetxt(place / f"tau{joint}.dat", VALUES[:, joint + 4], fmt="%.17g")
+        np.savetxt(place / "t.txt", VALUES[:, 0])
+        return place
+
+    @pytest.mark.parametrize("source", [".", "q_1.txt", "t.txt"])
+    def test_a_pattern_names_them(self, folder, robot, source):
+        """Counted from 1, or from 0 where they are."""
+        columns = column_map(**QUANTITIES)
+        path = import_log(folder / source, folder / "a.mcap", robot=robot, columns=columns)
+        archive = open_archive(path)
+        assert np.array_equal(archive.columns["position"], VALUES[:, 1:4])
+        assert np.array_equal(archive.columns["torque"], VALUES[:, 4:])
+        assert "q_2.txt" in archive.header.entries["source"]
+
+    def test_a_list_names_them_in_any_order(self, folder, robot):
+        position = {"files": ("q_3.txt", "q_1.txt", "q_2.txt"), "columns": (1,)}
+        found = read(folder, robot, position=position, joints=("ankle", "hip", "knee"))
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+        for joint in range(3):
+            np.save(folder / f"q{joint + 1}.npy", VALUES[:, joint + 1])
+        folder.with_suffix(".mcap").unlink()
+        found = read(folder, robot, position={"files": "q{}.npy"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+
+    def test_each_may_call_its_column_by_the_joint(self, folder, robot):
+        for joint in range(3):
+            header = f"t,angle{joint + 1}"
+            log(folder / f"{joint + 1}.csv", VALUES[:, [0, joint + 1]], header)
+        found = read(folder, robot, position={"files": "{}.csv", "columns": "angle{}"})
+        assert np.array_equal(found["position"], VALUES[:, 1:4])
+
+    def test_the_time_stands_in_each_of_them_or_in_its_own(self, folder, robot):
+        for time in ({"column": 0}, {"file": "t.txt"}):
+            columns = column_map(**QUANTITIES, time=time)
+            path = import_log(folder, folder / "a.mcap", robot=robot, columns=columns)
+            assert open_recording(path).time == pytest.approx(VALUES[:, 0])
+            path.unlink()
+
+    def test_joints_with_clocks_of_their_own_are_refused(self, folder, robot):
+        np.savetxt(folder / "q_2.txt", VALUES[:, [0, 2]] + [0.001, 0.0])
+        with pytest.raises(SourceError, match=r"q_2\.txt: time: has other times than q_1\.txt"):
+            read(folder, robot, **QUANTITIES, time={"column": 0})
+
+    @pytest.mark.parametrize(
+        ("position", "sentence"),
+        [
+            ({"files": "q_{}.txt"}, r"q_1\.txt: .*shape \(20, 2\), where one column is wanted"),
+            ({"files": "p{}.txt"}, r"position.files: there is no file 'p1.txt' for hip, joint 1"),
+            ({"files": ("q_1.txt",)}, "position.files: has 1 entries; one for each of the joints"),
+            ({"files": ("t.txt", "q_1.txt", "nowhere.txt"), "columns": (0,)}, "nowhere.txt: cann"),
+            ({"files": "q_{}.txt", "columns": (0, 1)}, "position.columns: has 2 entries"),
+            ({"files": ("tau0.dat", "tau1.dat", "short.dat")}, "tau1.dat 20, short.dat 5"),
+            ({}, r'run: position.file: is a folder; name a file in it: file = "q.txt"'),
+        ],
+    )
+    def test_what_does_not_fit_is_named(self, folder, robot, position, sentence):
+        np.savetxt(folder / "short.dat", VALUES[:5, 4])
+        with pytest.raises(SourceError, match=sentence):
+            read(folder, robot, position=position)
+
+    @pytest.mark.parametrize(
+        ("position", "sentence"),
+        [
+            ({"files": "q.txt"}, "position.files has no place for the joint's number"),
+            ({"files": "q{}.txt", "file": "q.txt"}, "position has files, so it has neither file"),
+        ],
+    )
+    def test_a_map_that_contradicts_itself_is_refused(self, position, sentence):
+        with pytest.raises(ValueError, match=sentence):
+            column_map(position=position)
+
+
+class TestMoreColumnsThanJoints:
+    """Which of them are the joints has to be said."""
+
+    WIDE = np.random.default_rng(7).normal(size=(20, 5))
+
+    def test_they_are_refused_with_the_two_ways_out(self, tmp_path, robot):
+        for first in (0, 1):
+            header = ",".join(f"q{k + first}" for k in range(5))
+            file = log(tmp_path / f"{first}.csv", self.WIDE, header)
+            expected = rf"5 columns are called 'q{{}}' \(q{first} to q{first + 4}\).* 3 joints: hip"
+            with pytest.raises(SourceError, match=f"columns: {expected}.*joints.*list of 3"):
+                read(file, robot)
+        np.savez(tmp_path / "a.npz", **{f"q{k}": self.WIDE[:, k] for k in range(4)})
+        with pytest.raises(SourceError, match=r"4 columns are called 'q\{\}' \(q0 to q3\)"):
+            read(tmp_path / "a.npz", robot)
+        for k in range(4):
+            np.savetxt(tmp_path / f"q{k}.txt", self.WIDE[:, k])
+        with pytest.raises(SourceError, match=r"4 files are called 'q\{\}.txt'"):
+            read(tmp_path, robot, position={"files": "q{}.txt"})
+
+    def test_the_map_may_name_all_joints_or_the_columns(self, tmp_path, robot):
+        file = log(tmp_path / "a.csv", self.WIDE, "q1,q2,q3,q4,q5")
+        ways = [
+            ({"joints": ("ext", "ankle", "knee", "hip", "ext_2")}, [3, 2, 1]),
+            ({"position": {"columns": ("q2", "q3", "q5")}}, [1, 2, 4]),
+        ]
+        for entries, expected in ways:
+            assert np.array_equal(read(file, robot, **entries)["position"], self.WIDE[:, expected])
+            file.with_suffix(".mcap").unlink()
+        np.savez(tmp_path / "b.npz", **{f"q{k}": self.WIDE[:, k] for k in range(3)})
+        for source in (tmp_path / "b.npz", log(tmp_path / "c.csv", self.WIDE[:, :3], "q0,q1,q2")):
+            assert np.array_equal(read(source, robot)["position"], self.WIDE[:, :3])
+
+
+class TestMapFile:
+    def test_reads_toml(self, tmp_path):
+        (tmp_path / "map.toml").write_text(
+            'sample_rate = 5000.0\n[position]\ncolumns = "Joint_{}"\nside = "motor"\n'
+            "[drive]\ngear_ratio = [32.0, 45]\ncoupling = [[2, 1, 32.0]]\n"
+        )
+        loaded = ColumnMap.load(tmp_path / "map.toml")
+        assert loaded.drive.coupling == ((2, 1, 32.0),)
+        assert loaded.position.side == "motor"
+
+    RATE = "sample_rate = 5\n"
+    POSITION = "[position]\ncolumns = 'q{}'\n"
+    COUPLED = "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n"
+
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            (RATE, "position: is missing"),
+            (POSITION, "either a time column or sample_rate"),
+            (f"{RATE}{POSITION}unit = 'inch'\n", "'inch' is no unit"),
+            (f"{RATE}[position]\ncolumn = 'q{{}}'\n", "position.column"),
+            (f"sample_rate = -5\n{POSITION}", "sample_rate: must be a number"),
+            (f"{RATE}{POSITION}side = 'motor'\n", "drive.gear_ratio is needed"),
+            (f"{RATE}[position]\ncolumns = -1\n", "position.columns: must be a name"),
+            (f"{RATE}[position]\nscale = 'x'\n", "position.scale: must be a number"),
+            (f"{RATE}position = 3\n", "position: must be a table"),
+            (f"{RATE}[position]\nfiles = 3\n", "position.files: must be a name with"),
+            ("sample_rate = \n", "cannot be read"),
+            (f"{RATE}{POSITION}scale = 0.0\n", "position.scale"),
+            (f"{RATE}{POSITION}{COUPLED}", "another joint"),
+        ],
+    )
+    def test_a_bad_one_is_refused_by_field(self, tmp_path, text, sentence):
+        (tmp_path / "map.toml").write_text(text)
+        with pytest.raises(SourceError, match=sentence) as refused:
+            ColumnMap.load(tmp_path / "map.toml")
+        assert "map.toml" in str(refused.value)
+
+
+# Arrays and text matrices: by key, by row or column, as programs write them
+
+
+Floats = NDArray[np.float64]
+Q = np.random.default_rng(5).normal(size=(40, 3))
+TAU = np.random.default_rng(6).normal(size=(40, 3))
+TIME = 0.01 * np.arange(40)
+
+
+def read_arrays(source: Path, robot: Robot, **entries: object) -> dict[str, Floats]:
+    return imported(source, robot, **{"position": {}, **entries})
+
+
+class TestArrays:
+    @pytest.mark.parametrize("transposed", [False, True])
+    def test_a_matrix_either_way_round(self, tmp_path, robot, transposed):
+        q, tau = (Q.T, TAU.T) if transposed else (Q, TAU)
+        np.savez(tmp_path / "a.npz", q=q, tau=tau)
+        found = read_arrays(
+            tmp_path / "a.npz", robot, position={"columns": "q"}, torque={"columns": "tau"}
+        )
+        assert np.array_equal(found["position"], Q)
+        assert np.array_equal(found["torque"], TAU)
+
+    def test_arrays_of_joints_or_columns_of_one_matrix(self, tmp_path, robot):
+        arrays = {f"q{j + 1}": Q[:, j] for j in range(3)} | dict(zip("abc", TAU.T, strict=True))
+        np.savez_compressed(tmp_path / "a.npz", **arrays)
+        found = read_arrays(
+            tmp_path / "a.npz",
+            robot,
+            position={"columns": "q{}"},
+            torque={"columns": ("c", "a", "b")},
+        )
+        assert np.array_equal(found["position"], Q)
+        assert np.array_equal(found["torque"], TAU[:, [2, 0, 1]])
+        np.save(tmp_path / "a.npy", np.column_stack([TIME, Q, TAU]))
+        found = read_arrays(
+            tmp_path / "a.npy",
+            robot,
+            time={"column": 0, "array": "array"},
+            position={"columns": (1, 2, 3)},
+            torque={"columns": (4, 5, 6)},
+        )
+        assert np.array_equal(found["torque"], TAU)
+        assert found["stamp"].tolist() == [10_000_000 * k for k in range(40)]
+
+    @pytest.mark.parametrize(
+        ("stamps", "unit"),
+        [
+            (1_700_000_000_123_456_000 + 10_000_000 * np.arange(40), "ns"),
+            (np.datetime64("2024-05-01T12:00:00") + np.arange(40) * np.timedelta64(10, "ms"), "s"),
+            (1.7e9 + TIME, "s"),
+            (-3.0 + TIME[:, None], "s"),
+            (1e12 + 10.0 * np.arange(40.0), "us"),
+        ],
+    )
+    def test_stamps_of_any_kind(self, tmp_path, robot, stamps, unit):
+        np.savez(tmp_path / "a.npz", q=Q, t=stamps)
+        found = read_arrays(
+            tmp_path / "a.npz",
+            robot,
+            position={"columns": "q"},
+            time={"column": "t", "unit": unit},
+        )
+        elapsed = (found["stamp"] - found["stamp"][0]) * 1e-9
+        scale = 1e-3 if unit == "us" else 1.0
+        assert elapsed == pytest.approx(TIME * scale, abs=3e-7)  # of a float that counts from 1970
+
+    def test_matlab_files_and_text(self, tmp_path, robot):
+        savemat(tmp_path / "a.mat", {"q": Q.T, "t": TIME[None, :]})
+        found = read_arrays(
+            tmp_path / "a.mat",
+            robot,
+            position={"columns": "q"},
+            time={"column": "t"},
+        )
+        assert np.array_equal(found["position"], Q)
+        rows = ";\n  ".join(" ".join(f"{cell:.17e}" for cell in row) for row in Q)
+        (tmp_path / "a.m").write_text(f"% a log\nT = [0.01];\nq = [ {rows} ]; % rad\n")
+        found = read_arrays(tmp_path / "a.m", robot, position={"columns": "q"})
+        assert np.array_equal(found["position"], Q)
+
+    @pytest.mark.parametrize(
+        ("arrays", "position", "sentence"),
+        [
+            ({"p": Q}, {"columns": "q"}, r"there is no array 'q'; its arrays are p \(40, 3\)"),
+            ({"p": Q, "r": Q}, {}, "which of its arrays is not said; its arrays are p"),
+            ({"p": Q[:3]}, {}, 'square matrix; say whether joints lie along "columns" or "rows"'),
+            ({"p": Q[:, :2]}, {}, r"shape \(40, 2\), joints along its columns, and there are 3"),
+            ({"p": Q}, {"columns": (0, 1, 7), "array": "p"}, r"'p' has no column 7; it has 3"),
+            ({"p": Q.T}, {"columns": (0, 9, 1), "joints_along": "rows"}, "rows 0, 9, 1; it has 3"),
+            ({"a": TIME, "b": TIME[1:]}, {"columns": ("a", "b", "a")}, "a 40, b 39, a 40"),
+            ({"p": np.array(["x"])}, {}, "holds no array of numbers"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused_with_what_is_there(
+        self,
+        tmp_path,
+        robot,
+        arrays,
+        position,
+        sentence,
+    ):
+        np.savez(tmp_path / "a.npz", **arrays)
+        with pytest.raises(SourceError, match=sentence):
+            read_arrays(tmp_path / "a.npz", robot, position=position)
+
+    def test_a_file_that_is_none_is_refused(self, tmp_path, robot):
+        (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 torn")
+        with pytest.raises(SourceError, match=r"a\.npz: cannot be read .* save the arrays again"):
+            read_arrays(tmp_path / "a.npz", robot)
+
+
+def stored(kind: str) -> bytes:
+    """A file with `t` and `q`."""
+    file, arrays = io.BytesIO(), {"t": TIME, "q": Q}
+    if kind == "npy":
+        np.save(file, Q)
+    elif kind == "npz":
+        np.savez_compressed(file, **arrays)
+    else:
+        savemat(file, arrays, do_compression=kind == "compressed mat")
+    return file.getvalue()
+
+
+def opaque(name: str) -> bytes:
+    """A variable of a .mat that only MATLAB can read, as it saves tables and strings."""
+    flags = struct.pack("<IIII", 6, 8, 17, 0)  # an array of UINT32: the class of opaque objects
+    text = struct.pack("<II", 1, len(name)) + name.encode().ljust(8, b"\0")
+    return struct.pack("<II", 14, len(flags) + len(text)) + flags + text
+
+
+LOG = {
+    "t": TIME,
+    "note": "a string",
+    "joint": {"q": Q, "tau": TAU.T, "more": {"q": -Q}},
+    "each": np.array([{"q": column} for column in Q.T], object),
+}
+
+
+class TestStructs:
+    """A path such as `log.joint.q` reaches a field of a struct."""
+
+    @pytest.mark.parametrize("packed", [False, True])
+    @pytest.mark.parametrize(
+        ("columns", "expected"),
+        [("log.joint.q", Q), ("log.joint.more.q", -Q), ("log.joint.tau", TAU)],
+    )
+    def test_a_field_is_reached_by_its_path(self, tmp_path, robot, columns, expected, packed):
+        savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0}, do_compression=packed)
+        entries = {"time": {"column": "log.t"}}
+        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
+        assert np.array_equal(found["position"], expected)
+        assert (found["stamp"] / 1e9) == pytest.approx(TIME)
+
+    @pytest.mark.parametrize("name", ["log.each({}).q", "cells({})", "one({}).q"])
+    def test_elements_count_from_one_as_in_matlab(self, tmp_path, robot, name):
+        records = np.zeros((1, 3), [("q", object)])
+        cells = np.empty(3, object)
+        for joint in range(3):
+            records[0, joint]["q"] = cells[joint] = Q[:, joint]
+        savemat(tmp_path / "a.mat", {"log": LOG, "cells": cells, "one": records})
+        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": name})
+        assert np.array_equal(found["position"], Q)
+
+    def test_columns_of_a_field_and_dimensions_of_one_element(self, tmp_path, robot):
+        """Simulink logs (1, joints, samples)."""
+        savemat(tmp_path / "a.mat", {"log": {"all": np.column_stack([TIME, Q])}})
+        position = {"array": "log.all", "columns": (1, 2, 3)}
+        assert np.array_equal(
+            read_arrays(tmp_path / "a.mat", robot, position=position)["position"], Q
+        )
+        (tmp_path / "a.mcap").unlink()
+        savemat(tmp_path / "a.mat", {"log": {"signals": {"values": Q.T[None]}}})
+        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.signals.values"})
+        assert np.array_equal(found["position"], Q)
+
+    @pytest.mark.parametrize(
+        ("path", "sentence"),
+        [
+            ("log.joint.x", r"its arrays are log.joint.q \(40, 3\)"),
+            ("log.joint", "its arrays are log.t"),
+            ("log.note", r"its arrays are log.t \(1, 40\), log.joint.q"),
+            ("other.q", r"its arrays are k \(1, 1\), log.t"),
+        ],
+    )
+    def test_a_field_that_is_missing_is_named_with_those_there(
+        self, tmp_path, robot, path, sentence
+    ):
+        savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0})
+        with pytest.raises(
+            SourceError, match=rf"a\.mat: position.columns: there is no array '{path}'; {sentence}"
+        ):
+            read_arrays(tmp_path / "a.mat", robot, position={"columns": path})
+
+    @pytest.mark.parametrize("position", ["q", "log.joint.q"])
+    def test_variables_that_only_matlab_reads_are_passed_over(self, tmp_path, robot, position):
+        """scipy lists nothing of a file with one."""
+        savemat(tmp_path / "a.mat", {"log": LOG, "q": Q})
+        with (tmp_path / "a.mat").open("ab") as file:
+            file.write(opaque("table"))
+        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": position})
+        assert np.array_equal(found["position"], Q)
+
+    def test_no_more_fields_are_read_than_anybody_logs(self, tmp_path, robot, monkeypatch):
+        monkeypatch.setattr(array_files, "_MOST_FIELDS", 2)
+        savemat(tmp_path / "a.mat", {"log": LOG})
+        with pytest.raises(ValueError, match="more than 2 fields"):
+            array_files._struct_fields(str(tmp_path / "a.mat"), ["log"])
+        monkeypatch.setattr(array_files, "_MOST_FIELDS", 100)
+        monkeypatch.setattr(array_files, "MOST_NUMBERS", 100)
+        with pytest.raises(ValueError, match="too large"):
+            array_files._struct_fields(str(tmp_path / "a.mat"), ["log"])
+
+
+class TestDamageAndMalice:
+    @pytest.mark.parametrize("kind", ["npz", "npy", "mat", "compressed mat"])
+    def test_a_damaged_file_is_read_or_refused_with_one_sentence(self, tmp_path, kind):
+        rng, whole = np.random.default_rng(1), stored(kind)
+        path = tmp_path / f"a.{kind.split()[-1]}"
+        refused = 0
+        for _ in range(40):
+            data = bytearray(whole)
+            data[rng.integers(min(len(data), 400))] = rng.integers(256)
+            path.write_bytes(data[: rng.integers(len(data) // 2, len(data) * 2)])
+            try:
+                file = ArrayFile.read(path)
+                for name in file.stored:
+                    file.matrix(name, "position")
+            except SourceError:
+                refused += 1
+        assert refused > 0
+
+    def test_a_file_that_kills_scipy_does_not_kill_the_import(self, tmp_path, robot):
+        savemat(tmp_path / "a.mat", {"t": np.arange(4.0)})
+        data = bytearray((tmp_path / "a.mat").read_bytes())
+        data[176] = 0  # the type of the numbers: MATLAB has none of that number
+        (tmp_path / "a.mat").write_bytes(data)
+        with pytest.raises(SourceError, match=r"cannot be read \(it is damaged\)"):
+            read_arrays(tmp_path / "a.mat", robot, position={"columns": "t"})
+        savemat(tmp_path / "b.mat", {"q": Q})
+        assert np.array_equal(read_arrays(tmp_path / "b.mat", robot)["position"], Q)
+
+    def test_only_what_the_map_names_is_read_and_no_more_than_fits(self, tmp_path, robot):
+        """Zeros pack well: a small file can hold more than any memory."""
+        path = tmp_path / "a.npz"
+        np.savez(path, q=Q, o=np.array([print], object), few=np.array([1, 2j]))
+        with zipfile.ZipFile(path, "a") as archive, archive.open("bomb.npy", "w") as bomb:
+            head = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
+            np.lib.format.write_array_header_1_0(bomb, head)
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr("torn.npy", stored("npy")[:-1])
+        assert np.array_equal(read_arrays(path, robot, position={"columns": "q"})["position"], Q)
+        for name, sentence in {
+            "bomb": "too large to be read at once; save the log in parts",
+            "torn": "cannot be read",
+            "o": "there is no array 'o'",
+            "few": "there is no array 'few'",
+        }.items():
+            with pytest.raises(SourceError, match=sentence):
+                read_arrays(path, robot, position={"columns": name})
+
+    def test_what_claims_more_than_it_holds_or_objects_is_refused(self, tmp_path, robot):
+        with (tmp_path / "a.npy").open("wb") as file:
+            head = {"descr": "<f8", "fortran_order": False, "shape": (10**7, 3)}
+            np.lib.format.write_array_header_1_0(file, head)
+        with pytest.raises(SourceError, match="cannot be read"):
+            read_arrays(tmp_path / "a.npy", robot)
+        np.save(tmp_path / "a.npy", np.array([print] * 3, object), allow_pickle=True)
+        with pytest.raises(SourceError, match=r"a\.npy"):
+            read_arrays(tmp_path / "a.npy", robot)
+
+    def test_brackets_without_end_are_quickly_found_out(self, tmp_path, robot):
+        (tmp_path / "a.m").write_text("a=[" * 100_000 + "a" * 100_000)
+        begin = monotonic()
+        with pytest.raises(SourceError, match="no array of numbers"):
+            read_arrays(tmp_path / "a.m", robot)
+        assert monotonic() - begin < 5.0
+
+
+@pytest.mark.parametrize("name", ["rob\x7f", "\U0001f916arm", 'a"\\', "\udc80rob", ""])
+def test_any_name_of_a_file_or_joint_makes_a_cell_file(name: str) -> None:
+    text = _cell_text(name, FrictionLaw(), (0, 0, np.nan), True, {name: 0.5})
+    cell = tomllib.loads(text.encode().decode())
+    assert cell["cell"]["name"] == (name.replace("\udc80", "?") or "robot")
+    assert list(cell["robot"]["locked"].values()) == [0.5]
+
+
+class TestTextMatrices:
+    @pytest.mark.parametrize("transposed", [False, True])
+    def test_one_file_per_quantity_without_header(self, tmp_path, robot, transposed):
+        for name, values in (("q", Q), ("tau", TAU)):
+            np.savetxt(tmp_path / f"{name}.txt", values.T if transposed else values, fmt="%.17e")
+        found = read_arrays(tmp_path / "q.txt", robot, torque={"file": "tau.txt"})
+        assert np.array_equal(found["position"], Q)
+        assert np.array_equal(found["torque"], TAU)
+
+    def test_channels_along_lines_with_their_names(self, tmp_path, robot):
+        rows = [("time", TIME), *((f"q{j + 1}", Q[:, j]) for j in range(3))]
+        lines = [" ".join([name, *(repr(float(v)) for v in values)]) for name, values in rows]
+        (tmp_path / "a.txt").write_text("\n".join(lines))
+        found = read_arrays(
+            tmp_path / "a.txt",
+            robot,
+            time={"column": "time"},
+            position={"columns": "q{}"},
+            format={"transposed": True},
+        )
+        assert np.array_equal(found["position"], Q)
+
+    @given(
+        values=arrays(np.float64, (7, 3), elements=st.floats(-1e6, 1e6, width=32)),
+        delimiter=st.sampled_from([",", ";", "\t", " ", "|", "  ", "; "]),
+        decimal=st.sampled_from([".", ","]),
+        exponent=st.sampled_from(["e", "E", "D", "d"]),
+        header=st.booleans(),
+        ends=st.sampled_from(["\n", "\r\n"]),
+    )
+    def test_whatever_is_written_is_read(
+        self, tmp_path_factory, values, delimiter, decimal, exponent, header, ends
+    ):
+        assume("," not in delimiter or decimal == ".")
+        lines = [
+            delimiter.join(f"{cell:.16e}".replace("e", exponent) for cell in row).replace(
+                ".", decimal
+            )
+            for row in values
+        ]
+        if header:
+            lines.insert(0, delimiter.join(["q1", "q2", "q3"]))
+        path = tmp_path_factory.mktemp("any") / "q.txt"
+        path.write_bytes(ends.join(lines).encode())
+        table = Table.read(path, Format())
+        assert np.array_equal(table.numbers([0, 1, 2], "position"), values)
+        assert table.names == (("q1", "q2", "q3") if header else ())
+
+    def test_an_empty_line_between_numbers_is_named(self, tmp_path, robot):
+        lines = [" ".join(map(repr, row)) for row in Q.tolist()]
+        (tmp_path / "q.txt").write_text("\n".join([*lines[:9], "", *lines[9:]]))
+        with pytest.raises(SourceError, match=r"line 10 is empty; .*skip_empty = true.*skip_rows"):
+            read_arrays(tmp_path / "q.txt", robot)
+
+    @pytest.mark.parametrize("header", [[], ["q1 q2 q3"], ["q1 q2 q3", ""]])
+    def test_empty_lines_are_left_out_on_demand(self, tmp_path, robot, header):
+        lines = [" ".join(map(repr, row)) + "\n" for row in Q.tolist()]
+        (tmp_path / "q.txt").write_text("\n".join(["", *header, *lines, " ", ""]))
+        found = read_arrays(tmp_path / "q.txt", robot, format={"skip_empty": True})
+        assert np.array_equal(found["position"], Q)
+
+    @pytest.mark.parametrize("hole", ["nan", "", "NULL", "-"])
+    def test_rows_with_holes_are_left_out_on_demand(self, tmp_path, robot, hole):
+        lines = [",".join(map(repr, [t, *row])) for t, row in zip(TIME, Q.tolist(), strict=True)]
+        lines = [line.replace("np.float64(", "").replace(")", "") for line in lines]
+        lines[7] = f"0.07,{hole},1,2"
+        (tmp_path / "a.csv").write_text("\n".join(["t,q1,q2,q3", *lines]))
+        entries = {"time": {"column": "t"}, "position": {"columns": "q{}"}}
+        with pytest.raises(SourceError, match=r"line 9 has .* in column q1"):
+            read_arrays(tmp_path / "a.csv", robot, **entries)
+        found = read_arrays(tmp_path / "a.csv", robot, **entries, format={"missing": "drop"})
+        assert np.array_equal(found["position"], np.delete(Q, 7, axis=0))
+        assert 70_000_000 not in found["stamp"]
+
+
+def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
+    more = np.column_stack([Q[:, 2], np.full(40, 9.0), Q[:, :2]])
+    np.savez(tmp_path / "a.npz", q=more)
+    found = read_arrays(
+        tmp_path / "a.npz",
+        robot,
+        joints=(JOINTS[2], "gripper", *JOINTS[:2]),
+        position={"columns": "q", "scale": (2.0, 1.0, 1.0, 1.0), "offset": (0.5, 0, 0, 0)},
+    )
+    assert found["position"][:, :2] == pytest.approx(Q[:, :2])
+    assert found["position"][:, 2] == pytest.approx(2.0 * (Q[:, 2] + 0.5))
+    np.savez(tmp_path / "a.npz", q=Q[:, :2])
+    with pytest.raises(SourceError, match="--locked NAME, or all: --lock-others"):
+        read_arrays(tmp_path / "a.npz", robot, joints=JOINTS[:2], position={"columns": "q"})
+    path = tmp_path / "two.urdf"
+    path.write_text(robot.urdf)
+    locked = Robot.from_urdf(path, locked={"ankle": 0.3})
+    found = read_arrays(tmp_path / "a.npz", locked, joints=JOINTS[:2], position={"columns": "q"})
+    assert np.array_equal(found["position"], Q[:, :2])
+    assert open_recording(tmp_path / "a.mcap").joint_names == JOINTS[:2]
+
+
+def test_the_process_that_reads_for_us_never_takes_all_memory_also_when_it_is_another() -> None:
+    pid = array_files._elsewhere(os.getpid)
+    os.kill(pid, signal.SIGKILL)
+    assert array_files._readers[0].connection.poll(5.0)
+    assert array_files._elsewhere(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
+    assert array_files._elsewhere(os.getpid) != pid
+
+
+# Robots of which only the Denavit-Hartenberg parameters are known
+
+
+DH_HEADER = "joint,type,a,alpha,d,theta_offset"
+MIXED = (
+    ("turn", "revolute", 0.2, 0.7, 0.4, 0.3),
+    ("slide", "prismatic", -0.1, -1.2, 0.15, 1.1),
+    ("elbow", "revolute", 0.05, 3.0, 0.0, -2.0),
+    ("wrist", "revolute", 0.0, -0.4, -0.3, 0.0),
+)
+UR5 = """joint,type,a,alpha_deg,d,theta_offset
+shoulder_pan_joint,revolute,0,90,0.089159,0
+shoulder_lift_joint,revolute,-0.425,0,0,0
+elbow_joint,revolute,-0.39225,0,0,0
+wrist_1_joint,revolute,0,90,0.10915,0
+wrist_2_joint,revolute,0,-90,0.09465,0
+wrist_3_joint,revolute,0,0,0.0823,0
+"""
+PANDA = """# as its maker gives them, after Craig
+joint;type;a_mm;alpha_deg;d_mm;theta_offset_deg
+panda_joint1;revolute;0;0;333;0
+panda_joint2;revolute;0;-90;0;0
+panda_joint3;revolute;0;90;316;0
+panda_joint4;revolute;82.5;90;0;0
+panda_joint5;revolute;-82.5;-90;384;0
+panda_joint6;revolute;0;90;0;0
+panda_joint7;revolute;88;90;0;0
+"""
+
+
+def dh_table(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def dh_text(rows: tuple[tuple[object, ...], ...]) -> str:
+    return "\n".join([DH_HEADER, *(",".join(map(str, row)) for row in rows)]) + "\n"
+
+
+def about_z(angle: float, along: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, along], [0, 0, 0, 1.0]])
+
+
+def about_x(angle: float, along: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0, along], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+
+
+def flange(convention: Convention, q: Floats) -> Floats:
+    """Forward kinematics of MIXED, row by row."""
+    place = np.eye(4)
+    for (_, kind, a, alpha, d, offset), value in zip(MIXED, q, strict=True):
+        turns = kind == "revolute"
+        z = about_z(offset + value * turns, d + value * (not turns))
+        x = about_x(alpha, a)
+        place = place @ (z @ x if convention == "standard" else x @ z)
+    return place
+
+
+def placement(model: pin.Model, q: Floats, frame: str) -> Floats:
+    """Of a frame of a URDF in its base; a joint without limits counts by cosine and sine."""
+    full = np.concatenate(
+        [
+            [np.cos(one), np.sin(one)] if joint.nq == 2 else [one]
+            for joint, one in zip(model.joints[1:], q, strict=True)
+        ]
+    )
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, full)
+    return np.array(data.oMf[model.getFrameId(frame)].homogeneous)
+
+
+class TestDhKinematics:
+    @pytest.mark.parametrize("convention", ["standard", "modified"])
+    def test_is_that_of_the_rows(self, tmp_path: Path, convention: Convention) -> None:
+        """Of turning and sliding joints, for any posture."""
+        model = pin.buildModelFromXML(
+            urdf_of_dh(dh_table(tmp_path / "dh.csv", dh_text(MIXED)), convention)
+        )
+        for q in np.random.default_rng(2).uniform(-3.0, 3.0, (20, 4)):
+            assert placement(model, q, "flange") == pytest.approx(flange(convention, q), abs=1e-12)
+
+    def test_of_a_ur5_is_that_of_its_urdf(self, tmp_path: Path) -> None:
+        """Standard: up to the frames in which base and tool are given."""
+        ours = pin.buildModelFromXML(urdf_of_dh(dh_table(tmp_path / "ur5.csv", UR5), "standard"))
+        theirs = pin.buildModelFromUrdf(str(urdf_path("ur5_robot.urdf")))
+        base, tools = about_z(np.pi, 0.0), []
+        for q in np.random.default_rng(3).uniform(-3.0, 3.0, (10, 6)):
+            there = base @ placement(theirs, q, "tool0")
+            tools.append(np.linalg.solve(there, placement(ours, q, "flange")))
+        assert np.ptp(tools, axis=0).max() < 1e-3  # m; the URDF rounds its lengths
+
+    def test_of_a_panda_is_that_of_its_urdf(self, tmp_path: Path) -> None:
+        """Modified, with lengths in mm and angles in degrees: the frames are the same."""
+        ours = pin.buildModelFromXML(
+            urdf_of_dh(dh_table(tmp_path / "panda.csv", PANDA), "modified")
+        )
+        theirs = pin.buildModelFromUrdf(str(urdf_path("panda.urdf")))
+        for q in np.random.default_rng(4).uniform(-1.0, 1.0, (10, 7)):
+            expected = placement(theirs, np.append(q, [0.0, 0.0]), "panda_link7")
+            assert placement(ours, q, "link_7") == pytest.approx(expected, abs=1e-9)
+
+    def test_nothing_is_known_of_masses_and_limits(self, tmp_path: Path) -> None:
+        """So that no nominal model is made of what nobody said."""
+        robot = Robot.from_urdf(
+            dh_table(tmp_path / "dh.csv", dh_text(MIXED)), convention="standard"
+        )
+        cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
+        assert robot.joint_names == ("turn", "slide", "elbow", "wrist")
+        assert not cell.model.nominal.any()
+        assert nominal_of(cell) is None
+
+
+class TestDhRefusals:
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            ("", r"has no row of a joint; write joint,type,a,alpha,d,theta_offset"),
+            (f"{DH_HEADER}\n", "has no row of a joint"),
+            ("joint,type,a,alpha,d\nj,revolute,0,0,0\n", "header: has no column theta_offset"),
+            (
+                f"{DH_HEADER},alpha_deg\nj,revolute,0,0,0,0,90\n",
+                "header: has columns alpha and alpha_deg",
+            ),
+            (
+                f"{DH_HEADER}\nj,spherical,0,0,0,0\n",
+                "type: line 2 has the type 'spherical'; write rev",
+            ),
+            (
+                f"{DH_HEADER}\nj,revolute,0,90,0,0\n",
+                "alpha: line 2 has '90'.*call the column alpha_deg",
+            ),
+            (f"{DH_HEADER}\nj,revolute,400,0,0,0\n", "a: line 2 has '400'.*call the column a_mm"),
+            (f"{DH_HEADER}\nj,revolute,0,0,0,\n", "theta_offset: line 2 has nothing"),
+            (f"{DH_HEADER}\nj,revolute,0,nan,0,0\n", "alpha: line 2 has 'nan'"),
+            (f"{DH_HEADER}\n,revolute,0,0,0,0\n", "joint: line 2 has no name"),
+            (f"{DH_HEADER}\nj,revolute,0,0,0,0\nj,revolute,0,0,0,0\n", "joint: has two joints 'j'"),
+        ],
+    )
+    def test_name_line_field_and_remedy(self, tmp_path: Path, text: str, sentence: str) -> None:
+        with pytest.raises(InputError, match=r"dh\.csv: cannot be read"):
+            urdf_of_dh(tmp_path / "dh.csv", "standard")
+        with pytest.raises(InputError, match=rf"dh\.csv: {sentence}"):
+            urdf_of_dh(dh_table(tmp_path / "dh.csv", text), "standard")
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (["--dh", "dh.csv"], "--convention: is not given; --dh needs standard"),
+            (["--dh", "dh.csv", "--convention", "craig"], "'craig' is unknown"),
+            (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: exclude each other"),
+            ([], "--urdf or --dh: one of them is needed"),
+        ],
+    )
+    def test_options_that_do_not_fit(self, options: list[str], sentence: str) -> None:
+        result = CliRunner().invoke(app, ["new", *options])
+        assert isinstance(result.exception, InputError)
+        assert sentence in str(result.exception)
+
+
+class TestDhCommands:
+    def test_new_writes_a_cell_and_its_urdf(self, tmp_path: Path) -> None:
+        path = dh_table(tmp_path / "panda.csv", PANDA)
+        arguments = ["new", "--dh", str(path), "--convention", "modified", "--json"]
+        result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "cell.toml")])
+        assert result.exit_code == 0, result.output
+        summary = json.loads(result.output)
+        assert summary["joints"] == [f"panda_joint{j}" for j in range(1, 8)]
+        assert "limits.lower_deg" in summary["unknown"]
+        assert any("no masses" in note for note in summary["notes"])
+        cell = tomllib.loads((tmp_path / "cell.toml").read_text())
+        assert cell["cell"]["urdf"] == "cell.urdf"
+        chain = chain_from_urdf((tmp_path / "cell.urdf").read_text())
+        assert list(chain.joint_names) == summary["joints"]
+        assert path.read_text() == PANDA
+
+    def test_a_log_is_imported_with_it(self, tmp_path: Path) -> None:
+        """As with a URDF; joints that were not recorded can be locked."""
+        time = np.arange(200) / 100.0
+        q = np.sin(time[:, None] * [1.0, 2.0, 3.0])
+        np.savez(tmp_path / "log.npz", t=time, q=q)
+        (tmp_path / "map.toml").write_text(
+            'joints = ["turn", "elbow", "wrist"]\n[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'
+        )
+        path = dh_table(tmp_path / "dh.csv", dh_text(MIXED))
+        arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
+        arguments += ["--map", str(tmp_path / "map.toml"), "--dh", str(path), "--lock-others"]
+        result = CliRunner().invoke(app, [*arguments, "--convention", "modified"])
+        assert result.exit_code == 0, result.exception
+        assert "locked, rad or m: slide at 0" in result.output
+        archive = open_archive(tmp_path / "log.mcap")
+        assert archive.joint_names == ("turn", "elbow", "wrist")
+        assert np.array_equal(archive.columns["position"], q)
+
+
+# Slips of a column map, and of what the robot is, are said when a log is imported
+
+
+DEGREES = 57.29578
+
+
+@pytest.fixture(scope="module")
+def arm() -> Simulated:
+    return simulate("ur5_robot.urdf", np.arange(0.0, 20.0, 0.01))
+
+
+@pytest.fixture(scope="module")
+def panda() -> Simulated:
+    """An arm whose joints have ranges of their own."""
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    return simulate("panda.urdf", np.arange(0.0, 20.0, 0.01), locked=fingers)
+
+
+def warnings(
+    arm: Simulated, *, position=1.0, velocity=1.0, torque=1.0, clock=1.0, order=None
+) -> list[str]:
+    stamp = np.rint(arm.time * clock * 1e9).astype(np.int64)
+    joints = range(len(arm.joint_names)) if order is None else order
+    samples = Samples(
+        stamp,
+        arm.position * position,
+        velocity=arm.velocity[:, list(joints)] * velocity,
+        torque=arm.torque * torque,
+    )
+    return list(examine(samples, arm.joint_names, arm.urdf.read_text()).warnings)
+
+
+class TestSlips:
+    def test_a_log_without_one_has_no_warning(self, arm: Simulated, panda: Simulated) -> None:
+        assert warnings(arm) == []
+        assert warnings(panda) == []
+
+    @pytest.mark.parametrize(
+        ("slip", "sentence"),
+        [
+            ({"position": DEGREES}, "degrees read as radians"),
+            ({"position": 1 / DEGREES}, "no joint moves further than"),
+            ({"velocity": 0.0}, "does not follow its position"),
+            ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): is its unit right"),
+            ({"torque": 0.0}, "is zero throughout"),
+            ({"clock": 1e3}, "0.1 samples a second is unusual"),
+            ({"clock": 1e-3}, "1e+05 samples a second is unusual"),
+        ],
+    )
+    def test_is_named(self, arm: Simulated, slip: dict[str, float], sentence: str) -> None:
+        found = warnings(arm, **slip)
+        assert any(sentence in warning for warning in found), found
+
+    @pytest.mark.parametrize("factor", [DEGREES, 1 / DEGREES, 9.5493, -1.0])
+    def test_a_unit_or_sign_of_velocity_shows_as_a_factor(
+        self, panda: Simulated, factor: float
+    ) -> None:
+        (sentence,) = warnings(panda, velocity=factor)
+        factors = sentence.partition(":")[0].partition(" times ")[2].split(", ")
+        found = [float(one.split()[0]) for one in factors]
+        assert found == pytest.approx([factor] * len(panda.joint_names), rel=1e-2)
+
+    def test_factors_are_named_by_joint_and_degrees_read_twice(
+        self, arm: Simulated, panda: Simulated
+    ) -> None:
+        (sentence,) = warnings(arm, velocity=np.array([1.0, 3.0, 1.0, 1.0, 1.0, 0.2]))
+        factors = sentence.partition(":")[0].partition(" times ")[2].split(", ")
+        assert [float(one.split()[0]) for one in factors] == pytest.approx([3.0, 0.2], rel=1e-2)
+        assert factors[0].endswith("for shoulder_lift_joint")
+        (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
+        assert sentence.startswith("as mapped, 100 % of the rows leave the limits of the URDF")
+        assert 'as degrees read as radians, none would: write unit = "deg"' in sentence
+        assert all("degrees" in other for other in others)
+
+
+class TestOrder:
+    def test_velocities_in_another_order_are_told_with_the_order(self, arm: Simulated) -> None:
+        names = list(arm.joint_names)
+        (sentence,) = warnings(arm, order=(1, 2, 0, 3, 4, 5))
+        right = [names[1], names[2], names[0], *names[3:]]
+        assert f"as those of {', '.join(right)} by 0 %" in sentence
+        assert "as mapped they miss their slopes by" in sentence
+
+    def test_positions_of_another_order_and_a_zero_that_is_off(self, panda: Simulated) -> None:
+        """Joint 4 of this arm bends one way only, joint 6 the other way."""
+        names = list(panda.joint_names)
+        order = [0, 1, 2, 5, 4, 3, 6]
+        samples = Samples(np.rint(panda.time * 1e9).astype(np.int64), panda.position[:, order])
+        found = examine(samples, names, panda.urdf.read_text()).warnings
+        assert "% of the rows leave the limits of the URDF" in found[0]
+        assert f"those of {', '.join(names[j] for j in order)}, none would" in found[0]
+        position = panda.position.copy()
+        position[:, 3] += 20.0
+        samples = Samples(np.rint(panda.time * 1e9).astype(np.int64), position)
+        found = examine(samples, panda.joint_names, panda.urdf.read_text()).warnings
+        assert "check unit, sign and zero in the column map" in found[0]
+        assert "order" not in found[0]
+
+
+class TestClock:
+    """A recording whose clock cannot be that of a motion is refused by file and field."""
+
+    def stamps(self, *seconds: float) -> NDArray[np.int64]:
+        return np.rint(np.array(seconds) * 1e9).astype(np.int64)
+
+    @pytest.mark.parametrize(
+        "seconds",
+        [
+            *(np.arange(50) / rate for rate in (10.0, 125.0, 1e3, 5e4)),
+            (3.0,),
+            (0.0, 0.01, 0.01, 0.02),
+        ],
+    )
+    def test_usual_rates_single_stamps_and_repeats_pass(self, seconds: Sequence[float]) -> None:
+        check_clock(self.stamps(*seconds), Path("x"))
+
+    @pytest.mark.parametrize(
+        ("seconds", "sentence"),
+        [
+            (
+                range(0, 1000, 10),
+                r"x: time: there would be 0\.1 samples .* would make it 100 samples a second",
+            ),
+            (
+                (0.0, 0.01, 0.02, 0.005, 0.015),
+                r"sample 3 is 0\.015 s older than the one before it \(1 such steps\)",
+            ),
+            ((3.0, 3.0, 3.0), "all 3 samples have the same time"),
+        ],
+    )
+    def test_that_of_no_motion_is_refused(self, seconds: Sequence[float], sentence: str) -> None:
+        with pytest.raises(SourceError, match=sentence):
+            check_clock(self.stamps(*seconds), Path("x"))
+
+    def test_the_file_with_the_times_is_named(self, arm: Simulated, tmp_path: Path) -> None:
+        np.savetxt(tmp_path / "q.txt", arm.position)
+        np.savetxt(tmp_path / "t.txt", 1e3 * arm.time)
+        columns = ColumnMap.model_validate(
+            {"time": {"column": 0, "file": "t.txt"}, "position": {"file": "q.txt"}}
+        )
+        with pytest.raises(SourceError, match=r"t\.txt: time: there would be 0\.1 samples"):
+            import_log(
+                tmp_path, tmp_path / "a.mcap", robot=Robot.from_urdf(arm.urdf), columns=columns
+            )
+        assert not (tmp_path / "a.mcap").exists()
+
+
+class TestImportCommand:
+    def test_it_says_what_it_read_and_the_archive_keeps_it(
+        self, arm: Simulated, tmp_path: Path
+    ) -> None:
+        np.savez(tmp_path / "log.npz", q=np.degrees(arm.position), t=arm.time)
+        (tmp_path / "map.toml").write_text(
+            '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
+        )
+        arguments = ["import", "npz", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
+        arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
+        result = CliRunner().invoke(app, [*arguments, "--kind", "validation"])
+        assert result.exit_code == 0
+        assert "2000 samples in 19.99 s, 100 Hz" in result.stdout
+        assert "warning: as mapped" in result.stdout
+        assert 'write unit = "deg"' in result.stdout
+        header = open_archive(tmp_path / "log.mcap").header
+        assert header.serves_as == "validation"
+        assert any("deg" in warning for warning in header.findings.warnings)
+        assert json.loads(header.entries["source"]) == ["log.npz"]
+
+    def test_an_earlier_archive_gives_its_warnings_too(self) -> None:
+        """They had another name in its metadata."""
+        stored = json.dumps({"lines": ["a"], "doubts": ["b"]})
+        entries = {"kind": "imported", "joint_names": '["a"]', "attachments": "[]"}
+        found = ArchiveHeader.of({**entries, "findings": stored}).findings
+        assert found == Findings(lines=("a",), warnings=("b",))
+
+
+TWO_JOINT_URDF = Path(__file__).parents[1] / "identification" / "two_link.urdf"
+
+
+LOADED = "gains a.mcap --loaded b.mcap --mass 4"
+NONSENSE = {
+    "gains a.mcap --delay nan": "--delay",
+    "gains a.mcap --delay 20": "--delay",
+    "gains a.mcap --loaded a.mcap --mass 4": "with load and without",
+    f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
+    f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
+    "import log a.csv -o a.mcap --map m.toml --urdf r.urdf --cell c.toml": (
+        "--urdf and --cell: exclude each other"
+    ),
+}
+
+
+@pytest.mark.parametrize("arguments", NONSENSE)
+def test_nonsense_is_refused_in_one_sentence(arguments: str) -> None:
+    result = CliRunner().invoke(app, arguments.split())
+
+    assert result.exit_code != 0
+    assert NONSENSE[arguments] in str(result.exception) + result.output
+
+
+class TestRobotOfAnImport:
+    """Options that say what the robot is, of both importers."""
+
+    @pytest.fixture
+    def place(self, tmp_path: Path) -> Path:
+        time = np.arange(200) / 100.0
+        q, tau = np.sin(time), np.sin(2.0 * time)
+        rows = np.column_stack([time, q, tau])
+        np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="t,q1,tau1", comments="")
+        messages = [
+            state(round(t * 1e9) + 1, [angle], names=["elbow"], effort=[1.0])
+            for t, angle in zip(time.tolist(), q.tolist(), strict=True)
+        ]
+        bag(tmp_path / "bag.db3", {"/js": (STATE, messages)})
+        (tmp_path / "map.toml").write_text(
+            'joints = ["elbow"]\n[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n'
+            '[torque]\ncolumns = "tau{}"\n'
+        )
+        return tmp_path
+
+    def run(self, place: Path, kind: str, *options: str) -> Result:
+        source = ["log.csv", "--map", str(place / "map.toml")] if kind == "log" else ["bag.db3"]
+        arguments = ["import", kind, str(place / source[0]), *source[1:]]
+        return CliRunner().invoke(app, [*arguments, "-o", str(place / "o.mcap"), *options])
+
+    @pytest.mark.parametrize("kind", ["log", "rosbag2"])
+    def test_others_are_locked_on_demand_and_named(self, place: Path, kind: str) -> None:
+        refused = self.run(place, kind, "--urdf", str(TWO_JOINT_URDF))
+        assert isinstance(refused.exception, SourceError)
+        assert "--lock-others" in str(refused.exception)
+
+        result = self.run(place, kind, "--urdf", str(TWO_JOINT_URDF), "--lock-others")
+
+        assert result.exit_code == 0, result.exception
+        assert "locked, rad or m: shoulder at 0" in result.output
+        assert open_archive(place / "o.mcap").joint_names == ("elbow",)
+
+    def test_joints_of_a_bag_can_have_other_names(self, place: Path) -> None:
+        messages = [state(10**7 * k, [0.1 * k], names=["j2"]) for k in range(9)]
+        bag(place / "other.db3", {"/js": (STATE, messages)})
+        arguments = ["import", "rosbag2", str(place / "other.db3"), "-o", str(place / "o.mcap")]
+        arguments += ["--urdf", str(TWO_JOINT_URDF), "--lock-others"]
+        refused = CliRunner().invoke(app, arguments)
+        assert "recorded are j2" in str(refused.exception)
+        assert "--rename RECORDED=URDF" in str(refused.exception)
+        assert "--rename" in str(CliRunner().invoke(app, [*arguments, "--rename", "j2"]).exception)
+        assert CliRunner().invoke(app, [*arguments, "--rename", "j2=elbow"]).exit_code == 0
+        assert open_archive(place / "o.mcap").joint_names == ("elbow",)
+
+    def test_a_map_without_names_cannot_say_which_are_others(self, place: Path) -> None:
+        text = (place / "map.toml").read_text()
+        (place / "map.toml").write_text(text.replace('joints = ["elbow"]\n', ""))
+        refused = self.run(place, "log", "--urdf", str(TWO_JOINT_URDF), "--lock-others")
+        assert isinstance(refused.exception, InputError)
+        assert "map.toml: joints: does not say which joints were recorded" in str(refused.exception)
+
+    @pytest.mark.parametrize("kind", ["log", "rosbag2"])
+    def test_gravity_has_any_finite_direction_and_size(self, place: Path, kind: str) -> None:
+        options = ["--urdf", str(TWO_JOINT_URDF), "--lock-others", "--gravity"]
+        result = self.run(place, kind, *options, "0", "-1.62", "3")
+        assert result.exit_code == 0, result.exception
+        cell = tomllib.loads(open_archive(place / "o.mcap").text("cell.toml"))
+        assert cell["robot"]["gravity"] == [0.0, -1.62, 3.0]
+        refused = self.run(place, kind, *options, "0", "nan", "0")
+        assert isinstance(refused.exception, InputError)
+        assert "--gravity" in str(refused.exception)
+
+    @pytest.mark.parametrize("kind", ["log", "rosbag2"])
+    def test_friction_is_offset_coulomb_and_viscous_unless_named(
+        self, place: Path, kind: str
+    ) -> None:
+        options = ["--urdf", str(TWO_JOINT_URDF), "--lock-others"]
+        for friction, third, offset in [([], "none", True), (["coulomb,cubic"], "cubic", False)]:
+            result = self.run(
+                place, kind, *options, *(["--friction", *friction] if friction else [])
+            )
+            assert result.exit_code == 0, result.exception
+            law = tomllib.loads(open_archive(place / "o.mcap").text("cell.toml"))["robot"][
+                "friction"
+            ]
+            assert (law["third"], law["offset"]) == (third, offset)
+            (place / "o.mcap").unlink()
