@@ -209,16 +209,7 @@ def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folde
     )
 
 
-def test_a_value_is_replaced_in_its_own_table_and_nowhere_else() -> None:
-    text = "[a]\nseed = 1 # one\n[b] # comment\nseed = 2\n"
-    assert replaced_value(text, "b", "seed", 7) == "[a]\nseed = 1 # one\n[b] # comment\nseed = 7\n"
-    assert "other = 3" in replaced_value(text, "a", "other", 3)
-    assert replaced_value("[ a ]\n  x = 1", "a", "x", '"\\u00e1"') == '[ a ]\n  x = "\\u00e1"'
-    with pytest.raises(ValueError, match="no table"):
-        replaced_value(text, "c", "seed", 7)
-
-
-def test_a_cell_can_be_moved_beside_its_urdf(folder: Path) -> None:
+def test_a_cell_is_moved_and_changed_in_its_text_too(folder: Path, ns16: Cell) -> None:
     (folder / "models").mkdir()
     (folder / "ns16.urdf").rename(folder / "models" / "ns16.urdf")
     path = folder / "cell.toml"
@@ -226,12 +217,15 @@ def test_a_cell_can_be_moved_beside_its_urdf(folder: Path) -> None:
     moved = Cell.load(path).with_urdf(folder / "models" / "cell.toml", "robot.urdf")
     assert moved.file.cell.urdf == "robot.urdf"
     assert moved.urdf == URDF_PATH.read_text("utf-8")
-
-
-def test_campaign_settings_can_be_replaced_in_the_text_too(ns16: Cell) -> None:
     cell = ns16.with_campaign(repetitions=7, simulation_seed=5)
     again = Cell.from_texts(cell.text, cell.urdf, cell.path)
     assert (again.campaign.repetitions, again.simulation.seed, again.campaign.seed) == (7, 5, 1)
+    text = "[a]\nseed = 1 # one\n[b] # comment\nseed = 2\n"
+    assert replaced_value(text, "b", "seed", 7) == "[a]\nseed = 1 # one\n[b] # comment\nseed = 7\n"
+    assert "other = 3" in replaced_value(text, "a", "other", 3)
+    assert replaced_value("[ a ]\n  x = 1", "a", "x", '"\\u00e1"') == '[ a ]\n  x = "\\u00e1"'
+    with pytest.raises(ValueError, match="no table"):
+        replaced_value(text, "c", "seed", 7)
 
 
 def test_a_cell_on_a_bus_names_its_adapter(ns16: Cell) -> None:

@@ -210,7 +210,7 @@ class TestRobot:
         with pytest.raises(InputError, match=r"'knee'.*hip, ankle"):
             Robot.from_urdf(tmp_path / "two.urdf", locked={"knee": 0.0})
 
-    def test_a_file_that_is_no_urdf_is_refused(self, tmp_path):
+    def test_files_and_urdfs_that_are_none_are_named(self, tmp_path):
         (tmp_path / "bad.urdf").write_text("<robot")
         with pytest.raises(InputError, match=r"bad\.urdf: the robot description .* is no XML"):
             Robot.from_urdf(tmp_path / "bad.urdf")
@@ -661,39 +661,23 @@ class TestTypes:
             layout_of("pkg/A", definition, message)
 
     def test_the_rest_of_the_file_is_read_all_the_same(self, tmp_path: Path) -> None:
-        path = tmp_path / "x.mcap"
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start("ros2")
-            for topic, text in {"/odd": "pkg/A again", "/good": "float64 x"}.items():
-                kind = writer.register_schema("pkg/A", "ros2msg", text.encode())
-                channel = writer.register_channel(topic, "cdr", kind)
-                writer.add_message(channel, 1, ENCAPSULATION + struct.pack("<d", 2.5), 1)
-            writer.finish()
-        assert read_mcap(path)["/good/x"].tolist() == [2.5]
+        message = [(1, ENCAPSULATION + struct.pack("<d", 2.5))]
+        texts = {"/odd": "pkg/A again", "/good": "float64 x"}
+        topics = {topic: ("pkg/A", text, "cdr", message) for topic, text in texts.items()}
+        assert read_mcap(mcap(tmp_path / "x.mcap", topics))["/good/x"].tolist() == [2.5]
 
 
 def chunked(path: Path) -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.ZSTD)
-        writer.start("ros2")
-        kind = writer.register_schema("pkg/A", "ros2msg", b"float64 x")
-        channel = writer.register_channel("/a", "cdr", kind)
-        for stamp in range(100):
-            writer.add_message(channel, stamp, ENCAPSULATION + struct.pack("<d", stamp), stamp)
-        writer.finish()
-    return path
+    numbers = [(stamp, ENCAPSULATION + struct.pack("<d", stamp)) for stamp in range(100)]
+    topics = {"/a": ("pkg/A", "float64 x", "cdr", numbers)}
+    return mcap(path, topics, compression=CompressionType.ZSTD)
 
 
 def with_chunk(path: Path, body: bytes) -> None:
     """Put another chunk before the first one, whose index is gone then."""
     data = path.read_bytes()
-    with path.open("rb") as stream:
-        records = list(container.records(stream, len(data)))
-    first = next(record for record in records if record.opcode == container.CHUNK)
-    path.write_bytes(
-        data[: first.offset] + mcap_bytes.record(container.CHUNK, body) + data[first.offset :]
-    )
+    first, _ = mcap_bytes.chunks(data)[0]
+    path.write_bytes(data[:first] + mcap_bytes.record(container.CHUNK, body) + data[first:])
 
 
 class TestMcap:

@@ -96,7 +96,7 @@ def bytes_of_an_init() -> bytes:
     return init
 
 
-def test_a_motion_that_ends_or_a_silent_link_is_noticed(recorder: Recorder) -> None:
+def test_an_interval_is_over_when_its_motion_came_to_rest(recorder: Recorder) -> None:
     recorder.take(cycles(0, 100), [MotionStarted(0, 10)])
     assert not recorder.over
     recorder.take(cycles(100, 50), [ended("completed", 140)])

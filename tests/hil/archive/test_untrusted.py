@@ -165,10 +165,9 @@ def test_what_is_written_for_a_number_stops_no_reader(number, written, path):
     assert "validation" in overview(path).title
 
 
-@pytest.mark.parametrize("count", ["samples", "events", "lost_packets"])
-def test_a_count_that_is_no_number_is_a_fault(count, written, path):
-    path = forged(written, path, outcome={count: "many"})
-    assert "outcome" in check_archive(path).faults
+def test_a_count_that_is_no_number_is_a_fault(written, path):
+    for count in ("samples", "events", "lost_packets"):
+        assert "outcome" in check_archive(forged(written, path, outcome={count: "many"})).faults
 
 
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
@@ -182,14 +181,11 @@ def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
         gather_sources([path], 0.3, in_sample=True)
 
 
-def test_joints_that_the_cycles_do_not_have_are_damage(written, path):
+def test_joints_or_a_description_that_do_not_belong_are_damage(written, path):
     path = forged(written, path, metadata={"joint_names": '["a", "b", "c"]'})
     assert "not that of 3 joints" in str(open_archive(path).damage)
     assert "holds no sample" in outcomes(path)["open_recording"]
     assert not check_archive(path).keeps
-
-
-def test_a_second_description_is_not_believed(written, path):
     entries = {"kind": "move", "joint_names": '["x"]', "attachments": "[]", "format_version": "1"}
     second = mcap_bytes.metadata("hil", {**entries, "checksum": header.checksum(entries)})
     end = written.records[-1]
@@ -216,13 +212,13 @@ def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, path):
 
 
 class TestEvents:
-    def test_data_nested_without_end_stay_text(self, written, path):
+    def test_texts_are_no_commands_and_data_nested_stay_text(self, written, path):
+        """Data nested without end stay text; no text steers the terminal."""
+
         def nested(plain: bytes) -> bytes:
             return plain.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
 
         assert open_archive(forged(written, path, chunk=nested)).events[0].data == {}
-
-    def test_texts_do_not_steer_the_terminal(self, written, path):
         path = forged(
             written,
             path,
