@@ -2,13 +2,23 @@
 
 `python screen_rig.py FILE ENDING`: shows a run until it is stopped, then ends in one of several
 ways, among them those that leave a terminal in a bad state. A line of JSON in FILE for each wish.
+`Terminal` is that other end, of any program.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
+import os
+import pty
+import select
+import struct
+import subprocess
 import sys
+import termios
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +42,73 @@ def status(wish: OperatorRequest) -> RunStatus:
         override=wish.override, held=wish.held,
     )  # fmt: skip
     return RunStatus("repetition", 3, 30, 65.0, motion)
+
+
+class Terminal:
+    """The far end of a terminal on which a program runs in the foreground."""
+
+    def __init__(self, *command: object, columns: int) -> None:
+        self.near, self.far = pty.openpty()
+        self.resize(columns, 24)
+        self.before = termios.tcgetattr(self.far)
+        self.seen = b""
+        self.reads = True
+        self.process = subprocess.Popen(
+            [sys.executable, *map(str, command)],
+            stdin=self.far, stdout=self.far, stderr=self.far,
+            preexec_fn=self._take_terminal,
+            env={**os.environ, "TERM": "xterm-256color", "PYTHONPATH": os.pathsep.join(sys.path)},
+        )  # fmt: skip
+
+    def _take_terminal(self) -> None:
+        os.setsid()
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    def resize(self, columns: int, rows: int) -> None:
+        fcntl.ioctl(self.near, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+
+    def look(self, timeout: float = 0.05) -> None:
+        """Take what was written, as a terminal does all the time."""
+        if select.select([self.near], [], [], timeout)[0]:
+            with contextlib.suppress(OSError):
+                self.seen += os.read(self.near, 65536)
+
+    def await_seen(self, words: bytes, timeout: float = 120.0) -> None:
+        until = time.monotonic() + timeout
+        while words not in self.seen:
+            assert time.monotonic() < until and self.process.poll() is None, self.seen[-2000:]
+            self.look()
+
+    def press(self, keys: str) -> None:
+        os.write(self.near, keys.encode())
+
+    def end(self, timeout: float = 10.0) -> int:
+        until = time.monotonic() + timeout
+        while self.process.poll() is None and time.monotonic() < until:
+            if self.reads:
+                self.look()
+            else:
+                time.sleep(0.05)
+        assert self.process.returncode is not None, "it did not end"
+        before: bytes | None = None
+        while self.reads and before != self.seen:
+            before = self.seen
+            self.look(0.2)
+        return self.process.returncode
+
+
+@contextlib.contextmanager
+def on_terminal(*command: object, columns: int = 80) -> Iterator[Terminal]:
+    """A Python program on a terminal of its own, killed at the end."""
+    end = Terminal(*command, columns=columns)
+    try:
+        yield end
+    finally:
+        if end.process.poll() is None:
+            end.process.kill()
+            end.process.wait()
+        os.close(end.near)
+        os.close(end.far)
 
 
 def main() -> int:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import json
 import os
 import pty
-import select
 import signal
-import struct
-import subprocess
-import sys
 import termios
 import threading
 import time
@@ -36,7 +33,7 @@ from hil.campaign.operator import (
 )
 from hil.cell import Cell
 from hil.cell.schema import CanTable
-from hil.progress import put
+from hil.progress import Bar, LineReporter, Silent, put, reporter
 from hil.screen import (
     Keyboard,
     Pace,
@@ -50,8 +47,9 @@ from hil.screen import (
     typed,
 )
 from sim_fixtures.ns16 import CELL_PATH
+from tests.hil import screen_rig
+from tests.hil.screen_rig import Terminal, on_terminal
 
-RIG = Path(__file__).with_name("screen_rig.py")
 NAMES = tuple(f"joint_{number}" for number in range(1, 7))
 
 
@@ -105,6 +103,13 @@ def test_eighty_by_twenty_four_hold_everything() -> None:
     assert "31%" in second and "-7.10 A" in second and "72%" in second
     bars = [second.count(mark) for mark in "█·"]
     assert all(bars)
+    line = layout.status_line(status())
+    assert layout.status_line(status(), "0:42 left").endswith(", 0:42 left")
+    for words in (
+        "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
+        "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
+    ):  # fmt: skip
+        assert words in line
 
 
 @pytest.mark.parametrize("width", [20, 40, 48, 63, 64, 79, 80, 132, 300])
@@ -175,16 +180,6 @@ def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
         assert (len(rows) > 1) is terminal
 
 
-def test_a_plain_line_says_the_same() -> None:
-    line = layout.status_line(status())
-    assert layout.status_line(status(), "0:42 left").endswith(", 0:42 left")
-    for words in (
-        "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
-        "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
-    ):  # fmt: skip
-        assert words in line
-
-
 # --- keys ------------------------------------------------------------------------------------
 
 
@@ -228,7 +223,7 @@ def test_escape_holds_and_takes_nothing_else_away(sent: str, means: str) -> None
     assert screen.request().override == 1.0
 
 
-def test_the_override_of_a_dry_run_ends_with_it() -> None:
+def test_a_dry_runs_override_ends_with_it_and_lowers_from_it() -> None:
     screen = Screen(NAMES, Stop(), quiet=True)
     for phase in ("dry run", "move"):
         screen.show(RunStatus(phase, 1, 1, 1.0))
@@ -240,10 +235,7 @@ def test_the_override_of_a_dry_run_ends_with_it() -> None:
     screen.press("5")
     screen.show(RunStatus("repetition", 1, 4, 1.0))
     assert screen.request().override == 0.5
-
-
-def test_an_override_is_lowered_from_what_it_is() -> None:
-    """What goes on at 20 % by order of the run goes on at 10 % after one key, not at 90 %."""
+    # What goes on at 20 % by order of the run goes on at 10 % after one key, not at 90 %.
     screen = Screen(NAMES, Stop(), quiet=True)
     screen.show(status(override=0.2))
     screen.press("-")
@@ -253,41 +245,20 @@ def test_an_override_is_lowered_from_what_it_is() -> None:
 # --- a real terminal -------------------------------------------------------------------------
 
 
-class Terminal:
-    """The far end of a terminal on which `screen_rig.py` runs in the foreground."""
+class Rig:
+    """`screen_rig.py` on a terminal."""
 
-    def __init__(self, told: Path, ending: str) -> None:
-        self.told = told
-        self.near, self.far = pty.openpty()
-        self.resize(80, 24)
-        self.before = termios.tcgetattr(self.far)
-        self.seen = b""
-        self.reads = True
-        self.process = subprocess.Popen(
-            [sys.executable, str(RIG), str(told), ending],
-            stdin=self.far, stdout=self.far, stderr=self.far,
-            preexec_fn=self._take_terminal,
-            env={**os.environ, "TERM": "xterm-256color", "PYTHONPATH": os.pathsep.join(sys.path)},
-        )  # fmt: skip
+    def __init__(self, end: Terminal, file: Path) -> None:
+        self._end, self._file = end, file
 
-    def _take_terminal(self) -> None:
-        os.setsid()
-        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._end, name)
 
-    def resize(self, columns: int, rows: int) -> None:
-        fcntl.ioctl(self.near, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+    def clear(self) -> None:
+        self._end.seen = b""
 
-    def look(self, timeout: float = 0.05) -> None:
-        """Take what was written, as a terminal does all the time."""
-        if select.select([self.near], [], [], timeout)[0]:
-            with contextlib.suppress(OSError):
-                self.seen += os.read(self.near, 65536)
-
-    def await_seen(self, words: bytes, timeout: float = 30.0) -> None:
-        until = time.monotonic() + timeout
-        while words not in self.seen:
-            assert time.monotonic() < until, self.seen[-2000:]
-            self.look()
+    def stop_reading(self) -> None:
+        self._end.reads = False
 
     def await_told(self, **expected: object) -> None:
         """Wait until the last thing that the program was told is this."""
@@ -297,9 +268,9 @@ class Terminal:
             self.look()
 
     def said(self) -> list[dict[str, object]]:
-        if not self.told.exists():
+        if not self._file.exists():
             return []
-        return [json.loads(line) for line in self.told.read_text().splitlines()]
+        return [json.loads(line) for line in self._file.read_text().splitlines()]
 
     def answer(self, words: str, number: int) -> None:
         """Type an answer until it is the so manieth that was taken.
@@ -315,38 +286,11 @@ class Terminal:
             while len(self.said()) < number and time.monotonic() < again:
                 self.look()
 
-    def press(self, keys: str) -> None:
-        os.write(self.near, keys.encode())
-
-    def end(self, timeout: float = 10.0) -> int:
-        until = time.monotonic() + timeout
-        while self.process.poll() is None and time.monotonic() < until:
-            if self.reads:
-                self.look()
-            else:
-                time.sleep(0.05)
-        assert self.process.returncode is not None, "it did not end"
-        before: bytes | None = None
-        while self.reads and before != self.seen:
-            before = self.seen
-            self.look(0.2)
-        return self.process.returncode
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-        os.close(self.near)
-        os.close(self.far)
-
 
 @contextlib.contextmanager
-def terminal(folder: Path, ending: str = "return") -> Iterator[Terminal]:
-    end = Terminal(folder / "told", ending)
-    try:
-        yield end
-    finally:
-        end.close()
+def terminal(folder: Path, ending: str = "return") -> Iterator[Rig]:
+    with on_terminal(screen_rig.__file__, folder / "reported", ending) as end:
+        yield Rig(end, folder / "reported")
 
 
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
@@ -371,7 +315,7 @@ def test_keys_arrive_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
         end.resize(40, 10)
         end.press("+")
         end.await_told(override=0.4, held=False)
-        end.seen = b""
+        end.clear()
         end.await_seen(b"h hold")
         end.press("s")
         assert end.end() == 0
@@ -421,7 +365,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
         for number, answer in enumerate(answers, start=1):
             end.await_seen(asked)
             assert (b"joint_2: measured torque runs against" in end.seen) is (ending != "question")
-            end.seen = b""
+            end.clear()
             end.answer(answer, number)
         end.await_seen(b"repetition 3 of 30")  # the screen is back
         end.press("s")
@@ -432,7 +376,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
 def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
         end.await_seen(b"repetition 3 of 30")
-        end.reads = False
+        end.stop_reading()
         time.sleep(1.5)  # some hundred kB of pictures later it blocks
         end.process.send_signal(signal.SIGTERM)
         until = time.monotonic() + 3.0
@@ -501,7 +445,7 @@ def test_a_picture_that_cannot_be_drawn_ends_nothing(
 # --- no terminal -----------------------------------------------------------------------------
 
 
-def test_without_a_terminal_there_are_lines() -> None:
+def test_without_a_terminal_there_are_lines_or_none() -> None:
     out = StringIO()
     with Screen(NAMES, Stop(), console=Console(file=out, width=200)) as screen:
         assert not screen.can_answer
@@ -512,9 +456,6 @@ def test_without_a_terminal_there_are_lines() -> None:
     assert out.getvalue().splitlines()[0] == "first [things] first"
     assert "\x1b" not in out.getvalue()
     assert out.getvalue().count("repetition 7 of 30") == 1  # not ten a second
-
-
-def test_quiet_says_nothing() -> None:
     out = StringIO()
     with Screen(NAMES, Stop(), quiet=True, console=Console(file=out)) as screen:
         screen.say("nothing")
@@ -547,3 +488,53 @@ def await_text(out: StringIO, words: str) -> None:
     while words not in out.getvalue():
         assert time.monotonic() < until
         time.sleep(0.02)
+
+
+# Long work says how far it is: bars on a terminal, lines elsewhere, nothing when quiet.
+
+
+def test_lines_come_every_tenth_of_the_way(capsys: pytest.CaptureFixture[str]) -> None:
+    plain = LineReporter()
+    with plain.task("smoothing", 40) as task:
+        for k in range(40):
+            task.advance(1, f"file {k}")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "smoothing"
+    assert len(lines) == 11
+    assert lines[1] == "smoothing: 10 %  file 3"
+    assert lines[-1] == "smoothing: 100 %  file 39"
+
+
+def test_a_bar_shows_the_note_and_the_time_left() -> None:
+    screen = io.StringIO()
+    bar = Bar(Console(file=screen, force_terminal=True, width=140))
+    with bar.task("running", 10) as task:
+        task.advance(4, "excitation 3")
+        bar.say("a line [above] the bar")
+    shown = screen.getvalue()
+    assert "a line [above] the bar" in shown
+    assert "running" in shown
+    assert "left" in shown
+
+
+@pytest.mark.parametrize("title", ["designing (motions)", "running the campaign (s of motion)"])
+def test_eighty_columns_hold_count_times_and_note(title: str) -> None:
+    screen = io.StringIO()
+    bar = Bar(Console(file=screen, force_terminal=True, width=80, color_system=None))
+    note = "generation 112 of 120, log det 104.1, I_c 80.1"
+    with bar.task(title, 23000) as task:
+        task.advance(11500, note)
+    lines = [line.rstrip() for line in screen.getvalue().splitlines()]
+    (shown,) = [line for line in lines if "11500/23000" in line]
+    assert title in shown and "0:00:0" in shown and " left " in shown and "━" in shown
+    assert note in lines
+
+
+def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = reporter(quiet=True)
+    assert isinstance(quiet, Silent)
+    quiet.say("nothing")
+    with quiet.task("nothing", 1) as task:
+        task.advance(1)
+    assert capsys.readouterr().out == ""
+    assert isinstance(reporter(), LineReporter)
