@@ -1,4 +1,4 @@
-"""Errors of the identification package: `ModelError` and `ShapeError`, both `ValueError`."""
+"""Errors: `IdentificationError`, and under it `ModelError` and `ShapeError` (`ValueError` too)."""
 
 from __future__ import annotations
 

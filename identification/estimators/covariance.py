@@ -152,8 +152,8 @@ def _sandwich(
 ) -> Clustered:
     """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p).
 
-    Scores that correlate by r with those of the next block add up to a variance 1 + 2 r times as
-    large; r is the mean over the directions, and never counted below zero.
+    Scores that correlate by r with those of the next block alone add up to a variance 1 + 2 r times
+    as large; r is the mean over the directions, at least zero. A few blocks may still be too short.
     """
     scores = scores @ solution.root
     corrected = leverage_corrected(shares, scores)

@@ -55,7 +55,7 @@ class Gains:
 
 
 def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
-    """Estimate the gain of each motor, from blocks with a known payload and with another or none.
+    """Estimate gains of motors (n,), from blocks with a known payload and with another or none.
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.

@@ -65,7 +65,7 @@ class Instruments(NamedTuple):
 
 
 def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = None) -> Instruments:
-    """Motion commanded by positions (m, n), NaN where none was, shifted by the lag of each axis.
+    """Motion commanded by positions (m, n) [rad or m], NaN where none was, shifted by their lag.
 
     The lag (n,) [s] is sought unless it is known from the same motion.
 
@@ -129,8 +129,8 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
     """Time by which each axis follows its command (n,) [s], NaN for one that is not moved.
 
-    The shift that leaves the smallest variance of the difference to measured positions (m, n): a
-    constant one, as gravity makes it, does not count.
+    The shift that leaves the smallest variance of the difference to positions (m, n) [rad or m]
+    measured at times (m,) [s]: a constant one, as gravity makes it, does not count.
     """
     thin = slice(None, None, max(1, len(time) // _ROWS))
     time, measured = time[thin], measured[thin]

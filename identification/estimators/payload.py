@@ -215,11 +215,11 @@ def identify_payload(
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([middle - halves - lower, middle + halves + upper])
     intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
-    width, usual = (intervals[:, 1] - intervals[:, 0]) / 2.0, mass * reference[0]
-    open_ended = width > np.repeat([np.inf, reference[1]], [4, 6])
+    width, usual = (intervals[:, 1] - intervals[:, 0]) / 2.0, mass * reference.tensor
+    open_ended = width > np.repeat([np.inf, reference.inertia], [4, 6])
     open_ended[1:4] = np.isinf(width[1:4])
     open_ended[4:] &= (intervals[4:, 0] <= usual) & (usual <= intervals[4:, 1])
-    possible, misfit = _closest_body(found, *reference)
+    possible, misfit = _closest_body(found, reference)
     figures = figures_of(possible)[:, None]
     intervals[:, :1] = np.minimum(intervals[:, :1], figures)
     intervals[:, 1:] = np.maximum(intervals[:, 1:], figures)
@@ -512,22 +512,25 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
     return off_diagonal + np.array([yy + zz, 0.0, 0.0, xx + zz, 0.0, xx + yy]), off_diagonal
 
 
-def _reference(mass: float, box: tuple[float, float, float] | None) -> tuple[Array, float, float]:
-    """Tensor about its centre per kg (6,) of a reference body, and what is large [kg m²], [m].
+class _Reference(NamedTuple):
+    """A body whose figures stand in for those that the motion does not determine."""
 
-    A point is small against a ball of water of its mass, a box is as large as it is.
-    """
+    tensor: Array  # about its centre, per kg (6,) [m²]
+    inertia: float  # what counts as large [kg m²]
+    length: float  # likewise [m]
+
+
+def _reference(mass: float, box: tuple[float, float, float] | None) -> _Reference:
+    """A point is small against a ball of water of its mass, a box is as large as it is."""
     if box is None:
         radius = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
-        return np.zeros(6), 0.4 * mass * radius**2, radius
+        return _Reference(np.zeros(6), 0.4 * mass * radius**2, radius)
     x, y, z = (edge**2 / 12.0 for edge in box)
     tensor = np.array([y + z, 0.0, 0.0, x + z, 0.0, x + y])
-    return tensor, mass * float(tensor.max()), max(box) / 2.0
+    return _Reference(tensor, mass * float(tensor.max()), max(box) / 2.0)
 
 
-def _closest_body(
-    found: _BodyEstimate, tensor: Array, inertia: float, length: float
-) -> tuple[Body, float]:
+def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, float]:
     """The possible body closest to an estimate, and how far away it is, squared."""
     import cvxpy  # a third of a second to import
 
@@ -538,13 +541,13 @@ def _closest_body(
     rows = (vectors.T / np.sqrt(variance)[:, None] / size) @ found.determined
     centre = values[6:9] / values[9]
     about = _moved(np.eye(3), -centre)[_INERTIA]
-    about[:, 9] -= tensor
+    about[:, 9] -= reference.tensor
     about *= np.sqrt(_OFF_DIAGONAL)[:, None]
     # As wide as the reference is large, or as the recordings show the body to be beyond chance.
     along, half = found.principal(about)
-    about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=inertia**2))
+    about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=reference.inertia**2))
     # In units of the reference the numbers are near one.
-    mass, length = values[9], max(length, float(np.linalg.norm(centre)))
+    mass, length = values[9], max(reference.length, float(np.linalg.norm(centre)))
     units = mass * np.repeat([length**2, length, 1.0], [6, 3, 1])
     x = cp.Variable(_BODY)
     entries = pseudo_inertia_map().reshape(_BODY, 16).T @ x

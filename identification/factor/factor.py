@@ -386,7 +386,7 @@ class Estimate:
 
 
 def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
-    """Weighted least squares (eq. 4), by default by the residual variances of an ordinary fit.
+    """Weighted least squares (eq. 4); weights (n,) by default from residuals of an ordinary fit.
 
     The covariance is the classical one, A^-1: honest only if the residuals are white. See
     :mod:`identification.estimators.covariance` for the one that does not need that.

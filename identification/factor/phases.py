@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,8 +262,13 @@ def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
             yield int(index[start]), slice(start, stop)
 
 
-# Blocks in a row of as many rows each: the first, how many, its first row, rows of each.
-EqualRuns = tuple[int, int, int, int]
+class EqualRuns(NamedTuple):
+    """Blocks in a row of as many rows each."""
+
+    first: int  # block
+    blocks: int
+    start: int  # first row of the first block
+    length: int  # rows of each
 
 
 def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
@@ -271,11 +276,11 @@ def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
     groups: list[EqualRuns] = []
     for block, at in block_runs(index):
         length = at.stop - at.start
-        first, count, start, rows = groups[-1] if groups else (block, 0, at.start, length)
-        if groups and rows == length and first + count == block:
-            groups[-1] = first, count + 1, start, rows
+        last = groups[-1] if groups else None
+        if last is not None and last.length == length and last.first + last.blocks == block:
+            groups[-1] = last._replace(blocks=last.blocks + 1)
         else:
-            groups.append((block, 1, at.start, length))
+            groups.append(EqualRuns(block, 1, at.start, length))
     return groups
 
 

@@ -12,7 +12,8 @@ friction does not jump at a reversal: over a displacement of some 1e-4 rad it re
 so that the torque stays linear in the coefficients once the distance d is fixed, and friction at
 rest is what was left of the motion before it.
 
-The quadratic third term is that of the paper's authors, the cubic one the other form in the field.
+The paper's equation (after its eq. 1: three coefficients per joint) could not be read; the third
+term is quadratic in the same authors' later software, and cubic elsewhere: either may be chosen.
 """
 
 # ruff: noqa: ARG005 - columns of all terms have the same arguments
@@ -47,13 +48,13 @@ class FrictionTerm:
     option: str  # of `FrictionLaw`, and of `[robot.friction]`, that asks for it
     label: str  # of the term in a list; in lower case its name on the command line
     words: str  # what it is
-    basis: str  # the column as a formula for people
-    # the column in Python, as a factor of the coefficient; `v` is the speed, `sign` its direction,
-    # `E` Euler's number and `LABEL_SPEED[joint]` the `speed`
-    code: str
     value: Callable[[Array, Array, float], Array]  # the column, of speeds, directions and `speed`
     rate: Callable[[Array, Array, float], Array]  # its derivative, of speeds, that of directions
     asked: Callable[[FrictionLaw], Any] | None = None  # setting, where not that of `option`
+    basis: str = ""  # the column as a formula for people
+    # the column in Python, as a factor of the coefficient; `v` is the speed, `sign` its direction,
+    # `E` Euler's number and `LABEL_SPEED[joint]` the `speed`
+    code: str = ""
     power: int = 0  # of the speed in the denominator of the coefficient's unit
     speed_symbol: str = ""  # of `speed`; empty for a column without it
     urdf: str = ""  # attribute of `<dynamics>` that holds the coefficient; empty for none
@@ -105,114 +106,112 @@ def _term(label: str, speed: float) -> FrictionTerm:
     return next(replace(term, speed=speed) for term in TERMS if term.label == label)
 
 
-TERMS: Final = (
-    FrictionTerm(
-        symbol="f0",
-        option="coulomb",
-        label="Coulomb",
-        words="Coulomb (dry) friction f0",
-        basis="sgn(v)",
-        code=" * sign",
-        value=lambda v, s, _: s,
-        rate=lambda v, ds, _: ds,
-        asked=lambda law: law.coulomb and law.tanh is None,
-        urdf="friction",
-        of_motor=True,
-        not_negative=True,
-    ),
-    FrictionTerm(
-        symbol="f0",
-        option="tanh",
-        label="tanh",
-        words="Coulomb friction f0 with a smooth sign",
-        basis="tanh(v/vt)",
-        code=" * tanh(v / TANH_SPEED[joint])",
-        value=lambda v, s, vt: np.tanh(v / vt),
-        rate=lambda v, ds, vt: (1.0 - np.tanh(v / vt) ** 2) / vt,
-        speed_symbol="vt",
-        urdf="friction",
-        of_motor=True,
-        not_negative=True,
-    ),
-    FrictionTerm(
-        symbol="f1",
-        option="viscous",
-        label="viscous",
-        words="viscous friction f1",
-        basis="v",
-        code=" * v",
-        value=lambda v, s, _: v,
-        rate=lambda v, ds, _: np.ones_like(v),
-        power=1,
-        urdf="damping",
-        of_motor=True,
-        not_negative=True,
-    ),
-    FrictionTerm(  # f1 + fd forwards, f1 - fd backwards
-        symbol="fd",
-        option="asymmetric",
-        label="asymmetric",
-        words="half the difference fd of viscous friction forwards and backwards",
-        basis="|v|",
-        code=" * abs(v)",
-        value=lambda v, s, _: np.abs(v),
-        rate=lambda v, ds, _: np.sign(v),
-        asked=lambda law: law.asymmetric and law.viscous,
-        power=1,
-        not_negative=True,
-        pair=("f1", ((0.5, 0.5), (0.5, -0.5))),
-    ),
-    FrictionTerm(
-        symbol="f2",
-        option="third",
-        label="quadratic",
-        words="a term f2 with the speed squared",
-        basis="sgn(v) v²",
-        code=" * v * abs(v)",
-        value=lambda v, s, _: np.abs(v) * v,
-        rate=lambda v, ds, _: 2.0 * np.abs(v),
-        power=2,
-    ),
-    FrictionTerm(
-        symbol="f2",
-        option="third",
-        label="cubic",
-        words="a term f2 with the third power of the speed",
-        basis="v³",
-        code=" * v**3",
-        value=lambda v, s, _: v * v * v,
-        rate=lambda v, ds, _: 3.0 * v**2,
-        power=3,
-    ),
-    FrictionTerm(  # the slope is without the fall with speed, which hardly any step feels
-        symbol="fs",
-        option="stribeck",
-        label="Stribeck",
-        words="additional friction fs at low speed (Stribeck)",
-        basis="sgn(v) exp(-(v/vs)²)",
-        code=" * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
-        value=lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s,
-        rate=lambda v, ds, _: ds,
-        speed_symbol="vs",
-        not_negative=True,
-        pair=("f0", ((1.0, 0.0), (-1.0, 1.0))),
-    ),
-    FrictionTerm(  # also the zero error of a sensor
-        symbol="fo",
-        option="offset",
-        label="offset",
-        words="a constant offset fo",
-        basis="",
-        code="",
-        value=lambda v, s, _: np.ones_like(v),
-        rate=lambda v, ds, _: np.zeros_like(v),
-        asked=lambda law: law.offset or (law.asymmetric and law.coulomb),
-        is_friction=False,
-    ),
+COULOMB: Final = FrictionTerm(
+    symbol="f0",
+    option="coulomb",
+    label="Coulomb",
+    words="Coulomb (dry) friction f0",
+    basis="sgn(v)",
+    code=" * sign",
+    value=lambda v, s, _: s,
+    rate=lambda v, ds, _: ds,
+    asked=lambda law: law.coulomb and law.tanh is None,
+    urdf="friction",
+    of_motor=True,
+    not_negative=True,
 )
+TANH: Final = FrictionTerm(
+    symbol="f0",
+    option="tanh",
+    label="tanh",
+    words="Coulomb friction f0 with a smooth sign",
+    basis="tanh(v/vt)",
+    code=" * tanh(v / TANH_SPEED[joint])",
+    value=lambda v, s, vt: np.tanh(v / vt),
+    rate=lambda v, ds, vt: (1.0 - np.tanh(v / vt) ** 2) / vt,
+    speed_symbol="vt",
+    urdf="friction",
+    of_motor=True,
+    not_negative=True,
+)
+VISCOUS: Final = FrictionTerm(
+    symbol="f1",
+    option="viscous",
+    label="viscous",
+    words="viscous friction f1",
+    basis="v",
+    code=" * v",
+    value=lambda v, s, _: v,
+    rate=lambda v, ds, _: np.ones_like(v),
+    power=1,
+    urdf="damping",
+    of_motor=True,
+    not_negative=True,
+)
+# F1 + fd forwards, f1 - fd backwards.
+ASYMMETRIC: Final = FrictionTerm(
+    symbol="fd",
+    option="asymmetric",
+    label="asymmetric",
+    words="half the difference fd of viscous friction forwards and backwards",
+    basis="|v|",
+    code=" * abs(v)",
+    value=lambda v, s, _: np.abs(v),
+    rate=lambda v, ds, _: np.sign(v),
+    asked=lambda law: law.asymmetric and law.viscous,
+    power=1,
+    not_negative=True,
+    pair=("f1", ((0.5, 0.5), (0.5, -0.5))),
+)
+QUADRATIC: Final = FrictionTerm(
+    symbol="f2",
+    option="third",
+    label="quadratic",
+    words="a term f2 with the speed squared",
+    basis="sgn(v) v²",
+    code=" * v * abs(v)",
+    value=lambda v, s, _: np.abs(v) * v,
+    rate=lambda v, ds, _: 2.0 * np.abs(v),
+    power=2,
+)
+CUBIC: Final = FrictionTerm(
+    symbol="f2",
+    option="third",
+    label="cubic",
+    words="a term f2 with the third power of the speed",
+    basis="v³",
+    code=" * v**3",
+    value=lambda v, s, _: v * v * v,
+    rate=lambda v, ds, _: 3.0 * v**2,
+    power=3,
+)
+# The slope is without the fall with speed, which hardly any step feels.
+STRIBECK: Final = FrictionTerm(
+    symbol="fs",
+    option="stribeck",
+    label="Stribeck",
+    words="additional friction fs at low speed (Stribeck)",
+    basis="sgn(v) exp(-(v/vs)²)",
+    code=" * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
+    value=lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s,
+    rate=lambda v, ds, _: ds,
+    speed_symbol="vs",
+    not_negative=True,
+    pair=("f0", ((1.0, 0.0), (-1.0, 1.0))),
+)
+# Also the zero error of a sensor.
+OFFSET: Final = FrictionTerm(
+    symbol="fo",
+    option="offset",
+    label="offset",
+    words="a constant offset fo",
+    value=lambda v, s, _: np.ones_like(v),
+    rate=lambda v, ds, _: np.zeros_like(v),
+    asked=lambda law: law.offset or (law.asymmetric and law.coulomb),
+    is_friction=False,
+)
+TERMS: Final = (COULOMB, TANH, VISCOUS, ASYMMETRIC, QUADRATIC, CUBIC, STRIBECK, OFFSET)
 """All terms that a joint can have, in the order of the parameters."""
-
-COULOMB, TANH, VISCOUS, _, QUADRATIC, CUBIC, _, OFFSET = TERMS
 _SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
 ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0, "tanh": 0.0}
@@ -321,8 +320,9 @@ class FrictionLaw:
     def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
 
-        Times [s], positions and velocities (m,) of joint or motor in joint units. A reversal
-        between two instants divides the step where the velocity, linear between them, is zero.
+        Times [s], positions [rad, m] and velocities [rad/s, m/s] (m,) of joint or motor in joint
+        units. A reversal between two instants divides the step where the velocity, linear between
+        them, is zero.
         """
         if self.presliding == 0.0:
             return self.sign(velocity)

@@ -91,7 +91,7 @@ class TimeBase:
 
 
 def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeBase:
-    """Examine time stamps (m,) [s], finite, legal or not; True before which samples are missing.
+    """Examine finite time stamps (m,) [s], legal or not, and where samples are missing before.
 
     Raises:
         RecordingError: fewer than two different times.

@@ -102,13 +102,12 @@ def mask_rows(
 ) -> RowMask:
     """Reasons against each row of a checked recording, with its smoothed motion in the same rows.
 
-    Of that smoothing `bandwidth` (n,) [Hz]; `torque_bandwidth` (n,) [Hz] is of a low-pass that
-    torque and regressor go through, `current_limit` (n,) [A] of the motors; the motion was read
-    `delay` [s] earlier than the rows. Of slow rows are left out: "rests": those of a joint that is
-    slower than standstill for longer than `LONGEST_HALT`, and the two between which a velocity
-    changes its sign, for where between them friction turns is not known, and rows on the wrong side
-    make Coulomb friction too small; "slow": all, and those near a velocity reversal; "none":
-    neither.
+    `bandwidth` (n,) [Hz] is of that smoothing, read `delay` [s] earlier; `torque_bandwidth` (n,)
+    [Hz] of a low-pass of torque and regressor; `current_limit` (n,) [A] of motors. Slow rows:
+
+    - "rests": out are those slower than standstill for longer than `LONGEST_HALT`, and the two
+      between which a velocity changes its sign, where one of them has the wrong sign of friction;
+    - "slow": all slower than standstill, and those near a velocity reversal; "none": none.
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)

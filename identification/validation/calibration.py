@@ -103,7 +103,7 @@ def calibrate(
     held_out: TorqueMeans,
     refit: Refit,
 ) -> Calibration:
-    """Compare held-out means of torque with their 95 % intervals, from `phase` and `fitted` means.
+    """Compare held-out means of torque with 95 % intervals, made from `phase` and `fitted` means.
 
     A parameter that the data do not determine adds nothing to an interval.
 

@@ -102,7 +102,7 @@ def find_causes(
 ) -> Causes:
     """Faults with which, once mended, blocks of the fitted recordings are predicted better.
 
-    Beside parameters (p,) estimated from them.
+    `values` (p,) are the parameters estimated from them, `names` those of the recordings.
     """
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
     search = _Search(model, recordings, values, words)

@@ -154,7 +154,7 @@ class InertiaRatio(NamedTuple):
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
-    """Compare a diagonal inertia (m, n) at positions (m, n) with that of parameters (p,).
+    """Compare a diagonal inertia (m, n) at positions (m, n) [rad or m] with that of values (p,).
 
     The controller's, `theirs`, is on the joint side [kg·m² or kg], zero where it sends nothing;
     None where there is nothing to compare.

@@ -101,7 +101,7 @@ class CollisionChecker(Scene):
         *,
         between: bool = True,
     ) -> Contact | None:
-        """Return the deepest contact along a motion and its samples with both ends, or None.
+        """Return the deepest contact along a trajectory, None if clear; samples hold both ends.
 
         Where all samples are clear, the motion is looked at `between` them too, without a gap; what
         even fine division cannot tell from a contact counts as one, and so does what would take too

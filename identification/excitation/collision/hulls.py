@@ -171,7 +171,7 @@ class Separation:
         return bound
 
     def bound(self, at: Bodies, pair: Indices, sample: Indices) -> tuple[Array, Array]:
-        """Return lower bounds (k,) [m] and directions (3, k) of pairs (k,), in rising order."""
+        """Return lower bounds (k,) [m] and directions (3, k) of pairs (k,) that never fall."""
         lower, normal = np.empty(len(pair)), np.empty((3, len(pair)))
         boxes, planes = np.searchsorted(pair, (self._boxes, self._planes)).tolist()
         for part, towards in (
