@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
-from math import radians
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil.cell import Cell
+from hil.simulation import planted_truth, simulated_drive
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
@@ -28,9 +27,9 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 from identification.signals.smoothing import low_pass
-from sim_fixtures import ControllerSettings, PlantTruth, SimulatedController, SimulatedDrive, ns16
+from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from tests.identification.robots import ur10
-from tests.identification.two_link import MODEL, URDF, truth
+from tests.identification.two_link import MODEL, URDF, four_sines, truth
 from tests.sim_fixtures.conftest import MinimalPC
 
 PERIOD = 0.001
@@ -40,7 +39,7 @@ def ns16_model() -> RobotModel:
     return RobotModel.from_urdf(ns16.urdf_text(), friction=FrictionLaw(third=None, standstill=0.1))
 
 
-def smooth_motion(duration: float, speed: float = 1.0) -> tuple[Array, Array]:
+def smooth_motion(duration: float) -> tuple[Array, Array]:
     """Positions and velocities (m, 6), DH angles: sines in and out of rest."""
     t = np.arange(round(duration / PERIOD) + 1) * PERIOD
     window = np.clip(np.minimum(t, duration - t), 0.0, 1.0)
@@ -48,7 +47,7 @@ def smooth_motion(duration: float, speed: float = 1.0) -> tuple[Array, Array]:
     slope = np.where(t < 1.0, 1.0, -1.0) * 30.0 * window**2 * (1.0 - window) ** 2
     slope[(t >= 1.0) & (t <= duration - 1.0)] = 0.0
     swing = np.radians([12.0, 8.0, 10.0, 22.0, 20.0, 25.0])
-    rate = speed * np.array([4.1, 4.7, 5.5, 7.3, 8.1, 9.0])
+    rate = np.array([4.1, 4.7, 5.5, 7.3, 8.1, 9.0])
     centre = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
     angle = rate * t[:, None] + np.arange(6)
     wave = np.sin(angle) + 0.4 * np.sin(2.3 * angle)
@@ -57,51 +56,31 @@ def smooth_motion(duration: float, speed: float = 1.0) -> tuple[Array, Array]:
     return position, swing * (soft[:, None] * wave_slope + slope[:, None] * wave)
 
 
-def simulated_recording(
-    duration: float, *, speed: float = 1.0, seed: int = 1
-) -> tuple[Recording, float]:
+def simulated_recording(duration: float, *, seed: int) -> tuple[Recording, float]:
     """Recording of a run on the simulated cell, and the delay of its currents [cycles]."""
-    cell = tomllib.loads(ns16.CELL_PATH.read_text(encoding="utf-8"))
-    drive, planted = _drive(cell["drive_train"]), cell["simulation"]
-    truth = PlantTruth(*(planted[k] for k in ("rotor_inertia", "coulomb", "viscous", "third")))
-    noise = {k: planted[k] for k in ("current_noise", "current_resolution")}
-    position, velocity = smooth_motion(duration, speed)
+    cell = Cell.load(ns16.CELL_PATH)
+    train, noise = cell.drive_train, cell.simulation
+    position, velocity = smooth_motion(duration)
     controller = SimulatedController(
-        ns16.urdf_text(), drive, truth, ControllerSettings(**noise), seed=seed,
+        ns16.urdf_text(),
+        simulated_drive(cell),
+        planted_truth(cell),
+        ControllerSettings(
+            current_noise=noise.current_noise, current_resolution=noise.current_resolution
+        ),
+        seed=seed,
         initial_position=position[0],
-    )  # fmt: skip
-    targets = np.array([drive.motor_revolutions(q.tolist()) for q in position])
-    deltas = _motor_speed(drive, velocity) * PERIOD
-    axes = MinimalPC(controller, targets, deltas).run(settle=50).axes
-    motors, currents = axes["d"][:, :, 2].astype(float), axes["d"][:, :, 4].astype(float)
-    turn = _turns(drive)
-    rest = np.array(drive.motor_revolutions([0.0] * 6))
+    )
+    deltas = train.motor_revolutions_per_cycle(velocity, PERIOD)
+    pc = MinimalPC(controller, train.motor_revolutions(position), deltas)
+    axes = pc.run(settle=50).axes
     recording = Recording(
-        time=np.arange(len(motors)) * PERIOD,
-        position=np.linalg.solve(turn, (motors - rest).T).T,
+        time=np.arange(len(axes)) * PERIOD,
+        position=train.joint_position(axes["d"][:, :, 2].astype(float)),
         joint_names=ns16_model().joint_names,
-        torque=np.array([drive.joint_torques(i.tolist()) for i in currents]),
+        torque=train.joint_torque(axes["d"][:, :, 4].astype(float)),
     )
     return recording, controller.current_delay_cycles
-
-
-def _drive(table: dict[str, Any]) -> SimulatedDrive:
-    same = ("gear_ratio", "calibration", "joint_sign", "torque_constant", "current_limit")
-    return SimulatedDrive(
-        **{k: table[k] for k in (*same, "following_error", "k54", "k64", "k65")},
-        joint_offset=[radians(a) for a in table["joint_offset_deg"]],
-        encoder_counts=table["encoder_counts_per_revolution"],
-    )
-
-
-def _turns(drive: SimulatedDrive) -> Array:
-    """Motor revolutions per radian of joint angle, column by column."""
-    rest = np.array(drive.motor_revolutions([0.0] * 6))
-    return np.column_stack([drive.motor_revolutions(e) - rest for e in np.eye(6).tolist()])
-
-
-def _motor_speed(drive: SimulatedDrive, velocity: Array) -> Array:
-    return velocity @ _turns(drive).T
 
 
 Array = NDArray[np.float64]
@@ -111,15 +90,8 @@ STEP = 1e-3
 
 
 def motion(time: Array, speed: float = 1.0) -> tuple[Array, Array, Array]:
-    rng = np.random.default_rng(12)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    w = w * speed
-    angle = w * time[:, None, None] + phase
-    return (
-        (a * np.sin(angle)).sum(axis=1),
-        (a * w * np.cos(angle)).sum(axis=1),
-        (-a * w**2 * np.sin(angle)).sum(axis=1),
-    )
+    """Position, velocity and acceleration (m, 2) of four sines for each joint."""
+    return four_sines(time, speed)[1:4]
 
 
 def a_recording(

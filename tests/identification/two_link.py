@@ -56,12 +56,16 @@ def truth() -> Array:
     return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
 
 
-def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+def four_sines(time: Array, speed: float = 1.0) -> Motion:
     """Four sines for each joint."""
-    time = np.arange(0.0, duration, step)
     rng = np.random.default_rng(12)
     a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    return sine_motion(time, a, w, phase)
+    return sine_motion(time, a, w * speed, phase)
+
+
+def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+    """Four sines for each joint, from time zero."""
+    return four_sines(np.arange(0.0, duration, step))
 
 
 def recording(error: Array, motion: Motion) -> Samples:
