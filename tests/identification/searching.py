@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ import numpy as np
 from identification import RobotModel
 from identification.excitation import Constraints, Design, Objective, Problem, ViaPointGenome
 from planner import JointLimits, PlanningError
+from tests.identification.two_link import URDF
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 VELOCITY = np.array([3.0, 4.0])
 LIMITS = JointLimits([-2.0, -2.5], [2.0, 2.5], VELOCITY, VELOCITY / 0.3, VELOCITY / 0.03)
 

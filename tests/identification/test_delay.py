@@ -210,8 +210,8 @@ class TestCommonDelay:
 
 
 @pytest.fixture(scope="module")
-def slow(model: RobotModel, truth: Array) -> DelayEstimate:
-    return estimate_delays(a_recording(model, truth, 0.0, speed=0.05), model)
+def slow() -> DelayEstimate:
+    return estimate_delays(a_recording(MODEL, TRUTH, 0.0, speed=0.05), MODEL)
 
 
 class TestUndeterminedDelay:

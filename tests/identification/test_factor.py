@@ -43,8 +43,8 @@ from tests.identification.two_link import (
     URDF,
     P,
     coloured,
+    one_sine,
     recording,
-    sine_motion,
     truth,
 )
 
@@ -65,15 +65,14 @@ def some_samples(m: int, seed: int = 0) -> tuple[Motion, Array]:
 
 
 def a_motion(samples: int = 3000, *, step: float = 2e-3, held_elbow: bool = False) -> Motion:
-    a, w = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])
     time = np.arange(samples) * step
-    return sine_motion(time, a, w, np.array([0.3, 1.1]), np.array([0.0, 0.4]))
+    return one_sine(time, centre=np.array([0.0, 0.4]), held_elbow=held_elbow)
 
 
 def ill() -> Samples:
     """A scaled condition of some 1e7: the elbow turns one way, at very nearly one speed."""
     time = np.arange(400) * 2e-3
-    motion = sine_motion(time, np.array([0.9, 1e-5]), np.array([2.1, 3.7]), np.array([0.3, 1.1]))
+    motion = one_sine(time, (0.9, 1e-5))
     motion.position[:, 1] += time
     motion.velocity[:, 1] += 1.0
     return recording(np.zeros((400, 2)), motion)
@@ -85,16 +84,7 @@ def noisy(motion: Motion, noise: Array | float = 0.0, seed: int = 0) -> Samples:
 
 
 def parts_of(samples: Samples, edges: Array) -> list[Samples]:
-    cuts = [slice(a, b) for a, b in pairwise(np.unique(edges).tolist())]
-    return [
-        replace(
-            samples,
-            motion=samples.motion.rows(s),
-            torque=samples.torque[s],
-            usable=samples.usable[s],
-        )
-        for s in cuts
-    ]
+    return [samples.between(a, b) for a, b in pairwise(np.unique(edges).tolist())]
 
 
 def summed(kind: Kind, parts: list[Samples]) -> Any:

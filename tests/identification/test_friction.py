@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from identification.model.friction import (
 )
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 from tests.identification.two_link import MODEL, a_motion, truth
+from tests.identification.two_link import URDF as TWO_LINK
 
 
 @pytest.mark.parametrize("kind", TERMS)
@@ -69,7 +69,6 @@ class TestFrictionTable:
 
 Array = NDArray[np.float64]
 
-TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
 LAWS = st.builds(
     FrictionLaw,
     coulomb=st.booleans(),

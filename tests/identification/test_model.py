@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pickle
 import time
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -30,6 +29,7 @@ from identification.model.pseudo_inertia import (
 from identification.model.robot import StandardLayout
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import one_joint, random_urdf, robot_text, some_bodies
+from tests.identification.two_link import URDF as TWO_LINK
 
 TILTED = (2.0, -3.0, -9.0)
 
@@ -206,7 +206,6 @@ def test_the_rotors_make_a_symmetric_matrix() -> None:
         bare.rotor_matrix(np.ones(22))
 
 
-TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
 FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.03}
 
 

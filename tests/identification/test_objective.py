@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,9 +33,9 @@ from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from planner.worker import load, pack
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.searching import NS16_VELOCITY
+from tests.identification.two_link import URDF
 
 LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
-URDF = (Path(__file__).parent / "two_link.urdf").read_text(encoding="utf-8")
 MODEL = RobotModel.from_urdf(URDF)
 P = MODEL.n_parameters
 WORST = {"log10_det": -np.inf, "coupling_index": np.inf}

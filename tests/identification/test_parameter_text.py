@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,8 @@ from identification.export.parameters import parameters_csv, parameters_json, st
 from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
 from identification.model.friction import ThirdTerm
+from tests.identification.two_link import URDF
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}
 DRY = FrictionLaw(third=None)
 Fit = tuple[RobotModel, Estimate, ConsistentEstimate]

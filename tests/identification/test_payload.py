@@ -24,7 +24,7 @@ from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text
 from tests.identification.test_gains import lively, load_torque
-from tests.identification.two_link import MODEL, URDF, as_samples, truth
+from tests.identification.two_link import MODEL, URDF, as_samples, sine_motion, truth
 
 TILTED = (2.0, -3.0, -9.0)
 INERTIA = (0.05, 0.01, -0.02, 0.04, 0.005, 0.03)
@@ -109,13 +109,8 @@ def test_a_recording_of_the_loaded_arm_gives_the_parameters_of_the_bare_one() ->
     bare = RobotModel.from_urdf(urdf_text(), friction=law)
     random = np.random.default_rng(8)
     time = np.arange(8000, dtype=np.float64) * 1e-3
-    pace, phase = random.uniform(2.0, 9.0, (4, 1, 6)), random.uniform(0.0, 6.0, (4, 1, 6))
-    angle = pace * time[:, None] + phase
-    motion = (
-        0.4 * np.sin(angle).sum(axis=0),
-        0.4 * (pace * np.cos(angle)).sum(axis=0),
-        -0.4 * (pace**2 * np.sin(angle)).sum(axis=0),
-    )
+    pace, phase = random.uniform(2.0, 9.0, (4, 6)), random.uniform(0.0, 6.0, (4, 6))
+    motion = sine_motion(time, np.full((4, 6), 0.4), pace, phase)[1:4]
     truth = np.append(bare.base.grouping @ bare.nominal, np.full(12, 5.0))
     recording = Recording(
         time=time,

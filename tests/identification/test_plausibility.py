@@ -27,7 +27,7 @@ from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
 from tests.identification.test_essential import NOISE, a_motion, samples_of
 from tests.identification.test_verdict import an_error, finding_of, judged
-from tests.identification.two_link import MODEL, URDF, as_samples, sine_motion
+from tests.identification.two_link import MODEL, URDF, as_samples, one_sine
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,7 @@ def with_value(name: str, value: float, std: float = 0.01) -> Estimate:
 
 
 def signs(found: Estimate, model: RobotModel = MODEL, *, error: float = 0.1) -> Implausible:
-    amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
-    motion = sine_motion(np.arange(2000) * 2e-3, amplitude, rate, np.array([0.3, 1.1]))
+    motion = one_sine(np.arange(2000) * 2e-3)
     return implausibilities(
         model,
         found,

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from identification.signals.masks import (
 from identification.signals.noise import difference_variance, standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
-from tests.identification.two_link import MODEL, truth
+from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
 
 Array = NDArray[np.float64]
 
@@ -37,13 +36,7 @@ RESOLUTION = 2e-6  # rad, of the encoders
 
 
 def motion(time: Array) -> tuple[Array, Array, Array]:
-    amplitude, rate, phase = np.array([0.9, 1.2]), np.array([2.1, 3.7]), np.array([0.3, 1.1])
-    angle = rate * time[:, None] + phase
-    return (
-        amplitude * np.sin(angle),
-        amplitude * rate * np.cos(angle),
-        -amplitude * rate**2 * np.sin(angle),
-    )
+    return one_sine(time)[1:4]
 
 
 def a_recording(
@@ -209,7 +202,6 @@ def test_a_bandwidth_that_is_none_is_refused() -> None:
         Preprocessing(torque_bandwidth=0.0)
 
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 TIME = np.arange(4000) * 1e-3
 EVERYWHERE = np.ones((1, 1), dtype=np.bool_)
 
@@ -220,10 +212,8 @@ def model() -> RobotModel:
 
 
 def motion_and_recording(model: RobotModel, clip: float = np.inf) -> tuple[Motion, Recording]:
-    angle = np.array([2.0, 3.1]) * TIME[:, None] + 0.4
-    rate = np.array([2.0, 3.1])
-    motion = Motion(TIME, np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle))
-    rng = np.random.default_rng(2)
+    rate, rng = np.array([2.0, 3.1]), np.random.default_rng(2)
+    angle, motion = rate * TIME[:, None] + 0.4, sine_motion(TIME, np.ones(2), rate, np.full(2, 0.4))
     torque = 20.0 * np.sin(angle * 1.7) + 0.2 * rng.standard_normal(angle.shape)
     return motion, Recording(
         time=TIME,

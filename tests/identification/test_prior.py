@@ -22,7 +22,7 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
 from tests.identification import two_link
-from tests.identification.two_link import MODEL, NOISE, P, as_samples, sine_motion, truth
+from tests.identification.two_link import MODEL, NOISE, P, as_samples, one_sine, truth
 
 Array = NDArray[np.float64]
 
@@ -33,8 +33,7 @@ KNOWN = ROTORS | FRICTION
 
 def a_motion(duration: float = 6.0, *, held_elbow: bool = False) -> Motion:
     time = np.arange(0.0, duration, 5e-3)
-    a, w = np.array([0.9, 0.0 if held_elbow else 1.2]), np.array([2.1, 3.7])
-    return sine_motion(time, a, w, np.array([0.3, 1.1]), np.array([0.0, 0.4]))
+    return one_sine(time, centre=np.array([0.0, 0.4]), held_elbow=held_elbow)
 
 
 def recording(values: Array, error: Array | float, motion: Motion) -> Samples:
@@ -173,18 +172,8 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
     # Yesterday's posterior is today's prior: the law that makes it one.
     samples, weights = noisy(), 1.0 / NOISE**2
     half = len(samples.torque) // 2
-    parts = [
-        Factor.of(
-            MODEL,
-            replace(
-                samples,
-                motion=samples.motion.rows(s),
-                torque=samples.torque[s],
-                usable=samples.usable[s],
-            ),
-        )
-        for s in (slice(0, half), slice(half, None))
-    ]
+    ends = ((0, half), (half, len(samples.torque)))
+    parts = [Factor.of(MODEL, samples.between(*part)) for part in ends]
     prior = prior_of(truth(), some_covariance(seed))
     once = with_prior(MODEL, parts[0] + parts[1], prior, weights).estimate
     first = with_prior(MODEL, parts[0], prior, weights).estimate

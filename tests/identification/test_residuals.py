@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.model.motion import Motion
-from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.residuals import (
@@ -29,7 +28,7 @@ from identification.validation.residuals import (
     find_outliers,
 )
 from tests.identification.test_verdict import finding_of, judged
-from tests.identification.two_link import as_samples, sine_motion
+from tests.identification.two_link import MODEL, as_samples, sine_motion
 
 Array = NDArray[np.float64]
 Disturbance = Callable[[Motion, int], Array]
@@ -40,8 +39,8 @@ NOISE = 0.5
 MEMORY = 0.05  # s, of the coloured noise
 
 
-def values_of(model: RobotModel) -> Array:
-    return np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
+def values_of() -> Array:
+    return np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
 
 
 def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float = MEMORY) -> Array:
@@ -52,7 +51,6 @@ def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float = M
 
 
 def a_run(
-    model: RobotModel,
     seed: int,
     disturbance: Disturbance | None = None,
     *,
@@ -63,29 +61,28 @@ def a_run(
     rng = np.random.default_rng(seed)
     amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
     motion = sine_motion(time, amplitude, rate, rng.uniform(0.0, 6.0, (3, 2)))
-    torque = model.torque(values_of(model), *motion[1:])
+    torque = MODEL.torque(values_of(), *motion[1:])
     torque = torque + noise * coloured(rng, torque.shape)
     if disturbance is not None:
         torque = torque + disturbance(motion, seed)
-    return as_samples(model, motion, torque)
+    return as_samples(MODEL, motion, torque)
 
 
 def checked(
-    model: RobotModel,
     disturbance: Disturbance | None = None,
     *,
     first_seed: int = 0,
     noise: float = NOISE,
 ) -> ResidualChecks:
-    runs = [a_run(model, first_seed + k, disturbance, noise=noise) for k in range(6)]
-    return check_residuals(model, values_of(model), runs[:5], runs[5:], motor_from_joint=GEAR)
+    runs = [a_run(first_seed + k, disturbance, noise=noise) for k in range(6)]
+    return check_residuals(MODEL, values_of(), runs[:5], runs[5:], motor_from_joint=GEAR)
 
 
-def test_coloured_noise_alone_raises_no_alarm(model: RobotModel) -> None:
+def test_coloured_noise_alone_raises_no_alarm() -> None:
     alarms = np.zeros(4)
     campaigns = 25
     for campaign in range(campaigns):
-        checks = checked(model, first_seed=100 * campaign)
+        checks = checked(first_seed=100 * campaign)
         assert checks.ripple is not None and checks.drift is not None
         for k, check in enumerate((checks.speed, checks.position, checks.ripple, checks.drift)):
             alarms[k] += np.count_nonzero(check.significant)
@@ -93,34 +90,32 @@ def test_coloured_noise_alone_raises_no_alarm(model: RobotModel) -> None:
     assert (alarms <= 1).all(), alarms
 
 
-def test_friction_of_another_form_shows_over_speed_of_its_joint_only(
-    model: RobotModel,
-) -> None:
+def test_friction_of_another_form_shows_over_speed_of_its_joint_only() -> None:
     def stribeck(motion: Motion, _: int) -> Array:
         extra = 1.0 * np.sign(motion.velocity) * np.exp(-((motion.velocity / 0.5) ** 2))
         return np.asarray(extra * np.array([0.0, 1.0]))
 
-    checks = checked(model, stribeck)
+    checks = checked(stribeck)
     assert checks.speed.significant.tolist() == [False, True]
     at, size = checks.speed.worst(1)
     assert abs(at) < 0.6 and np.sign(size) == np.sign(at)
 
 
-def test_a_pull_that_depends_on_posture_shows_over_position(model: RobotModel) -> None:
-    checks = checked(model, lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
+def test_a_pull_that_depends_on_posture_shows_over_position() -> None:
+    checks = checked(lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
     assert checks.position.significant.tolist() == [True, False]
     # RMS of the planted wave, to within what binning and its own noise take off.
     assert checks.position.rms[0] == pytest.approx(0.6 / np.sqrt(2.0), rel=0.25)
 
 
 @pytest.mark.parametrize("harmonic", HARMONICS)
-def test_ripple_is_found_with_its_harmonic_and_amplitude(model: RobotModel, harmonic: int) -> None:
+def test_ripple_is_found_with_its_harmonic_and_amplitude(harmonic: int) -> None:
     planted = np.array([0.0, 0.4])
 
     def ripple(motion: Motion, _: int) -> Array:
         return np.asarray(planted * np.sin(harmonic * motion.position @ GEAR.T + 0.7))
 
-    found = checked(model, ripple).ripple
+    found = checked(ripple).ripple
     assert found is not None
     assert found.significant.tolist() == [False, True]
     assert found.strongest(1) == harmonic
@@ -129,29 +124,27 @@ def test_ripple_is_found_with_its_harmonic_and_amplitude(model: RobotModel, harm
     assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
 
 
-def test_without_a_gear_ratio_there_is_no_ripple_to_look_for(model: RobotModel) -> None:
-    assert check_residuals(model, values_of(model), [a_run(model, 1)]).ripple is None
+def test_without_a_gear_ratio_there_is_no_ripple_to_look_for() -> None:
+    assert check_residuals(MODEL, values_of(), [a_run(1)]).ripple is None
 
 
-def test_friction_that_falls_from_run_to_run_is_found_with_its_size(
-    model: RobotModel,
-) -> None:
-    friction = np.where(model.friction_columns, values_of(model), 0.0)
+def test_friction_that_falls_from_run_to_run_is_found_with_its_size() -> None:
+    friction = np.where(MODEL.friction_columns, values_of(), 0.0)
 
     def cooling(motion: Motion, seed: int) -> Array:
         # Five fitted recordings, seeds 0 to 4: from +4 % to -4 % of the second joint's friction.
         change = 0.04 - 0.02 * seed
-        return np.asarray(change * model.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
+        return np.asarray(change * MODEL.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
 
-    drift = checked(model, cooling, noise=0.1).drift
+    drift = checked(cooling, noise=0.1).drift
     assert drift is not None and len(drift.share) == 15
     assert drift.significant.tolist() == [False, True]
     assert drift.change[1] == pytest.approx(-0.08, abs=4.0 * drift.change_std[1])
     assert drift.change_std[1] < 0.02
 
 
-def test_one_recording_is_cut_so_that_drift_can_be_seen(model: RobotModel) -> None:
-    drift = check_residuals(model, values_of(model), [a_run(model, 1, duration=30.0)]).drift
+def test_one_recording_is_cut_so_that_drift_can_be_seen() -> None:
+    drift = check_residuals(MODEL, values_of(), [a_run(1, duration=30.0)]).drift
     assert drift is not None and len(drift.share) >= 4
 
 
@@ -252,8 +245,8 @@ def drift(*change: float) -> FrictionDrift:
 
 
 @pytest.fixture(scope="module")
-def sound(model: RobotModel) -> ResidualChecks:
-    return replace(checked(model), ripple=None, drift=None, rms=np.full(2, 0.01))
+def sound() -> ResidualChecks:
+    return replace(checked(), ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
 class TestPatterns:

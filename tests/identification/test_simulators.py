@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -33,7 +32,7 @@ from identification.signals.smoothing import LowPassShape, low_passed
 from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-from tests.identification.two_link import as_samples, sine_motion
+from tests.identification.two_link import URDF, as_samples, one_sine, sine_motion
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
 WRIST = np.eye(6)
@@ -176,7 +175,6 @@ class TestTexts:
 
 Array = NDArray[np.float64]
 
-URDF = (Path(__file__).parent / "two_link.urdf").read_text()
 F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
 PRESLIDING = 1e-3
 
@@ -192,9 +190,7 @@ def values_of(model: RobotModel) -> Array:
 
 
 def samples_of(model: RobotModel, bandwidth: float | None = None) -> Samples:
-    time = np.arange(3000) * 2e-3
-    rate, amplitude = np.array([2.1, 3.7]), np.array([0.9, 1.2])
-    motion = sine_motion(time, amplitude, rate, np.zeros(2))
+    motion = one_sine(np.arange(3000) * 2e-3, phase=(0.0, 0.0))
     samples = as_samples(
         model,
         motion,

@@ -30,6 +30,7 @@ from identification.model.kinematics import MOST_JOINTS, chain_from_urdf, urdf_f
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import robot_text, some_bodies
+from tests.identification.two_link import URDF as TWO_LINK
 
 INERTIAL = (
     '<inertial><mass value="6"/><origin xyz="0.2 0 0"/>'
@@ -358,9 +359,6 @@ def test_what_xacro_leaves_in_the_header_is_no_fault() -> None:
     text = xacro(robot(LINKS + joint("continuous")))
     assert urdf_fault(text) is None
     assert RobotModel.from_urdf(text).n_joints == 1
-
-
-TWO_LINK = (Path(__file__).parent / "two_link.urdf").read_text()
 
 
 ROBOTS = {

@@ -15,7 +15,6 @@ from identification.errors import IdentificationError, ShapeError
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
-from identification.model.robot import RobotModel
 from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
 from identification.signals.samples import Samples
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate, inner_errors
@@ -32,8 +31,8 @@ from tests.identification.two_link import (
     a_motion,
     as_samples,
     coloured,
+    one_sine,
     recording,
-    sine_motion,
     truth,
 )
 
@@ -43,13 +42,12 @@ Array = NDArray[np.float64]
 torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
 
 
-def samples_with(model: RobotModel, error: Array, *, origin: float = 0.0) -> Samples:
+def samples_with(error: Array, *, origin: float = 0.0) -> Samples:
     """A motion whose torque is that of parameters 1, 1, 1, ... plus an error (m, 2)."""
     time = np.arange(len(error)) * 2e-3
-    amplitude, rate = np.array([0.9, 1.2]), np.array([2.1, 3.7])
-    motion = sine_motion(time, amplitude, rate, np.array([0.3, 1.1]))._replace(time=time + origin)
-    torque = model.torque(np.ones(model.n_parameters), *motion[1:]) + error
-    return as_samples(model, motion, torque, origin=origin)
+    motion = one_sine(time)._replace(time=time + origin)
+    torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:]) + error
+    return as_samples(MODEL, motion, torque, origin=origin)
 
 
 def test_the_measures_are_those_of_their_definitions() -> None:
@@ -90,32 +88,30 @@ def test_an_error_is_printed_as_a_person_reads_it() -> None:
     assert str(error) == "10.0 % of the torque (10.0, 10.0 % by joint; 2 to 2 rows of a joint)"
 
 
-def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for(
-    model: RobotModel,
-) -> None:
-    values = np.ones(model.n_parameters)
-    samples = samples_with(model, np.zeros((2000, 2)))
+def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for() -> None:
+    values = np.ones(MODEL.n_parameters)
+    samples = samples_with(np.zeros((2000, 2)))
     torque = samples.torque.copy()
     torque[~samples.usable] += 50.0  # stiction
     stuck = Samples(**{**samples.__dict__, "torque": torque})
-    (error,) = prediction_error(model, values, [stuck])
+    (error,) = prediction_error(MODEL, values, [stuck])
     assert error.overall < 1e-12
-    (error,) = prediction_error(model, values, [stuck], all_rows=True)
+    (error,) = prediction_error(MODEL, values, [stuck], all_rows=True)
     assert error.overall > 0.05
 
 
-def test_a_change_of_friction_is_apart_from_other_slow_errors(model: RobotModel) -> None:
+def test_a_change_of_friction_is_apart_from_other_slow_errors() -> None:
     """Measured in full, and forgiven up to a tenth."""
-    values = np.ones(model.n_parameters)
-    motion = samples_with(model, np.zeros((5000, 2))).motion
-    friction = model.torque(np.where(model.friction_columns, values, 0.0), *motion[1:])
+    values = np.ones(MODEL.n_parameters)
+    motion = samples_with(np.zeros((5000, 2))).motion
+    friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), *motion[1:])
     other = 0.2 * np.sin(2.0 * np.pi * 1.3 * motion.time)[:, None] * np.array([1.0, 0.0])
-    warm = samples_with(model, np.array([0.05, -0.08]) * friction + other)
-    left, change, apart = slow_error(model, values, warm, 10.0)
+    warm = samples_with(np.array([0.05, -0.08]) * friction + other)
+    left, change, apart = slow_error(MODEL, values, warm, 10.0)
     np.testing.assert_allclose(change, [0.05, -0.08], atol=0.01)
     np.testing.assert_allclose(left.rms, [0.2 / np.sqrt(2.0), 0.0], atol=0.01)
     np.testing.assert_allclose(apart.rms, left.rms)
-    left, change, apart = slow_error(model, values, samples_with(model, 0.5 * friction), 10.0)
+    left, change, apart = slow_error(MODEL, values, samples_with(0.5 * friction), 10.0)
     np.testing.assert_allclose(change, 0.5, atol=0.01)
     assert (left.rms > 0.3 * np.std(friction, axis=0)).all()
     assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
@@ -128,18 +124,17 @@ def test_no_runs_and_other_shapes_are_errors() -> None:
         PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
 
 
-def test_noise_is_what_differs_between_repetitions(model: RobotModel) -> None:
+def test_noise_is_what_differs_between_repetitions() -> None:
     """Their clocks start at different times, as recordings' clocks do."""
     rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
     common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
-    values = np.ones(model.n_parameters)
+    values = np.ones(MODEL.n_parameters)
     runs = [
-        samples_with(model, common + sizes * rng.standard_normal((3000, 2)), origin=k)
-        for k in range(12)
+        samples_with(common + sizes * rng.standard_normal((3000, 2)), origin=k) for k in range(12)
     ]
-    np.testing.assert_allclose(repetition_noise(model, values, runs), sizes, rtol=0.05)
+    np.testing.assert_allclose(repetition_noise(MODEL, values, runs), sizes, rtol=0.05)
     with pytest.raises(IdentificationError, match="two repetitions"):
-        repetition_noise(model, values, runs[:1])
+        repetition_noise(MODEL, values, runs[:1])
 
 
 def test_a_joint_without_torque_has_no_relative_error() -> None:

@@ -34,6 +34,7 @@ ROTORS = [7.6465, 24.5955, 10.48, 0.253, 0.298, 0.12]
 COULOMB = np.array([68.035, 108.777, 50.446, 9.248, 8.904, 5.148])
 VISCOUS = np.array([41.196, 63.255, 39.248, 3.2659, 16.4439, 8.8808])
 CURRENT_NOISE = 0.02  # A
+MODEL = RobotModel.from_urdf(urdf_text())
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,9 @@ class Drive:
         return replace(self, **{what: tuple(values)})
 
 
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(urdf_text())
-
-
-def parameters(model: RobotModel, coulomb: Array = COULOMB, viscous: Array = VISCOUS) -> Array:
+def parameters(
+    coulomb: Array = COULOMB, viscous: Array = VISCOUS, model: RobotModel = MODEL
+) -> Array:
     standard = model.nominal.reshape(6, -1).copy()
     standard[:, -1] = ROTORS
     base = model.base.grouping @ standard.ravel()
@@ -102,27 +100,25 @@ def nothing(motion: Motion, torque: Array) -> Array:
 
 
 def campaign(
-    model: RobotModel,
     *,
     believed: Drive = Drive(),
     truth: Array | None = None,
     disturbance: Disturbance = nothing,
     unseen_disturbance: Disturbance | None = None,
-    real: RobotModel | None = None,
+    real: RobotModel = MODEL,
 ) -> tuple[Verdict, Evidence]:
-    real = model if real is None else real
-    truth = parameters(real) if truth is None else truth
+    truth = parameters(model=real) if truth is None else truth
     training, unseen = a_motion(17, duration=12.0), unseen_disturbance or disturbance
     fitted = [executed(real, truth, training, k, believed, disturbance) for k in range(2)]
     held_out = [executed(real, truth, a_motion(k), 10 + k, believed, unseen) for k in range(2)]
-    result = estimate_repetitions(model, fitted)
-    evidence = gather(model, result, fitted, held_out, nominal=parameters(model))
-    return judge(model.joint_names, evidence), evidence
+    result = estimate_repetitions(MODEL, fitted)
+    evidence = gather(MODEL, result, fitted, held_out, nominal=parameters())
+    return judge(MODEL.joint_names, evidence), evidence
 
 
 class TestSoundCampaign:
-    def test_it_is_good_and_nothing_is_blamed(self, model: RobotModel) -> None:
-        verdict, evidence = campaign(model)
+    def test_it_is_good_and_nothing_is_blamed(self) -> None:
+        verdict, evidence = campaign()
         assert verdict.good, verdict.reasons
         assert "predicts unseen motion well" in verdict.line
         assert f"{evidence.held_out.overall:.1%}" in verdict.line
@@ -132,7 +128,7 @@ class TestSoundCampaign:
         assert evidence.gravity is not None and np.degrees(evidence.gravity.angle) < 0.5
         np.testing.assert_array_equal(evidence.loaded, [False, *[True] * 5])
 
-    def test_effects_that_no_model_has_do_not_spoil_it(self, model: RobotModel) -> None:
+    def test_effects_that_no_model_has_do_not_spoil_it(self) -> None:
         def effects(motion: Motion, torque: Array) -> Array:
             motor = motion.position @ Drive().motor_from_joint.T
             ripple = 0.10 * COULOMB * np.sin(2.0 * motor + np.arange(6))
@@ -140,7 +136,7 @@ class TestSoundCampaign:
             late = 0.0005 * np.gradient(torque, motion.time, axis=0)
             return np.asarray(ripple + 0.02 * friction - late)
 
-        verdict, evidence = campaign(model, disturbance=effects)
+        verdict, evidence = campaign(disturbance=effects)
         assert verdict.good, verdict.reasons
         assert evidence.systematic is not None and evidence.systematic.max() > 0.005
 
@@ -155,11 +151,9 @@ class TestOneSidedErrors:
             *((coupling, 4) for coupling in ("k54", "k64", "k65")),
         ],
     )
-    def test_a_turned_one_is_found_and_nothing_else_blamed(
-        self, model: RobotModel, what: str, axis: int
-    ) -> None:
+    def test_a_turned_one_is_found_and_nothing_else_blamed(self, what: str, axis: int) -> None:
         """Neither gravity nor a load; of the large axes by name."""
-        verdict, evidence = campaign(model, believed=Drive().with_turned(what, axis))
+        verdict, evidence = campaign(believed=Drive().with_turned(what, axis))
         assert not verdict.good and "must not be relied on" in verdict.line
         assert evidence.load is not None and evidence.causes is not None
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
@@ -175,10 +169,10 @@ class TestOneSidedErrors:
         ("term", "axis"),
         [*(("coulomb", axis) for axis in (0, 2, 4)), *(("viscous", axis) for axis in (1, 3, 5))],
     )
-    def test_friction_that_drives_is_named(self, model: RobotModel, term: str, axis: int) -> None:
+    def test_friction_that_drives_is_named(self, term: str, axis: int) -> None:
         values = {"coulomb": COULOMB, "viscous": VISCOUS}[term].copy()
         values[axis] *= -1.0
-        verdict, _ = campaign(model, truth=parameters(model, **{term: values}))
+        verdict, _ = campaign(truth=parameters(**{term: values}))
         assert not verdict.good
         assert any("friction" in one and f"joint_{axis + 1}" in one for one in verdict.reasons)
 
@@ -192,9 +186,9 @@ class TestUnseenMotion:
         ids=["tilted by 10 degrees", "upside down", "on a wall", "on another wall"],
     )
     def test_gravity_that_pulls_elsewhere_is_named_first(
-        self, model: RobotModel, mounted: tuple[float, float, float]
+        self, mounted: tuple[float, float, float]
     ) -> None:
-        verdict, evidence = campaign(model, real=RobotModel.from_urdf(urdf_text(), gravity=mounted))
+        verdict, evidence = campaign(real=RobotModel.from_urdf(urdf_text(), gravity=mounted))
         assert not verdict.good
         assert "gravity seems to pull along" in verdict.reasons[0]
         assert evidence.gravity is not None
@@ -203,13 +197,13 @@ class TestUnseenMotion:
         assert not any("gear ratio" in step or "jog" in step for step in verdict.next_steps)
 
     @pytest.mark.parametrize("mass", [4.0, 1.0])
-    def test_a_load_is_named_and_weighed(self, model: RobotModel, mass: float) -> None:
+    def test_a_load_is_named_and_weighed(self, mass: float) -> None:
         carrying = RobotModel.from_urdf(urdf_text(), payload=Payload(mass, (0.0, 0.09, 0.12)))
 
         def load(motion: Motion, _: Array) -> Array:
             return carrying.load_torque(*motion[1:4])
 
-        verdict, evidence = campaign(model, unseen_disturbance=load)
+        verdict, evidence = campaign(unseen_disturbance=load)
         assert not verdict.good
         assert f"carried {mass:g} ± 0.0" in verdict.reasons[0]
         assert evidence.load is not None and evidence.load.mass == pytest.approx(mass, rel=0.02)
@@ -217,24 +211,24 @@ class TestUnseenMotion:
         (step,) = verdict.next_steps
         assert step.startswith("record both with the same tool and payload")
 
-    def test_changed_friction_is_given_in_full(self, model: RobotModel) -> None:
+    def test_changed_friction_is_given_in_full(self) -> None:
         def warmer(motion: Motion, _: Array) -> Array:
             return 0.2 * (COULOMB * np.sign(motion.velocity) + VISCOUS * motion.velocity)
 
-        verdict, _ = campaign(model, unseen_disturbance=warmer)
+        verdict, _ = campaign(unseen_disturbance=warmer)
         assert not verdict.good
         assert "joint_1 +20%" in verdict.reasons[0] and "warm" in verdict.reasons[0]
         assert verdict.next_steps == ("warm the arm up by moving it before recording",)
 
     @pytest.mark.parametrize("share", [0.01, 0.001])
-    def test_spikes_are_named_and_no_gear_ratio(self, model: RobotModel, share: float) -> None:
+    def test_spikes_are_named_and_no_gear_ratio(self, share: float) -> None:
         random = np.random.default_rng(3)
 
         def spikes(_: Motion, torque: Array) -> Array:
             hit = random.random(torque.shape) < share
             return hit * random.standard_normal(torque.shape) * 0.06 / share * torque.std(axis=0)
 
-        verdict, _ = campaign(model, disturbance=spikes)
+        verdict, _ = campaign(disturbance=spikes)
         assert not verdict.good
         assert "single samples far outside" in verdict.reasons[0]
         assert not any("gear ratio" in step for step in verdict.next_steps)
@@ -398,15 +392,15 @@ DELAY = 0.02  # s
 SLOW = 0.2  # rad/s; rows near a reversal are left out
 
 
-def recorded(model: RobotModel, seed: int, load: Array | None = None) -> Samples:
+def recorded(seed: int, load: Array | None = None) -> Samples:
     """A motion with the torques of the paper's arm, a load (m,) [kg] on its flange, and noise."""
     motion = a_motion(seed, duration=10.0, step=8e-3)
-    torque = model.torque(parameters(model), *motion[1:])
+    torque = MODEL.torque(parameters(), *motion[1:])
     if load is not None:
         torque = torque + load[:, None] * of_one_kilogram(motion)
     rng = np.random.default_rng(seed + 1000)
     torque = torque + NOISE * torque.std(axis=0) * rng.standard_normal(torque.shape)
-    return as_samples(model, motion, torque, usable=np.abs(motion.velocity) > SLOW)
+    return as_samples(MODEL, motion, torque, usable=np.abs(motion.velocity) > SLOW)
 
 
 def of_one_kilogram(motion: Motion) -> Array:
@@ -422,11 +416,11 @@ def of_one_kilogram(motion: Motion) -> Array:
     )
 
 
-def causes(model: RobotModel, recordings: Sequence[Samples]) -> tuple[Cause, ...]:
-    factors = (Factor.of(model, one) for one in recordings)
-    values = estimate(model, sum(factors, Factor.zero(model))).values
+def causes(recordings: Sequence[Samples]) -> tuple[Cause, ...]:
+    factors = (Factor.of(MODEL, one) for one in recordings)
+    values = estimate(MODEL, sum(factors, Factor.zero(MODEL))).values
     names = [f"{k}.mcap" for k in range(len(recordings))]
-    return find_causes(model, recordings, values, names).found
+    return find_causes(MODEL, recordings, values, names).found
 
 
 def late(samples: Samples) -> Samples:
@@ -473,26 +467,24 @@ class TestCausesOfWholeRecordings:
     """What is wrong throughout."""
 
     @pytest.mark.parametrize("seed", range(8))
-    def test_sound_recordings_have_none(self, model: RobotModel, seed: int) -> None:
-        assert causes(model, [recorded(model, seed)]) == ()
+    def test_sound_recordings_have_none(self, seed: int) -> None:
+        assert causes([recorded(seed)]) == ()
 
     @pytest.mark.parametrize("kind", FAULTS)
     @pytest.mark.parametrize("seed", [1, 2])
-    def test_a_fault_is_named_and_nothing_else(
-        self, model: RobotModel, kind: str, seed: int
-    ) -> None:
+    def test_a_fault_is_named_and_nothing_else(self, kind: str, seed: int) -> None:
         joints, spoil = FAULTS[kind]
-        found = causes(model, [spoil(recorded(model, seed))])
+        found = causes([spoil(recorded(seed))])
         assert [(one.fault.kind, one.fault.joints) for one in found] == [(kind, joints)]
 
-    def test_sizes_lie_within_four_deviations(self, model: RobotModel) -> None:
+    def test_sizes_lie_within_four_deviations(self) -> None:
         for kind, size in (("delay", DELAY), ("gain", 0.15)):
-            (cause,) = causes(model, [FAULTS[kind][1](recorded(model, 1))])
+            (cause,) = causes([FAULTS[kind][1](recorded(1))])
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
-    def test_two_faults_are_found_one_after_the_other(self, model: RobotModel) -> None:
-        both = FAULTS["torque sign"][1](late(recorded(model, 1)))
-        found = causes(model, [both])
+    def test_two_faults_are_found_one_after_the_other(self) -> None:
+        both = FAULTS["torque sign"][1](late(recorded(1)))
+        found = causes([both])
         assert {one.fault.kind for one in found} == {"torque sign", "delay"}
 
 
@@ -503,36 +495,34 @@ class TestCausesOfParts:
         ("seeds", "loaded", "words"),
         [((1,), 0.5, "0.mcap from 5 s on"), (range(4), (1, 3), "1.mcap, 3.mcap")],
     )
-    def test_a_load_is_weighed(
-        self, model: RobotModel, seeds: Sequence[int], loaded: Any, words: str
-    ) -> None:
+    def test_a_load_is_weighed(self, seeds: Sequence[int], loaded: Any, words: str) -> None:
         """In the second half of one recording, or in two of four."""
         if loaded == 0.5:
-            runs = [recorded(model, 1, LOAD * (np.arange(1250) >= 625))]
+            runs = [recorded(1, LOAD * (np.arange(1250) >= 625))]
         else:
             load = np.full(1250, LOAD)
-            runs = [recorded(model, k, load if k in loaded else None) for k in seeds]
-        (cause,) = causes(model, runs)
+            runs = [recorded(k, load if k in loaded else None) for k in seeds]
+        (cause,) = causes(runs)
         assert cause.fault.kind == "payload"
         assert cause.fault.part is not None and cause.fault.part.words == words
         assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
 
-    def test_friction_of_one_recording(self, model: RobotModel) -> None:
-        runs = [recorded(model, k) for k in range(3)]
+    def test_friction_of_one_recording(self) -> None:
+        runs = [recorded(k) for k in range(3)]
         velocity = runs[1].motion.velocity[:, 1]
         torque = runs[1].torque.copy()
         torque[:, 1] += 0.4 * (COULOMB[1] * np.sign(velocity) + VISCOUS[1] * velocity)
         runs[1] = replace(runs[1], torque=torque)
-        (cause,) = causes(model, runs)
+        (cause,) = causes(runs)
         assert (cause.fault.kind, cause.fault.joints) == ("changed friction", (1,))
         assert cause.fault.part is not None and cause.fault.part.words == "1.mcap"
         assert cause.size == pytest.approx(0.4, abs=0.05)
 
-    def test_another_arm_in_the_second_half(self, model: RobotModel) -> None:
-        runs = [recorded(model, k) for k in range(4)]
+    def test_another_arm_in_the_second_half(self) -> None:
+        runs = [recorded(k) for k in range(4)]
         scale = np.array([1.4, 0.8, 1.3, 0.7, 1.5, 0.8])
         runs[2:] = [replace(one, torque=scale * one.torque) for one in runs[2:]]
-        first = causes(model, runs)[0]
+        first = causes(runs)[0]
         assert first.fault.kind == "changed arm"
         assert first.fault.part is not None
         assert first.fault.part.words == "2.mcap and what follows it"

@@ -56,6 +56,13 @@ def truth() -> Array:
     return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
 
 
+def one_sine(time: Array, size: Any = (0.9, 1.2), phase: Any = (0.3, 1.1), **named: Any) -> Motion:
+    """One sine for each joint, with reversals at other times; `held_elbow` lets the second rest."""
+    if named.pop("held_elbow", False):
+        size = (size[0], 0.0)
+    return sine_motion(time, np.array(size), np.array([2.1, 3.7]), np.array(phase), **named)
+
+
 def four_sines(time: Array, speed: float = 1.0) -> Motion:
     """Four sines for each joint."""
     rng = np.random.default_rng(12)
