@@ -30,7 +30,7 @@ from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from tests.identification.robots import ur10
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
-from tests.sim_fixtures.conftest import MinimalPC
+from tests.sim_fixtures.bench import MinimalPC
 
 PERIOD = 0.001
 

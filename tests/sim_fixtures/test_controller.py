@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import pi
 from typing import Any
 
@@ -34,9 +33,9 @@ from sim_fixtures import (
 from sim_fixtures.controller import RUN_UP, OwnMotion
 from sim_fixtures.program import MISSING, Answer, LoopProgram, StartStep
 from tests.fault_matrix import small_cell
+from tests.sim_fixtures.bench import DRIVE, SMOOTH, TRUTH, make_drive, motor_matrix, play
 
 Array = NDArray[np.float64]
-Make = Callable[..., SimulatedController]
 Fields = dict[int, Any]
 """What is answered: field number 1..5 to values."""
 HOME = np.radians([0.0, -90.0, 180.0, 0.0, 90.0, 0.0])
@@ -44,19 +43,15 @@ NOISY = {"current_noise": 0.02, "current_resolution": 0.005}
 QUICK: dict[str, Any] = {"drive_off_cycles": 3, "driving_on_cycles": 4, "closed_cycles": 5}
 
 
-@pytest.fixture
-def make(drive: SimulatedDrive, truth: PlantTruth) -> Make:
-    def build(**changes: Any) -> SimulatedController:
-        options = {"drive": drive, "seed": 1, "initial_position": HOME} | {
-            k: changes.pop(k)
-            for k in ("drive", "seed", "initial_position", "stated", "effects")
-            if k in changes
-        }
-        settings = ControllerSettings(**(QUICK | changes))
-        physical = options.pop("drive")
-        return SimulatedController(ns16.urdf_text(), physical, truth, settings, **options)
-
-    return build
+def make(**changes: Any) -> SimulatedController:
+    options = {"drive": DRIVE, "seed": 1, "initial_position": HOME} | {
+        k: changes.pop(k)
+        for k in ("drive", "seed", "initial_position", "stated", "effects")
+        if k in changes
+    }
+    settings = ControllerSettings(**(QUICK | changes))
+    physical = options.pop("drive")
+    return SimulatedController(ns16.urdf_text(), physical, TRUTH, settings, **options)
 
 
 def receive(controller: SimulatedController) -> CyclicPacket:
@@ -95,7 +90,7 @@ def run_to(controller: SimulatedController, phase: Phase, limit: int = 3000) -> 
 
 
 class TestStart:
-    def test_nine_sync_packets_init_as_number_ten_and_two_more(self, make: Make) -> None:
+    def test_nine_sync_packets_init_as_number_ten_and_two_more(self) -> None:
         controller = make()
         packets = []
         while controller.phase is Phase.START:
@@ -107,24 +102,22 @@ class TestStart:
         assert [len(p) for p in packets] == [732] * 9 + [1200] + [732] * 2
         assert is_init(packets[9])
 
-    def test_init_tells_the_drive(self, make: Make, drive: SimulatedDrive) -> None:
+    def test_init_tells_the_drive(self) -> None:
         controller = make(cold_start=False)
         packet = controller.next_packet()
         assert packet is not None
         init = InitPacket.decode(packet)
         assert init.period == 0.001
         assert [(a.arm, a.axis, a.slot) for a in init.open_axes()] == [(1, i, i) for i in range(6)]
-        np.testing.assert_array_equal(init.gear_ratio[0, :6], np.float32(drive.gear_ratio))
-        np.testing.assert_array_equal(init.calibration[0, :6], np.float32(drive.calibration))
-        np.testing.assert_array_equal(init.current_limit[0, :6], np.float32(drive.current_limit))
+        np.testing.assert_array_equal(init.gear_ratio[0, :6], np.float32(DRIVE.gear_ratio))
+        np.testing.assert_array_equal(init.calibration[0, :6], np.float32(DRIVE.calibration))
+        np.testing.assert_array_equal(init.current_limit[0, :6], np.float32(DRIVE.current_limit))
         np.testing.assert_array_equal(
-            init.following_error[0, :6], np.float32(drive.following_error)
+            init.following_error[0, :6], np.float32(DRIVE.following_error)
         )
         assert init.wrist_coupling() == pytest.approx((0.03, -0.02, 0.035), rel=1e-7)
 
-    def test_what_is_announced_may_differ_from_what_is_there(
-        self, make: Make, make_drive: Callable[..., SimulatedDrive]
-    ) -> None:
+    def test_what_is_announced_may_differ_from_what_is_there(self) -> None:
         lying = make_drive(gear_ratio=[116.0, 116.0, -106.0, -50.0, 51.5, -33.0])
         told = make(cold_start=False, stated=lying)
         honest = make(cold_start=False)
@@ -136,7 +129,7 @@ class TestStart:
             run_to(controller, Phase.OPEN)
         np.testing.assert_array_equal(receive(told).axes, receive(honest).axes)
 
-    def test_modes_and_status_on_the_way_to_open(self, make: Make) -> None:
+    def test_modes_and_status_on_the_way_to_open(self) -> None:
         controller = make(opening_stagger=2)
         run_to(controller, Phase.DRIVE_OFF)
         seen: list[tuple[int, tuple[int, ...]]] = []
@@ -150,17 +143,15 @@ class TestStart:
         assert [modes.count(4) for _, modes in seen[3:]] == [1, 2, 3, 4, 5, 6]
         assert all(status == 5 for status, _ in seen[1:])
 
-    def test_before_the_drive_is_on_only_the_measurement_is_filled(
-        self, make: Make, drive: SimulatedDrive
-    ) -> None:
+    def test_before_the_drive_is_on_only_the_measurement_is_filled(self) -> None:
         controller = make(encoder_noise=0.0)
         run_to(controller, Phase.DRIVE_OFF)
         d = step(controller).axes["d"]
         np.testing.assert_array_equal(d[:, [0, 1, 3, 4]], 0.0)
-        measured = np.array(drive.motor_revolutions(HOME.tolist()))
-        np.testing.assert_allclose(d[:, 2], measured, atol=1.0 / drive.encoder_counts)
+        measured = np.array(DRIVE.motor_revolutions(HOME.tolist()))
+        np.testing.assert_allclose(d[:, 2], measured, atol=1.0 / DRIVE.encoder_counts)
 
-    def test_the_first_target_is_where_the_motors_stand(self, make: Make) -> None:
+    def test_the_first_target_is_where_the_motors_stand(self) -> None:
         controller = make()
         run_to(controller, Phase.OPENING)
         d = step(controller).axes["d"]
@@ -169,7 +160,7 @@ class TestStart:
 
 
 class TestOpenMode:
-    def test_targets_of_open_axes_are_taken_and_of_closed_axes_ignored(self, make: Make) -> None:
+    def test_targets_of_open_axes_are_taken_and_of_closed_axes_ignored(self) -> None:
         controller = make(opening_stagger=50)
         run_to(controller, Phase.OPENING)
         before = step(controller).axes["d"][:, 0].copy()
@@ -178,7 +169,7 @@ class TestOpenMode:
         after = receive(controller).axes["d"][:, 0]
         np.testing.assert_allclose(after - before, [0.001, 0, 0, 0, 0, 0], atol=1e-5)
 
-    def test_505_switches_the_drive_off_and_its_targets_are_ignored(self, make: Make) -> None:
+    def test_505_switches_the_drive_off_and_its_targets_are_ignored(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         resting = controller.plant.position.copy()
@@ -190,7 +181,7 @@ class TestOpenMode:
             step(controller)
         np.testing.assert_allclose(controller.plant.position, resting, atol=1e-4)
 
-    def test_508_in_one_slot_closes_all_and_targets_are_ignored(self, make: Make) -> None:
+    def test_508_in_one_slot_closes_all_and_targets_are_ignored(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         before = receive(controller)
@@ -201,7 +192,7 @@ class TestOpenMode:
         np.testing.assert_array_equal(after.axes["d"][:, 0], before.axes["d"][:, 0])
 
     @pytest.mark.parametrize("reply", [None, b"", b"\x05\x00\x00\x00", "stale"])
-    def test_a_missing_or_foreign_reply_ends_open_mode(self, make: Make, reply: Any) -> None:
+    def test_a_missing_or_foreign_reply_ends_open_mode(self, reply: Any) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         received = receive(controller)
@@ -213,13 +204,13 @@ class TestOpenMode:
         controller.accept(reply)
         np.testing.assert_array_equal(step(controller).axes["mode"], 0)
 
-    def test_a_packet_never_answered_counts_as_missing(self, make: Make) -> None:
+    def test_a_packet_never_answered_counts_as_missing(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         receive(controller)
         np.testing.assert_array_equal(receive(controller).axes["mode"], 0)
 
-    def test_a_jump_trips_the_drive_by_its_following_error(self, make: Make) -> None:
+    def test_a_jump_trips_the_drive_by_its_following_error(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         far = np.array(controller.servo.target)
@@ -234,7 +225,7 @@ class TestOpenMode:
 
 
 class TestEnd:
-    def test_finish_is_drive_off_then_504_then_nothing(self, make: Make) -> None:
+    def test_finish_is_drive_off_then_504_then_nothing(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         controller.finish()
@@ -247,7 +238,7 @@ class TestEnd:
         assert last.status[0] == 0
         assert controller.next_packet() is None
 
-    def test_numbers_wrap_after_0x7fff(self, make: Make) -> None:
+    def test_numbers_wrap_after_0x7fff(self) -> None:
         controller = make()
         run_to(controller, Phase.OPEN)
         controller._number = 0x7FFF
@@ -257,7 +248,7 @@ class TestEnd:
 
 
 class TestStandstill:
-    def test_the_arm_rests_while_the_servo_trembles(self, make: Make) -> None:
+    def test_the_arm_rests_while_the_servo_trembles(self) -> None:
         controller = make(**NOISY)
         run_to(controller, Phase.OPEN)
         for _ in range(300):
@@ -271,9 +262,9 @@ class TestStandstill:
         assert np.all(d[:, :, 4].std(axis=0) < 0.01 * np.array([16.5, 22.0, 9.5, 3.5, 7.0, 10.0]))
 
 
-def test_one_seed_is_one_run_bit_for_bit(play: Any, drive: SimulatedDrive) -> None:
+def test_one_seed_is_one_run_bit_for_bit() -> None:
     settings, effects = ControllerSettings(**NOISY), UnmodelledEffects.default_sizes(6)
-    logs = [play(drive, settings, seed=seed, effects=effects)[1] for seed in (3, 3, 4)]
+    logs = [play(DRIVE, settings, seed=seed, effects=effects)[1] for seed in (3, 3, 4)]
     first, again, other = (log.raw for log in logs)
     assert len(first) > 3000
     assert first == again
@@ -281,34 +272,28 @@ def test_one_seed_is_one_run_bit_for_bit(play: Any, drive: SimulatedDrive) -> No
 
 
 class TestFollowing:
-    def test_a_smooth_motion_is_followed_within_a_fifth_of_the_threshold(
-        self, play: Any, drive: SimulatedDrive, smooth_motion: Any
-    ) -> None:
-        controller, log = play(drive, ControllerSettings(**NOISY))
+    def test_a_smooth_motion_is_followed_within_a_fifth_of_the_threshold(self) -> None:
+        controller, log = play(DRIVE, ControllerSettings(**NOISY))
         assert controller.reason == ""
         d = log.axes["d"].astype(np.float64)
         error = np.abs(d[:, :, 0] - d[:, :, 2]).max(axis=0)
-        assert np.all(error < 0.2 * np.array(drive.following_error))
-        assert np.all(np.abs(d[:, :, 4]).max(axis=0) < 0.75 * np.array(drive.current_limit))
+        assert np.all(error < 0.2 * np.array(DRIVE.following_error))
+        assert np.all(np.abs(d[:, :, 4]).max(axis=0) < 0.75 * np.array(DRIVE.current_limit))
         # the arm really was where the motion wanted it, one cycle after the target was sent
-        np.testing.assert_allclose(log.q[1:], smooth_motion.q[:-1], atol=4e-3)
+        np.testing.assert_allclose(log.q[1:], SMOOTH.q[:-1], atol=4e-3)
         assert np.abs(log.qd).max() > 1.0
 
-    def test_the_stated_velocity_is_that_of_the_motion(
-        self, play: Any, drive: SimulatedDrive
-    ) -> None:
-        _, log = play(drive, ControllerSettings())
+    def test_the_stated_velocity_is_that_of_the_motion(self) -> None:
+        _, log = play(DRIVE, ControllerSettings())
         d = log.axes["d"].astype(np.float64)
         np.testing.assert_allclose(d[1:-1, :, 1], 0.5 * (d[2:, :, 0] - d[:-2, :, 0]), atol=2e-5)
         # D4 is the difference of the encoder positions of this packet and the one before
         np.testing.assert_allclose(d[1:, :, 3], d[1:, :, 2] - d[:-1, :, 2], atol=2e-5)
 
-    def test_extra_2_is_the_diagonal_inertia_on_the_joint_side(
-        self, play: Any, drive: SimulatedDrive, truth: PlantTruth
-    ) -> None:
+    def test_extra_2_is_the_diagonal_inertia_on_the_joint_side(self) -> None:
         import pinocchio as pin
 
-        controller, log = play(drive, ControllerSettings())
+        controller, log = play(DRIVE, ControllerSettings())
         k = 1500
         inertia = pin.crba(
             controller.plant.model, controller.plant.model.createData(), log.q[k]
@@ -317,7 +302,7 @@ class TestFollowing:
 
 
 @pytest.fixture(scope="module")
-def silent_run(play: Any, make_drive: Callable[..., SimulatedDrive]) -> Any:
+def silent_run() -> Any:
     """The smooth motion without noise, with encoders so fine that the servo is quiet too."""
     return play(make_drive(encoder_counts=2**30), ControllerSettings(encoder_noise=0.0))
 
@@ -356,19 +341,15 @@ class TestCurrentsAreTorques:
         scale = np.sqrt(np.mean(expected[10:-10] ** 2, axis=0))
         return np.sqrt((residual**2).sum(axis=0) / used.sum(axis=0)) / scale
 
-    def test_they_agree(
-        self, silent_run: Any, drive: SimulatedDrive, motor_matrix: Callable[..., Array]
-    ) -> None:
+    def test_they_agree(self, silent_run: Any) -> None:
         delay = silent_run[0].current_delay_cycles
-        assert np.all(self.residuals(silent_run, drive, motor_matrix(drive), delay) < 3e-4)
+        assert np.all(self.residuals(silent_run, DRIVE, motor_matrix(DRIVE), delay) < 3e-4)
 
-    def test_the_documented_delay_is_the_best_one(
-        self, silent_run: Any, drive: SimulatedDrive, motor_matrix: Callable[..., Array]
-    ) -> None:
+    def test_the_documented_delay_is_the_best_one(self, silent_run: Any) -> None:
         controller = silent_run[0]
         delays = controller.current_delay_cycles + np.linspace(-0.9, 0.9, 37)
-        turn = motor_matrix(drive)
-        cost = [np.sum(self.residuals(silent_run, drive, turn, d) ** 2) for d in delays]
+        turn = motor_matrix(DRIVE)
+        cost = [np.sum(self.residuals(silent_run, DRIVE, turn, d) ** 2) for d in delays]
         a, b, _ = np.polyfit(delays, cost, 2)
         assert a > 0.0
         assert -b / (2.0 * a) == pytest.approx(controller.current_delay_cycles, abs=0.01)
@@ -384,31 +365,26 @@ class TestCurrentsAreTorques:
         ],
     )
     def test_one_wrong_figure_in_the_conversion_shows(
-        self,
-        silent_run: Any,
-        drive: SimulatedDrive,
-        make_drive: Callable[..., SimulatedDrive],
-        motor_matrix: Callable[..., Array],
-        flip: dict[str, Any],
+        self, silent_run: Any, flip: dict[str, Any]
     ) -> None:
         delay = silent_run[0].current_delay_cycles
-        right = self.residuals(silent_run, drive, motor_matrix(drive), delay)
+        right = self.residuals(silent_run, DRIVE, motor_matrix(DRIVE), delay)
         wrong_drive = make_drive(**flip)
         wrong = self.residuals(silent_run, wrong_drive, motor_matrix(wrong_drive), delay)
         assert (wrong / right).max() > 50.0
 
 
-def test_sizes_must_match(drive: SimulatedDrive) -> None:
+def test_sizes_must_match() -> None:
     with pytest.raises(SettingError, match="6 axes"):
         SimulatedController(
-            ns16.urdf_text(), drive, PlantTruth.frictionless(np.ones(5)), ControllerSettings(),
+            ns16.urdf_text(), DRIVE, PlantTruth.frictionless(np.ones(5)), ControllerSettings(),
             seed=1,
         )  # fmt: skip
 
 
-def test_the_truth_is_at_hand_for_reports(make: Make, truth: PlantTruth) -> None:
+def test_the_truth_is_at_hand_for_reports() -> None:
     controller = make()
-    assert controller.truth is truth
+    assert controller.truth is TRUTH
     planted = controller.standard_parameters()
     for name, value in ns16.standard_parameters().items():
         assert planted[name] == pytest.approx(value, rel=1e-11, abs=1e-11), name
@@ -548,7 +524,7 @@ SPEED = np.array([2.0, 3.0])
 angles = st.floats(-2.0, 2.0)
 
 
-def play(motion: OwnMotion, limit: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
+def played(motion: OwnMotion, limit: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
     rows = []
     while not motion.finished:
         rows.append(tuple(part.copy() for part in motion.advance()))
@@ -565,7 +541,7 @@ def motion(*postures: tuple[float, float], start: tuple[float, float] = (0.0, 0.
 
 def test_each_posture_is_reached_exactly_and_rested_in() -> None:
     postures = [(0.5, -0.3), (-0.2, 0.4)]
-    q, qd = play(motion(*postures))
+    q, qd = played(motion(*postures))
     np.testing.assert_array_equal(q[-1], postures[1])
     np.testing.assert_array_equal(qd[-1], 0.0)
     resting = np.all(q == postures[0], axis=1)
@@ -577,7 +553,7 @@ def test_each_posture_is_reached_exactly_and_rested_in() -> None:
 def test_speed_and_acceleration_keep_their_bounds(
     there: tuple[float, float], start: tuple[float, float]
 ) -> None:
-    q, qd = play(motion(there, start=start))
+    q, qd = played(motion(there, start=start))
     assert np.all(np.abs(qd) <= SPEED * (1.0 + 1e-9))
     steps = np.diff(np.vstack((start, q)), axis=0) / PERIOD
     assert np.all(np.abs(steps) <= SPEED * (1.0 + 1e-6))
@@ -585,7 +561,7 @@ def test_speed_and_acceleration_keep_their_bounds(
 
 
 def test_the_stated_velocity_is_the_derivative_of_the_positions() -> None:
-    q, qd = play(motion((1.0, -1.0)))
+    q, qd = played(motion((1.0, -1.0)))
     np.testing.assert_allclose(qd[1:-1], (q[2:] - q[:-2]) / (2.0 * PERIOD), atol=1e-4)
 
 
@@ -594,7 +570,7 @@ def test_told_to_end_it_finishes_the_move_under_way_and_begins_no_other() -> Non
     while made.at_rest:
         made.advance()
     made.end()
-    q, _ = play(made)
+    q, _ = played(made)
     np.testing.assert_array_equal(q[-1], (0.5, 0.5))
 
 

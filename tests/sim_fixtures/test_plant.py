@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from math import pi
 from typing import Any
@@ -28,6 +27,7 @@ from sim_fixtures import (
 from sim_fixtures.arm import FrictionDrift, TorqueRipple
 from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
 from sim_fixtures.servo import INERTIA_CYCLES, CurrentLoop, NominalModel, Servo
+from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, make_drive, motor_matrix
 
 Array = NDArray[np.float64]
 START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
@@ -55,18 +55,18 @@ def swing(truth: PlantTruth, step: float, duration: float = 1.0) -> tuple[Plant,
     return plant, worst
 
 
-def test_energy_is_kept_to_second_order_in_the_step(frictionless: PlantTruth) -> None:
-    plant, worst = swing(frictionless, STEP)
+def test_energy_is_kept_to_second_order_in_the_step() -> None:
+    plant, worst = swing(FRICTIONLESS, STEP)
     kinetic = 0.5 * plant.velocity @ full_inertia(plant) @ plant.velocity
     assert kinetic > 100.0  # the fall is a real one
     assert worst < 2e-5 * kinetic
-    _, coarse = swing(frictionless, 2.0 * STEP)
+    _, coarse = swing(FRICTIONLESS, 2.0 * STEP)
     assert coarse / worst == pytest.approx(4.0, rel=0.2)
 
 
-def test_simulated_accelerations_need_the_torques_that_made_them(truth: PlantTruth) -> None:
+def test_simulated_accelerations_need_the_torques_that_made_them() -> None:
     """Inverse dynamics at the middle of a step: applied torque = rigid bodies + friction."""
-    plant = Plant(ns16.urdf_text(), truth, position=START)
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     rng = np.random.default_rng(3)
     plant.set_state(START, rng.uniform(0.3, 1.5, 6) * rng.choice([-1.0, 1.0], 6))
     torque = rng.uniform(-1.0, 1.0, 6) * [400.0, 600.0, 200.0, 30.0, 40.0, 30.0]
@@ -84,18 +84,18 @@ def test_simulated_accelerations_need_the_torques_that_made_them(truth: PlantTru
             smooth_steps += 1
             assert error.max() < 2e-3  # N m, of some hundred
             np.testing.assert_allclose(
-                plant.friction_torque, truth.friction(middle[1]), rtol=1e-3, atol=0.0
+                plant.friction_torque, TRUTH.friction(middle[1]), rtol=1e-3, atol=0.0
             )
         assert error.max() < 0.5  # also where a joint stops, turns or starts
         settled = straight
     assert smooth_steps > 50
 
 
-def test_rotors_count_as_armature(truth: PlantTruth, frictionless: PlantTruth) -> None:
-    with_rotors = Plant(ns16.urdf_text(), frictionless, position=START)
+def test_rotors_count_as_armature() -> None:
+    with_rotors = Plant(ns16.urdf_text(), FRICTIONLESS, position=START)
     without = Plant(ns16.urdf_text(), PlantTruth.frictionless(np.zeros(6)), position=START)
     difference = full_inertia(with_rotors) - full_inertia(without)
-    np.testing.assert_allclose(difference, np.diag(truth.rotor_inertia), atol=1e-12)
+    np.testing.assert_allclose(difference, np.diag(TRUTH.rotor_inertia), atol=1e-12)
     torque = gravity_torque(with_rotors) + 10.0
     for plant in (with_rotors, without):
         plant.step(torque, 1e-6)
@@ -104,9 +104,9 @@ def test_rotors_count_as_armature(truth: PlantTruth, frictionless: PlantTruth) -
         )
 
 
-def test_stiction_holds_a_resting_arm_for_good(truth: PlantTruth) -> None:
-    plant = Plant(ns16.urdf_text(), truth, position=START)
-    push = 0.95 * truth.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
+def test_stiction_holds_a_resting_arm_for_good() -> None:
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
+    push = 0.95 * TRUTH.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
     torque = gravity_torque(plant) + push
     for _ in range(4000):
         plant.step(torque, STEP)
@@ -115,19 +115,19 @@ def test_stiction_holds_a_resting_arm_for_good(truth: PlantTruth) -> None:
     np.testing.assert_allclose(plant.friction_torque, push, rtol=1e-9)
 
 
-def test_an_axis_breaks_loose_just_above_its_coulomb_torque(truth: PlantTruth) -> None:
+def test_an_axis_breaks_loose_just_above_its_coulomb_torque() -> None:
     for joint in range(6):
         for factor, moves in ((0.999, False), (1.02, True)):
-            plant = Plant(ns16.urdf_text(), truth, position=START)
+            plant = Plant(ns16.urdf_text(), TRUTH, position=START)
             torque = gravity_torque(plant)
-            torque[joint] += factor * truth.coulomb[joint]
+            torque[joint] += factor * TRUTH.coulomb[joint]
             for _ in range(10):
                 plant.step(torque, STEP)
             assert bool(plant.velocity[joint] > 0.0) is moves, (joint, factor)
 
 
-def test_a_pushed_arm_comes_to_rest_and_stays_there(truth: PlantTruth) -> None:
-    plant = Plant(ns16.urdf_text(), truth, position=START)
+def test_a_pushed_arm_comes_to_rest_and_stays_there() -> None:
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     plant.set_state(START, [0.4, -0.3, 0.5, 1.0, -1.0, 2.0])
     crossings = np.zeros(6)
     for _ in range(4000):
@@ -143,16 +143,16 @@ def test_a_pushed_arm_comes_to_rest_and_stays_there(truth: PlantTruth) -> None:
 
 
 @pytest.mark.parametrize("law", ["quadratic", "cubic"])
-def test_the_third_term_bends_friction_as_stated(truth: PlantTruth, law: str) -> None:
+def test_the_third_term_bends_friction_as_stated(law: str) -> None:
     third = np.full(6, -0.5)
-    bent = PlantTruth(truth.rotor_inertia, truth.coulomb, truth.viscous, third, law)
+    bent = PlantTruth(TRUTH.rotor_inertia, TRUTH.coulomb, TRUTH.viscous, third, law)
     v = np.array([2.0, -2.0, 1.0, -1.0, 0.5, 0.0])
     shape = np.sign(v) * v**2 if law == "quadratic" else v**3
-    np.testing.assert_allclose(bent.friction(v), truth.friction(v) + third * shape)
+    np.testing.assert_allclose(bent.friction(v), TRUTH.friction(v) + third * shape)
 
 
-def test_closed_brakes_stop_and_hold_the_arm(truth: PlantTruth) -> None:
-    plant = Plant(ns16.urdf_text(), truth, position=START, brake_torque=2000.0)
+def test_closed_brakes_stop_and_hold_the_arm() -> None:
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START, brake_torque=2000.0)
     plant.set_state(START, np.full(6, 2.0))
     plant.close_brakes(True)
     for _ in range(1000):
@@ -164,26 +164,26 @@ def test_closed_brakes_stop_and_hold_the_arm(truth: PlantTruth) -> None:
     assert plant.velocity.any()
 
 
-def test_warm_friction_is_scaled(truth: PlantTruth) -> None:
-    plant = Plant(ns16.urdf_text(), truth, position=START)
+def test_warm_friction_is_scaled() -> None:
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     plant.set_state(START, np.ones(6))
     plant.scale_friction(np.full(6, 0.5))
     plant.step(gravity_torque(plant), 1e-6)
-    np.testing.assert_allclose(plant.friction_torque, 0.5 * truth.friction(np.ones(6)), rtol=1e-6)
+    np.testing.assert_allclose(plant.friction_torque, 0.5 * TRUTH.friction(np.ones(6)), rtol=1e-6)
 
 
-def test_a_run_that_leaves_the_numbers_is_an_error(truth: PlantTruth) -> None:
-    plant = Plant(ns16.urdf_text(), truth, position=START)
+def test_a_run_that_leaves_the_numbers_is_an_error() -> None:
+    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     with pytest.raises(PlantDiverged):
         for _ in range(10):
             plant.step(np.full(6, np.nan), STEP)
 
 
-def test_links_have_the_planted_share_of_the_inertia_of_the_urdf(truth: PlantTruth) -> None:
+def test_links_have_the_planted_share_of_the_inertia_of_the_urdf() -> None:
     """Mass, first moment and tensor alike, whatever the arm does."""
     scale = np.array([1.2, 0.8, 1.1, 0.9, 1.15, 0.85])
-    plain = Plant(ns16.urdf_text(), truth).model
-    scaled = Plant(ns16.urdf_text(), replace(truth, inertia_scale=scale)).model
+    plain = Plant(ns16.urdf_text(), TRUTH).model
+    scaled = Plant(ns16.urdf_text(), replace(TRUTH, inertia_scale=scale)).model
     for body, own, factor in zip(
         list(scaled.inertias)[1:], list(plain.inertias)[1:], scale, strict=True
     ):
@@ -198,9 +198,9 @@ def test_nothing_is_on_unless_asked_for() -> None:
     assert not none.is_elastic
 
 
-def test_the_cell_file_documents_the_default_sizes(cell: dict[str, Any]) -> None:
+def test_the_cell_file_documents_the_default_sizes() -> None:
     sizes = UnmodelledEffects.default_sizes(6)
-    planted = cell["simulation"]
+    planted = CELL["simulation"]
     assert sizes.torque_ripple == planted["torque_ripple"]
     assert sizes.friction_drift == planted["friction_drift"]
     assert sizes.elasticity == tuple(planted["elasticity"])
@@ -235,8 +235,8 @@ def elastic(truth: PlantTruth, compliance: tuple[float, ...] = SOFT) -> ElasticP
     return ElasticPlant(ns16.urdf_text(), truth, elasticity=compliance, step=STEP, position=START)
 
 
-def test_springs_carry_gravity_from_the_start(truth: PlantTruth) -> None:
-    plant = elastic(truth)
+def test_springs_carry_gravity_from_the_start() -> None:
+    plant = elastic(TRUTH)
     gravity = pin.computeGeneralizedGravity(plant.model, plant.model.createData(), START)
     np.testing.assert_allclose(plant.motor_position - START, gravity * SOFT, atol=1e-15)
     for _ in range(200):
@@ -244,8 +244,8 @@ def test_springs_carry_gravity_from_the_start(truth: PlantTruth) -> None:
     np.testing.assert_allclose(plant.position, START, atol=1e-9)
 
 
-def test_only_elastic_axes_deflect(truth: PlantTruth) -> None:
-    plant = elastic(truth)
+def test_only_elastic_axes_deflect() -> None:
+    plant = elastic(TRUTH)
     rng = np.random.default_rng(1)
     for _ in range(300):
         plant.step(rng.normal(size=6) * 300.0, STEP)
@@ -254,9 +254,9 @@ def test_only_elastic_axes_deflect(truth: PlantTruth) -> None:
     assert np.all(np.abs(stretch[:3]) > 1e-6)
 
 
-def test_a_stiff_gear_is_a_rigid_one(truth: PlantTruth) -> None:
-    stiff = elastic(truth, (5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0))
-    rigid = Plant(ns16.urdf_text(), truth, position=START)
+def test_a_stiff_gear_is_a_rigid_one() -> None:
+    stiff = elastic(TRUTH, (5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0))
+    rigid = Plant(ns16.urdf_text(), TRUTH, position=START)
     for k in range(1000):
         torque = np.array([900.0, -300.0, 0.0, 5.0, 15.0, 8.0]) * np.sin(0.01 * k)
         stiff.step(torque, STEP)
@@ -266,8 +266,8 @@ def test_a_stiff_gear_is_a_rigid_one(truth: PlantTruth) -> None:
     np.testing.assert_allclose(stiff.position, rigid.position, atol=2e-3)
 
 
-def test_damped_springs_lose_energy_and_never_gain_it(frictionless: PlantTruth) -> None:
-    plant = elastic(frictionless)
+def test_damped_springs_lose_energy_and_never_gain_it() -> None:
+    plant = elastic(FRICTIONLESS)
     start = plant.energy()
     energies = []
     for _ in range(2000):
@@ -278,10 +278,10 @@ def test_damped_springs_lose_energy_and_never_gain_it(frictionless: PlantTruth) 
     assert start - 20.0 < energies[-1] < start
 
 
-def test_a_struck_link_rings_at_the_frequency_of_its_spring(truth: PlantTruth) -> None:
+def test_a_struck_link_rings_at_the_frequency_of_its_spring() -> None:
     """Motor held by its brake, link free: an oscillator with the link's own inertia."""
     plant = ElasticPlant(
-        ns16.urdf_text(), truth, elasticity=(1e-6, 0.0, 0.0, 0.0, 0.0, 0.0), step=STEP,
+        ns16.urdf_text(), TRUTH, elasticity=(1e-6, 0.0, 0.0, 0.0, 0.0, 0.0), step=STEP,
         position=START, brake_torque=1e5,
     )  # fmt: skip
     plant.close_brakes(True)
@@ -330,34 +330,28 @@ GRAVITY = (0.0, 0.0, -9.81)
 POSTURE = [0.2, -1.2, 2.5, 0.3, 1.0, 0.2]
 
 
-@pytest.fixture
-def make_servo(drive: SimulatedDrive, truth: PlantTruth) -> Callable[..., Servo]:
-    def make(resolution: float = 0.0, **gains: Any) -> Servo:
-        settings = ServoSettings(**gains)
-        model = NominalModel(
-            ns16.urdf_text(), truth, gravity=GRAVITY, error=settings.model_error,
-            rng=np.random.default_rng(2),
-        )  # fmt: skip
-        servo = Servo(drive, model, settings, period=0.001, current_resolution=resolution)
-        servo.start_at(drive.motor_revolutions(POSTURE))
-        return servo
-
-    return make
+def make_servo(resolution: float = 0.0, **gains: Any) -> Servo:
+    settings = ServoSettings(**gains)
+    model = NominalModel(
+        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=settings.model_error,
+        rng=np.random.default_rng(2),
+    )  # fmt: skip
+    servo = Servo(DRIVE, model, settings, period=0.001, current_resolution=resolution)
+    servo.start_at(DRIVE.motor_revolutions(POSTURE))
+    return servo
 
 
 def hold(servo: Servo) -> list[float]:
     return servo.advance(servo.target, [0.0] * 6)
 
 
-def test_a_servo_at_rest_asks_for_the_model_current_alone(make_servo: Callable[..., Servo]) -> None:
+def test_a_servo_at_rest_asks_for_the_model_current_alone() -> None:
     servo = make_servo()
     assert hold(servo) == servo.model_current
     assert servo.model_current[1] != 0.0  # gravity
 
 
-def test_an_error_of_position_calls_for_current_that_reduces_it(
-    make_servo: Callable[..., Servo],
-) -> None:
+def test_an_error_of_position_calls_for_current_that_reduces_it() -> None:
     servo = make_servo()
     target = [p + 0.01 for p in servo.measured]
     servo.advance(target, [0.0] * 6)
@@ -365,54 +359,48 @@ def test_an_error_of_position_calls_for_current_that_reduces_it(
     assert np.all(current > servo.model_current)  # positive current turns a motor forward
 
 
-def test_the_integral_takes_over_what_stays(make_servo: Callable[..., Servo]) -> None:
+def test_the_integral_takes_over_what_stays() -> None:
     servo = make_servo()
     target = [p + 0.01 for p in servo.measured]
     first, *_, last = [servo.advance(target, [0.0] * 6) for _ in range(50)]
     assert np.all(np.array(last) > np.array(first))
 
 
-def test_within_the_deadband_nothing_is_integrated(
-    make_servo: Callable[..., Servo], drive: SimulatedDrive
-) -> None:
+def test_within_the_deadband_nothing_is_integrated() -> None:
     servo = make_servo()
-    target = [p + 2.0 / drive.encoder_counts for p in servo.measured]
+    target = [p + 2.0 / DRIVE.encoder_counts for p in servo.measured]
     currents = [servo.advance(target, [0.0] * 6) for _ in range(50)]
     settled = currents[INERTIA_CYCLES + 1]  # the gains are those of the new posture by then
     np.testing.assert_allclose(currents[-1], settled, rtol=1e-12)
 
 
-def test_current_stays_within_its_limit_and_does_not_wind_up(
-    make_servo: Callable[..., Servo], drive: SimulatedDrive
-) -> None:
+def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
     servo = make_servo()
     home = list(servo.measured)
     far = [p + 20.0 for p in home]
     for _ in range(500):
         current = servo.advance(far, [0.0] * 6)
-        assert np.all(np.abs(current) <= drive.current_limit)
-    assert current == list(drive.current_limit)
+        assert np.all(np.abs(current) <= DRIVE.current_limit)
+    assert current == list(DRIVE.current_limit)
     servo.advance(home, [0.0] * 6)
     back = np.array(servo.advance(home, [0.0] * 6))
-    assert np.all(back < 0.5 * np.array(drive.current_limit))
+    assert np.all(back < 0.5 * np.array(DRIVE.current_limit))
 
 
-def test_target_currents_come_in_steps(make_servo: Callable[..., Servo]) -> None:
+def test_target_currents_come_in_steps() -> None:
     servo = make_servo(resolution=0.005)
     steps = np.array(hold(servo)) / 0.005
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
-def test_the_model_is_wrong_by_five_to_ten_per_cent(
-    drive: SimulatedDrive, truth: PlantTruth
-) -> None:
+def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
     model = NominalModel(
-        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.05, 0.10), rng=np.random.default_rng(3)
+        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.05, 0.10), rng=np.random.default_rng(3)
     )
-    off = np.abs(model.rotor_inertia / truth.rotor_inertia - 1.0)
+    off = np.abs(model.rotor_inertia / TRUTH.rotor_inertia - 1.0)
     assert np.all((off >= 0.05) & (off <= 0.10))
     exact = NominalModel(
-        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
+        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
     )
     q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
     truly = exact.torque(q, qd, qdd)
@@ -420,17 +408,17 @@ def test_the_model_is_wrong_by_five_to_ten_per_cent(
     assert 0.01 < error < 0.5
 
 
-def test_without_errors_the_model_is_the_plants(truth: PlantTruth) -> None:
+def test_without_errors_the_model_is_the_plants() -> None:
     import pinocchio as pin
 
     exact = NominalModel(
-        ns16.urdf_text(), truth, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
+        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
     )
     plain = pin.buildModelFromXML(ns16.urdf_text())
     q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
-    rigid = pin.rnea(plain, plain.createData(), q, qd, qdd) + truth.rotor_inertia * qdd
-    np.testing.assert_allclose(exact.torque(q, qd, qdd), rigid + truth.friction(qd), rtol=1e-12)
-    inertia = np.diag(pin.crba(plain, plain.createData(), q)) + truth.rotor_inertia
+    rigid = pin.rnea(plain, plain.createData(), q, qd, qdd) + TRUTH.rotor_inertia * qdd
+    np.testing.assert_allclose(exact.torque(q, qd, qdd), rigid + TRUTH.friction(qd), rtol=1e-12)
+    inertia = np.diag(pin.crba(plain, plain.createData(), q)) + TRUTH.rotor_inertia
     np.testing.assert_allclose(exact.diagonal_inertia(q), inertia, rtol=1e-12)
 
 
@@ -458,55 +446,49 @@ numbers = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
 
 
 @given(q=angles)
-def test_motor_positions_follow_the_formulas(
-    drive: SimulatedDrive, motor_matrix: Callable[[SimulatedDrive], Array], q: list[float]
-) -> None:
-    controller = np.array(q) * drive.joint_sign + drive.joint_offset
-    expected = motor_matrix(drive) @ controller + drive.calibration
-    np.testing.assert_allclose(drive.motor_revolutions(q), expected, rtol=1e-12, atol=1e-11)
+def test_motor_positions_follow_the_formulas(q: list[float]) -> None:
+    controller = np.array(q) * DRIVE.joint_sign + DRIVE.joint_offset
+    expected = motor_matrix(DRIVE) @ controller + DRIVE.calibration
+    np.testing.assert_allclose(DRIVE.motor_revolutions(q), expected, rtol=1e-12, atol=1e-11)
 
 
 @given(q=angles)
-def test_motor_to_joint_undoes_joint_to_motor(drive: SimulatedDrive, q: list[float]) -> None:
-    np.testing.assert_allclose(drive.joint_angles(drive.motor_revolutions(q)), q, atol=1e-12)
-    np.testing.assert_allclose(drive.joint_speeds(drive.motor_speeds(q)), q, atol=1e-12)
+def test_motor_to_joint_undoes_joint_to_motor(q: list[float]) -> None:
+    np.testing.assert_allclose(DRIVE.joint_angles(DRIVE.motor_revolutions(q)), q, atol=1e-12)
+    np.testing.assert_allclose(DRIVE.joint_speeds(DRIVE.motor_speeds(q)), q, atol=1e-12)
 
 
 @given(qd=angles, currents=numbers)
-def test_power_at_the_motors_is_power_at_the_joints(
-    drive: SimulatedDrive, qd: list[float], currents: list[float]
-) -> None:
-    motor_torque = np.array(currents) * drive.torque_constant
-    motor_speed = 2.0 * pi * np.array(drive.motor_speeds(qd))
-    joint_power = np.dot(drive.joint_torques(currents), qd)
+def test_power_at_the_motors_is_power_at_the_joints(qd: list[float], currents: list[float]) -> None:
+    motor_torque = np.array(currents) * DRIVE.torque_constant
+    motor_speed = 2.0 * pi * np.array(DRIVE.motor_speeds(qd))
+    joint_power = np.dot(DRIVE.joint_torques(currents), qd)
     assert joint_power == pytest.approx(motor_torque @ motor_speed, rel=1e-10, abs=1e-6)
 
 
 @given(torques=numbers)
-def test_currents_give_the_torques_asked_for(drive: SimulatedDrive, torques: list[float]) -> None:
+def test_currents_give_the_torques_asked_for(torques: list[float]) -> None:
     np.testing.assert_allclose(
-        drive.joint_torques(drive.currents(torques)), torques, rtol=1e-12, atol=1e-10
+        DRIVE.joint_torques(DRIVE.currents(torques)), torques, rtol=1e-12, atol=1e-10
     )
 
 
-def test_coupling_acts_on_4_and_5_and_nowhere_else(
-    drive: SimulatedDrive, make_drive: Callable[..., SimulatedDrive]
-) -> None:
+def test_coupling_acts_on_4_and_5_and_nowhere_else() -> None:
     plain = make_drive(k54=0.0, k64=0.0, k65=0.0)
     one_ampere = [1.0] * 6
-    difference = np.subtract(drive.joint_torques(one_ampere), plain.joint_torques(one_ampere))
+    difference = np.subtract(DRIVE.joint_torques(one_ampere), plain.joint_torques(one_ampere))
     np.testing.assert_allclose(difference[[0, 1, 2, 5]], 0.0, atol=0.0)
     assert np.all(np.abs(difference[[3, 4]]) > 0.1)
 
 
-def test_encoders_read_whole_counts(drive: SimulatedDrive) -> None:
+def test_encoders_read_whole_counts() -> None:
     positions = [0.1, -2.34567, 57.0000001, 3.0, -0.00001, 12.5]
-    read = np.array(drive.encoder(positions, [0.0] * 6))
-    counts = read * drive.encoder_counts
+    read = np.array(DRIVE.encoder(positions, [0.0] * 6))
+    counts = read * DRIVE.encoder_counts
     np.testing.assert_array_equal(counts, np.round(counts))
-    assert np.abs(read - positions).max() <= 0.5 / drive.encoder_counts
-    shifted = np.array(drive.encoder(positions, [2.0] * 6))
-    np.testing.assert_allclose((shifted - read) * drive.encoder_counts, 2.0, atol=1e-6)
+    assert np.abs(read - positions).max() <= 0.5 / DRIVE.encoder_counts
+    shifted = np.array(DRIVE.encoder(positions, [2.0] * 6))
+    np.testing.assert_allclose((shifted - read) * DRIVE.encoder_counts, 2.0, atol=1e-6)
 
 
 def test_an_arm_without_a_wrist_needs_no_coupling() -> None:
@@ -516,12 +498,6 @@ def test_an_arm_without_a_wrist_needs_no_coupling() -> None:
 
 
 TWO = (1.0, 1.0)
-SIX = (1.0,) * 6
-DRIVE = {
-    **dict.fromkeys(("calibration", "joint_sign", "joint_offset"), SIX),
-    **dict.fromkeys(("gear_ratio", "torque_constant", "current_limit", "following_error"), SIX),
-    "encoder_counts": 4096,
-}
 SIMPLE = PlantTruth.frictionless(np.ones(6))
 
 
@@ -554,7 +530,7 @@ SIMPLE = PlantTruth.frictionless(np.ones(6))
             for gain in ({"position_gain": 0.0}, {"current_lag": -1.0}, {"model_error": (0.2, 0.1)})
         ),
         *(
-            (lambda change=change: SimulatedDrive(**{**DRIVE, **change}), next(iter(change)))
+            (lambda change=change: make_drive(**change), next(iter(change)))
             for change in (
                 {"gear_ratio": [100.0] * 5 + [0.0]},
                 {"calibration": [0.0] * 5},

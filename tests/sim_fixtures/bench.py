@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import pi, radians
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from drivers.packets import CyclicPacket, Mode, echo, is_init, next_number
@@ -26,64 +24,32 @@ Array = NDArray[np.float64]
 PERIOD = 0.001
 
 
-@pytest.fixture(scope="session")
-def cell() -> dict[str, Any]:
-    with ns16.CELL_PATH.open("rb") as stream:
-        return tomllib.load(stream)
+CELL: dict[str, Any] = tomllib.loads(ns16.CELL_PATH.read_text("utf-8"))
 
 
-@pytest.fixture(scope="session")
-def make_drive(cell: dict[str, Any]) -> Callable[..., SimulatedDrive]:
-    table = cell["drive_train"]
-
-    def make(**changes: Any) -> SimulatedDrive:
-        figures = {
-            "gear_ratio": table["gear_ratio"],
-            "calibration": table["calibration"],
-            "joint_sign": table["joint_sign"],
-            "joint_offset": [radians(a) for a in table["joint_offset_deg"]],
-            "torque_constant": table["torque_constant"],
-            "current_limit": table["current_limit"],
-            "following_error": table["following_error"],
-            "encoder_counts": table["encoder_counts_per_revolution"],
-            "k54": table["k54"],
-            "k64": table["k64"],
-            "k65": table["k65"],
-        }
-        return SimulatedDrive(**(figures | changes))
-
-    return make
+def make_drive(**changes: Any) -> SimulatedDrive:
+    """The drive of the cell file, with these figures changed."""
+    table = CELL["drive_train"]
+    same = ("gear_ratio", "calibration", "joint_sign", "torque_constant", "current_limit")
+    figures = {name: table[name] for name in (*same, "following_error", "k54", "k64", "k65")}
+    figures["joint_offset"] = [radians(a) for a in table["joint_offset_deg"]]
+    figures["encoder_counts"] = table["encoder_counts_per_revolution"]
+    return SimulatedDrive(**(figures | changes))
 
 
-@pytest.fixture(scope="session")
-def drive(make_drive: Callable[..., SimulatedDrive]) -> SimulatedDrive:
-    return make_drive()
-
-
-@pytest.fixture(scope="session")
-def truth(cell: dict[str, Any]) -> PlantTruth:
-    planted = cell["simulation"]
-    names = ("rotor_inertia", "coulomb", "viscous", "third")
-    return PlantTruth(*(np.array(planted[name]) for name in names))
-
-
-@pytest.fixture(scope="session")
-def frictionless(truth: PlantTruth) -> PlantTruth:
-    return PlantTruth.frictionless(truth.rotor_inertia)
-
-
-@pytest.fixture(scope="session")
-def motor_matrix() -> Callable[[SimulatedDrive], Array]:
+def motor_matrix(drive: SimulatedDrive) -> Array:
     """Motor revolutions per radian of *controller* angle as a matrix, written from the formulas."""
+    rows = np.eye(6)
+    rows[4, 3] = -drive.k54
+    rows[5, 3] = drive.k65 * drive.k54 - drive.k64
+    rows[5, 4] = -drive.k65
+    return np.diag(drive.gear_ratio) @ rows / (2.0 * pi)
 
-    def matrix(drive: SimulatedDrive) -> Array:
-        rows = np.eye(6)
-        rows[4, 3] = -drive.k54
-        rows[5, 3] = drive.k65 * drive.k54 - drive.k64
-        rows[5, 4] = -drive.k65
-        return np.diag(drive.gear_ratio) @ rows / (2.0 * pi)
 
-    return matrix
+DRIVE = make_drive()
+_PLANTED = [CELL["simulation"][name] for name in ("rotor_inertia", "coulomb", "viscous", "third")]
+TRUTH = PlantTruth(*map(np.array, _PLANTED))
+FRICTIONLESS = PlantTruth.frictionless(TRUTH.rotor_inertia)
 
 
 @dataclass
@@ -96,8 +62,7 @@ class SmoothMotion:
     qdd: Array
 
 
-@pytest.fixture(scope="session")
-def smooth_motion() -> SmoothMotion:
+def _smooth_motion() -> SmoothMotion:
     """Three seconds within the NS 16's limits at up to about a third of its speeds."""
     duration, n = 3.0, int(3.0 / PERIOD)
     t = np.arange(n + 1) * PERIOD
@@ -117,6 +82,9 @@ def smooth_motion() -> SmoothMotion:
         * (np.cos(angle) * rate[:, None] - turns * np.sin(angle) * window[:, None] ** 2)
     )
     return SmoothMotion(t, q, qd, qdd)
+
+
+SMOOTH = _smooth_motion()
 
 
 @dataclass
@@ -166,35 +134,25 @@ class MinimalPC:
         return Log(np.array(axes), np.array(q), np.array(qd), raw)
 
 
-@pytest.fixture(scope="session")
 def play(
-    truth: PlantTruth, smooth_motion: SmoothMotion, motor_matrix: Callable[..., Array]
-) -> Callable[..., tuple[SimulatedController, Log]]:
-    """Play the smooth motion on a fresh NS 16 and return the controller and the log."""
-
-    def run(
-        drive: SimulatedDrive,
-        settings: ControllerSettings,
-        *,
-        seed: int = 7,
-        effects: UnmodelledEffects | None = None,
-        motion: SmoothMotion = smooth_motion,
-        **options: Any,
-    ) -> tuple[SimulatedController, Log]:
-        controller = SimulatedController(
-            ns16.urdf_text(),
-            drive,
-            truth,
-            settings,
-            seed=seed,
-            effects=effects or UnmodelledEffects(),
-            initial_position=motion.q[0],
-            **options,
-        )
-        turn = motor_matrix(drive)
-        angles = motion.q * drive.joint_sign + drive.joint_offset
-        targets = angles @ turn.T + drive.calibration
-        deltas = (motion.qd * drive.joint_sign) @ turn.T * PERIOD
-        return controller, MinimalPC(controller, targets, deltas).run()
-
-    return run
+    drive: SimulatedDrive,
+    settings: ControllerSettings,
+    *,
+    seed: int = 7,
+    effects: UnmodelledEffects | None = None,
+) -> tuple[SimulatedController, Log]:
+    """Play the smooth motion on a fresh NS 16; the controller and the log."""
+    controller = SimulatedController(
+        ns16.urdf_text(),
+        drive,
+        TRUTH,
+        settings,
+        seed=seed,
+        effects=effects or UnmodelledEffects(),
+        initial_position=SMOOTH.q[0],
+    )
+    turn = motor_matrix(drive)
+    angles = SMOOTH.q * drive.joint_sign + drive.joint_offset
+    targets = angles @ turn.T + drive.calibration
+    deltas = (SMOOTH.qd * drive.joint_sign) @ turn.T * PERIOD
+    return controller, MinimalPC(controller, targets, deltas).run()
