@@ -17,7 +17,7 @@ from planner.errors import UnsupportedSolver
 from planner.interpolator import corner
 from planner.piecewise_cubic import Block
 from planner.straight import StraightMoves, rest_to_rest
-from tests.planner.conftest import legs_between, rows_of
+from tests.planner.six_axes import SIX_AXES, join, legs_between, random_points, rows_of
 
 magnitude = st.floats(-3.0, 3.0).map(lambda exponent: 10.0**exponent)
 
@@ -54,25 +54,25 @@ def test_the_line_is_straight_whichever_joint_is_slowest():
     assert np.all(extrema.jerk <= limits.jerk * (1 + 1e-12))
 
 
-def test_it_equals_ruckig_where_ruckig_keeps_the_phase(six_axis_limits, random_points):
+def test_it_equals_ruckig_where_ruckig_keeps_the_phase():
     start, end = random_points(3, 2)
     problem = ruckig.InputParameter(6)
     problem.synchronization = ruckig.Synchronization.Phase
     problem.current_position, problem.target_position = start, end
-    problem.max_velocity = six_axis_limits.velocity
-    problem.max_acceleration = six_axis_limits.acceleration
-    problem.max_jerk = six_axis_limits.jerk
+    problem.max_velocity = SIX_AXES.velocity
+    problem.max_acceleration = SIX_AXES.acceleration
+    problem.max_jerk = SIX_AXES.jerk
     solution = ruckig.Trajectory(6)
     ruckig.Ruckig(6).calculate(problem, solution)
-    motion = straight_table(straight(start, end, six_axis_limits))
+    motion = straight_table(straight(start, end, SIX_AXES))
     assert motion.duration == pytest.approx(solution.duration)
     for t in np.linspace(0.0, motion.duration, 50):
         for ours, theirs in zip(motion.sample_one(t), solution.at_time(t), strict=True):
             np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
 
-def test_states_and_parts_are_those_of_the_whole(six_axis_limits, random_points):
-    moves = straight(*random_points(4, 2), six_axis_limits)
+def test_states_and_parts_are_those_of_the_whole():
+    moves = straight(*random_points(4, 2), SIX_AXES)
     motion, duration = straight_table(moves), float(moves.durations[0])
     for t in (0.0, 0.05, 0.4, duration):
         state = np.stack(motion.sample_one(t), axis=1)
@@ -84,17 +84,17 @@ def test_states_and_parts_are_those_of_the_whole(six_axis_limits, random_points)
         np.testing.assert_allclose(ours, whole, atol=1e-12)
 
 
-def test_a_deceleration_of_its_own_bounds_the_second_ramp(six_axis_limits, random_points):
+def test_a_deceleration_of_its_own_bounds_the_second_ramp():
     start, end = random_points(6, 2)
-    slowing = six_axis_limits.acceleration / np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    moves = straight(start, end, six_axis_limits, slowing)
+    slowing = SIX_AXES.acceleration / np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    moves = straight(start, end, SIX_AXES, slowing)
     assert moves.slowing_down > moves.speeding_up
     up = straight_table(moves, 0.0, moves.speeding_up[0]).extrema().acceleration
     down = straight_table(moves, moves.durations[0] - moves.slowing_down[0]).extrema().acceleration
     # On a line the ratio between the joints is fixed: one of them reaches its bound.
-    assert np.max(up / six_axis_limits.acceleration) == pytest.approx(1.0)
+    assert np.max(up / SIX_AXES.acceleration) == pytest.approx(1.0)
     assert np.max(down / slowing) == pytest.approx(1.0)
-    alike = straight(start, end, six_axis_limits)
+    alike = straight(start, end, SIX_AXES)
     assert alike.speeding_up == pytest.approx(moves.speeding_up)
 
 
@@ -162,11 +162,11 @@ def cut(points, limits, share):
 
 
 @pytest.mark.parametrize("fly", [0.05, 0.1, 0.5, 1.0])
-def test_a_join_begins_and_ends_exactly_in_its_states(six_axis_limits, random_points, join, fly):
+def test_a_join_begins_and_ends_exactly_in_its_states(fly):
     # The solver by itself is content with 1e-8 rad, which millisecond samples turn into jerk.
     for seed in range(20):
-        start, end, time = cut(random_points(seed, 3), six_axis_limits, fly)
-        joined = join(start, end, six_axis_limits, time)
+        start, end, time = cut(random_points(seed, 3), SIX_AXES, fly)
+        joined = join(start, end, SIX_AXES, time)
         assert joined is not None
         ends = np.array([table[-1] for table in joined.ends()])
         starts = np.array([table[0, :3] for table in joined.coefficients])
@@ -189,40 +189,36 @@ class Solver:
 
 @pytest.mark.parametrize("quantity", [1, 2])
 @pytest.mark.parametrize("which", [0, 1])
-def test_states_near_the_limits_never_reach_the_solver(
-    six_axis_limits, join, monkeypatch, quantity, which
-):
+def test_states_near_the_limits_never_reach_the_solver(monkeypatch, quantity, which):
     monkeypatch.setattr("planner.corners.ruckig.Ruckig", Solver)
     states = np.zeros((2, 6, 3))
-    bound = (six_axis_limits.velocity, six_axis_limits.acceleration)[quantity - 1]
+    bound = (SIX_AXES.velocity, SIX_AXES.acceleration)[quantity - 1]
     states[which, 3, quantity] = -0.995 * bound[3]
-    assert join(*states, six_axis_limits, 0.4) is None
+    assert join(*states, SIX_AXES, 0.4) is None
 
 
 @pytest.mark.parametrize("error", [ruckig.RuckigError, ValueError])
-def test_whatever_the_solver_raises_the_motion_stops(
-    six_axis_limits, random_points, monkeypatch, error
-):
+def test_whatever_the_solver_raises_the_motion_stops(monkeypatch, error):
     # A number of an error that its Python face does not know is a ValueError.
     monkeypatch.setattr(Solver, "error", error("-101 is not a valid Result"))
     monkeypatch.setattr("planner.corners.ruckig.Ruckig", Solver)
-    assert flown(random_points(4, 3), six_axis_limits) is STOP
+    assert flown(random_points(4, 3), SIX_AXES) is STOP
 
 
-def test_a_join_beyond_a_position_limit_is_tightened(six_axis_limits, random_points):
+def test_a_join_beyond_a_position_limit_is_tightened():
     tightened = 0
     for seed in range(300):
         points = random_points(seed, 3)
         # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
-        points[1] = six_axis_limits.upper
-        passed = flown(points, six_axis_limits, 1.0)
+        points[1] = SIX_AXES.upper
+        passed = flown(points, SIX_AXES, 1.0)
         if passed.join is not None:
-            assert np.all(passed.join.extrema().upper <= six_axis_limits.upper + 1e-9)
+            assert np.all(passed.join.extrema().upper <= SIX_AXES.upper + 1e-9)
         tightened += passed.share < 0.89
     assert tightened > 0
 
 
-def test_a_corner_slower_than_a_stop_is_given_up(six_axis_limits, random_points, monkeypatch):
+def test_a_corner_slower_than_a_stop_is_given_up(monkeypatch):
     points, asked = random_points(1, 3), []
 
     def slow(starts, *rest):
@@ -231,16 +227,14 @@ def test_a_corner_slower_than_a_stop_is_given_up(six_axis_limits, random_points,
         return found._replace(durations=np.full(len(starts), 10.0))
 
     monkeypatch.setattr("planner.corners.solve_many", slow)
-    assert flown(points, six_axis_limits) is STOP
+    assert flown(points, SIX_AXES) is STOP
     parts = FIRST_SHARES + LAST_SHARES
-    tried = [cut(points, six_axis_limits, 0.5 * part)[0] for part in parts]
+    tried = [cut(points, SIX_AXES, 0.5 * part)[0] for part in parts]
     np.testing.assert_array_equal(asked, tried)
 
 
 @pytest.mark.parametrize("missed", [1.2, np.inf], ids=["too slow", "unknown"])
-def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(
-    six_axis_limits, random_points, monkeypatch, missed
-):
+def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch, missed):
     def misses_the_first(*asked):
         found = solve_many(*asked)
         # What was seen to happen: a join much longer than need be, still shorter than to stop.
@@ -248,7 +242,7 @@ def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(
         return found
 
     monkeypatch.setattr("planner.corners.solve_many", misses_the_first)
-    passed = flown(random_points(1, 3), six_axis_limits)
+    passed = flown(random_points(1, 3), SIX_AXES)
     assert (passed.how, passed.share) == ("reduced", 0.5 * 0.9999)
     assert passed.join is not None
 
@@ -275,12 +269,12 @@ def test_the_corner_asked_for_comes_first_among_equals(savings, order):
 
 
 @pytest.mark.parametrize("distance", [1e-6, 1e-3, 0.05, 0.3, 10.0])
-def test_a_corner_within_a_distance_uses_most_of_it(six_axis_limits, random_points, distance):
+def test_a_corner_within_a_distance_uses_most_of_it(distance):
     used = []
     for seed in range(25):
         points = random_points(seed, 3)
-        passed = corner(legs_between(points, six_axis_limits), FlyDistance(distance))
-        whole = flown(points, six_axis_limits, 1.0)
+        passed = corner(legs_between(points, SIX_AXES), FlyDistance(distance))
+        whole = flown(points, SIX_AXES, 1.0)
         assert passed.join is not None and whole.join is not None
         q = passed.join.sample(np.linspace(0.0, passed.join.duration, 20001))[0]
         nearest = np.linalg.norm(q - points[1], axis=1).min()
@@ -290,24 +284,22 @@ def test_a_corner_within_a_distance_uses_most_of_it(six_axis_limits, random_poin
 
 
 @pytest.mark.parametrize("version", ["0.20.1", "0.1.9", "unknown", "0.19.9"])
-def test_no_corner_is_planned_with_an_unknown_solver(
-    six_axis_limits, random_points, monkeypatch, version
-):
+def test_no_corner_is_planned_with_an_unknown_solver(monkeypatch, version):
     monkeypatch.setattr("planner.corners._VERSION", version)
     points = random_points(3, 3)
-    assert flown(points, six_axis_limits, 0.0) is STOP
+    assert flown(points, SIX_AXES, 0.0) is STOP
     if version == "0.19.9":
-        assert flown(points, six_axis_limits).how == "flown"
+        assert flown(points, SIX_AXES).how == "flown"
     else:
         with pytest.raises(UnsupportedSolver, match=rf"{version}.*0\.19"):
-            flown(points, six_axis_limits)
+            flown(points, SIX_AXES)
 
 
-def test_nothing_is_cut_from_a_stop(six_axis_limits, random_points):
+def test_nothing_is_cut_from_a_stop():
     a, b, c = random_points(6, 3)
     for fly in (Stop(), FlyPercent(0.0), FlyDistance(0.0)):
-        assert corner(legs_between(np.array([a, b, c]), six_axis_limits), fly) is STOP
-    assert flown(np.array([a, b, b]), six_axis_limits) is STOP
+        assert corner(legs_between(np.array([a, b, c]), SIX_AXES), fly) is STOP
+    assert flown(np.array([a, b, b]), SIX_AXES) is STOP
 
 
 numbers = st.floats(-3.0, 3.0)
@@ -325,11 +317,11 @@ class TestPassing:
         assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
         assert passed.distance == pytest.approx(0.5, abs=1e-12)
 
-    def test_a_point_on_the_path_is_met(self, six_axis_limits, random_points):
+    def test_a_point_on_the_path_is_met(self):
         # As long as a join, at rest at one end, at both, or at neither.
         points = random_points(1, 3)
-        joined = flown(points, six_axis_limits).join
-        start, stop = (plan(points[k : k + 2], six_axis_limits) for k in (0, 1))
+        joined = flown(points, SIX_AXES).join
+        start, stop = (plan(points[k : k + 2], SIX_AXES) for k in (0, 1))
         for motion in (joined, start, stop):
             for time in np.linspace(0.01, 0.99, 37) * motion.duration:
                 here = motion.sample_one(time)[0]

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from planner import InvalidSetting, InvalidTrajectory, LimitExceeded, TrajectoryPlayer, check_limits
 from planner.fourier import FourierSeries, harmonic_bounds, supremum
+from tests.planner.six_axes import SIX_AXES
 
 
 @st.composite
@@ -210,11 +211,9 @@ def test_refuses_stored_data_that_are_no_series(damage):
 
 @given(st.integers(0, 10**6), st.integers(1, 5))
 @settings(max_examples=25)
-def test_bare_series_inside_the_papers_bounds_keep_position_and_acceleration(
-    six_axis_limits, seed, harmonics
-):
+def test_bare_series_inside_the_papers_bounds_keep_position_and_acceleration(seed, harmonics):
     random = np.random.default_rng(seed)
-    limits = six_axis_limits
+    limits = SIX_AXES
     offset = limits.lower + random.uniform(0.05, 0.95, 6) * (limits.upper - limits.lower)
     bounds = harmonic_bounds(limits, offset, harmonics)
     shares = random.uniform(-1.0, 1.0, (2, 6, harmonics))
@@ -224,21 +223,21 @@ def test_bare_series_inside_the_papers_bounds_keep_position_and_acceleration(
     assert np.all(extrema.acceleration <= limits.acceleration)
 
 
-def test_the_papers_bounds_are_the_largest_of_their_kind(six_axis_limits):
-    bounds = harmonic_bounds(six_axis_limits, np.zeros(6), 1)
+def test_the_papers_bounds_are_the_largest_of_their_kind():
+    bounds = harmonic_bounds(SIX_AXES, np.zeros(6), 1)
     on_bounds = FourierSeries(np.zeros(6), bounds.amplitude[:, None], bounds.frequency[:, None], 60)
     extrema = on_bounds.extrema()
-    room = np.minimum(six_axis_limits.upper, -six_axis_limits.lower)
+    room = np.minimum(SIX_AXES.upper, -SIX_AXES.lower)
     np.testing.assert_allclose(extrema.upper, room, rtol=1e-9)
-    np.testing.assert_allclose(extrema.acceleration, six_axis_limits.acceleration, rtol=1e-9)
+    np.testing.assert_allclose(extrema.acceleration, SIX_AXES.acceleration, rtol=1e-9)
 
 
-def test_the_papers_bounds_need_an_offset_inside_the_limits(six_axis_limits):
-    for offset in (six_axis_limits.upper, six_axis_limits.lower - 1.0, [0.0], [np.nan] * 6):
+def test_the_papers_bounds_need_an_offset_inside_the_limits():
+    for offset in (SIX_AXES.upper, SIX_AXES.lower - 1.0, [0.0], [np.nan] * 6):
         with pytest.raises(InvalidSetting):
-            harmonic_bounds(six_axis_limits, offset, 3)
+            harmonic_bounds(SIX_AXES, offset, 3)
     with pytest.raises(InvalidSetting):
-        harmonic_bounds(six_axis_limits, np.zeros(6), 0)
+        harmonic_bounds(SIX_AXES, np.zeros(6), 0)
 
 
 def executable(limits, seed: int) -> FourierSeries:
@@ -255,19 +254,19 @@ def executable(limits, seed: int) -> FourierSeries:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_limits_are_checked_as_those_of_any_other_motion(six_axis_limits, seed):
-    motion = executable(six_axis_limits, seed)
-    check_limits(motion, six_axis_limits)
-    worst = int(np.argmax(ratios(motion, six_axis_limits)))
+def test_limits_are_checked_as_those_of_any_other_motion(seed):
+    motion = executable(SIX_AXES, seed)
+    check_limits(motion, SIX_AXES)
+    worst = int(np.argmax(ratios(motion, SIX_AXES)))
     name = ("velocity", "acceleration", "jerk")[worst]
     with pytest.raises(LimitExceeded, match=name):
-        check_limits(motion, six_axis_limits.scaled(**{name: 1.0 - 1e-8}))
+        check_limits(motion, SIX_AXES.scaled(**{name: 1.0 - 1e-8}))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_player_plays_it_and_its_set_points_keep_the_limits(six_axis_limits, seed):
-    motion, period = executable(six_axis_limits, seed), 0.002
-    player = TrajectoryPlayer(motion, period, six_axis_limits)
+def test_a_player_plays_it_and_its_set_points_keep_the_limits(seed):
+    motion, period = executable(SIX_AXES, seed), 0.002
+    player = TrajectoryPlayer(motion, period, SIX_AXES)
     player.begin(player.start)
     rows = [player.start] * 3
     while not player.finished:
@@ -275,26 +274,26 @@ def test_a_player_plays_it_and_its_set_points_keep_the_limits(six_axis_limits, s
     rows += [rows[-1]] * 3
     for order, name in ((1, "velocity"), (2, "acceleration"), (3, "jerk")):
         rate = np.abs(np.diff(rows, order, axis=0)) / period**order
-        assert np.all(rate <= getattr(six_axis_limits, name) * (1 + 1e-5)), name
+        assert np.all(rate <= getattr(SIX_AXES, name) * (1 + 1e-5)), name
     np.testing.assert_allclose(rows[-1], motion.offset, atol=1e-15)
 
 
-def test_sines_too_fast_to_be_bounded_are_refused_and_absent_ones_do_not_matter(six_axis_limits):
+def test_sines_too_fast_to_be_bounded_are_refused_and_absent_ones_do_not_matter():
     amplitude = np.zeros((6, 2))
     amplitude[:, 0] = 0.01
     frequency = np.full((6, 2), 0.5)
     frequency[3, 1] = 1e70
-    middle = (six_axis_limits.lower + six_axis_limits.upper) / 2.0
+    middle = (SIX_AXES.lower + SIX_AXES.upper) / 2.0
     for ramp in (0.0, 1.0):
-        check_limits(FourierSeries(middle, amplitude, frequency, 9.0, ramp), six_axis_limits)
+        check_limits(FourierSeries(middle, amplitude, frequency, 9.0, ramp), SIX_AXES)
     amplitude[3, 1] = 1e-9
     for ramp in (0.0, 1.0):
         with pytest.raises(LimitExceeded, match="joint 3"):
-            check_limits(FourierSeries(middle, amplitude, frequency, 9.0, ramp), six_axis_limits)
+            check_limits(FourierSeries(middle, amplitude, frequency, 9.0, ramp), SIX_AXES)
 
 
-def test_one_time_and_many_times_are_the_same(six_axis_limits):
-    motion = executable(six_axis_limits, 7)
+def test_one_time_and_many_times_are_the_same():
+    motion = executable(SIX_AXES, 7)
     for t in (-1.0, 0.0, 1.3, 12.0, motion.duration, 1e3):
         for one, many in zip(motion.sample_one(t), motion.sample(np.array([t, 0.5])), strict=True):
             np.testing.assert_array_equal(one, many[0])

@@ -20,6 +20,7 @@ from planner.interpolator import Interpolator, corner
 from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
 from planner.rrs import AccelerationKind, EventKind, FlybyCriterion, SpeedCorrection, Status
 from planner.worker import in_child
+from tests.planner.six_axes import SIX_AXES, random_points
 
 PERIOD = 0.002
 
@@ -73,15 +74,13 @@ def worst_ratios(start, q, limits, period=PERIOD):
 
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 10.0, 50.0, 100.0]), st.integers(2, 6))
 @settings(max_examples=20, deadline=None)
-def test_targets_queued_at_once_are_the_plan_of_the_same_moves(
-    six_axis_limits, random_points, seed, fly, count
-):
+def test_targets_queued_at_once_are_the_plan_of_the_same_moves(seed, fly, count):
     points = random_points(seed, count)
-    interpolator = ready(six_axis_limits, points[0], fly=fly)
+    interpolator = ready(SIX_AXES, points[0], fly=fly)
     queue(interpolator, points[1:])
     steps = steps_to_rest(interpolator)
     moves = [Move(point, fly=FlyPercent(fly)) for point in points[1:]]
-    plan = plan_moves(points[0], moves, six_axis_limits)
+    plan = plan_moves(points[0], moves, SIX_AXES)
     q, _, _ = plan.trajectory.sample(PERIOD * np.arange(1, len(steps) + 1))
     np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
     assert steps[-1].elapsed_time == pytest.approx(plan.trajectory.duration, abs=1e-9)
@@ -91,9 +90,9 @@ def test_targets_queued_at_once_are_the_plan_of_the_same_moves(
         assert told[target] == pytest.approx(np.ceil(passage.time / PERIOD - 1e-6), abs=0)
 
 
-def test_every_setting_reaches_the_plan(six_axis_limits, random_points):
+def test_every_setting_reaches_the_plan():
     points = random_points(5, 4)
-    interpolator = ready(six_axis_limits, points[0])
+    interpolator = ready(SIX_AXES, points[0])
     interpolator.set_joint_speeds(80.0)
     interpolator.set_joint_speeds(35.0, joints=[2])
     interpolator.set_joint_accelerations([90.0, 80.0, 70.0, 60.0, 50.0, 40.0])
@@ -112,7 +111,7 @@ def test_every_setting_reaches_the_plan(six_axis_limits, random_points):
     plan = plan_moves(
         points[0],
         [Move(point, fly=FlyDistance(0.05), **shares) for point in points[1:]],
-        six_axis_limits,
+        SIX_AXES,
         Overrides(speed=0.9, acceleration=0.7, deceleration=0.6),
     )
     steps = steps_to_rest(interpolator)
@@ -120,17 +119,17 @@ def test_every_setting_reaches_the_plan(six_axis_limits, random_points):
     np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
     # None of them is idle: the plan without it is another.
     plain = plan_moves(
-        points[0], [Move(point, fly=FlyDistance(0.05)) for point in points[1:]], six_axis_limits
+        points[0], [Move(point, fly=FlyDistance(0.05)) for point in points[1:]], SIX_AXES
     )
     assert plan.trajectory.duration > 1.2 * plain.trajectory.duration
 
 
 @pytest.mark.parametrize("fly", [25.0, 100.0])
-def test_a_target_set_in_time_is_as_good_as_one_set_at_once(six_axis_limits, random_points, fly):
+def test_a_target_set_in_time_is_as_good_as_one_set_at_once(fly):
     points = random_points(7, 6)
-    at_once = ready(six_axis_limits, points[0], fly=fly)
+    at_once = ready(SIX_AXES, points[0], fly=fly)
     queue(at_once, points[1:])
-    one_by_one = ready(six_axis_limits, points[0], fly=fly)
+    one_by_one = ready(SIX_AXES, points[0], fly=fly)
     waiting = list(enumerate(points[1:], 1))
     steps, one = [], steps_to_rest(at_once)
     one_by_one.set_next_target(*waiting.pop(0))
@@ -144,22 +143,22 @@ def test_a_target_set_in_time_is_as_good_as_one_set_at_once(six_axis_limits, ran
 
 @given(st.integers(0, 10**6), st.floats(0.0, 1.0))
 @settings(max_examples=15, deadline=None)
-def test_a_late_target_finds_the_arm_stopping(six_axis_limits, random_points, seed, late):
+def test_a_late_target_finds_the_arm_stopping(seed, late):
     a, b, c = random_points(seed, 3)
-    plan = plan_moves(a, [Move(b, fly=FlyPercent(50.0)), Move(c)], six_axis_limits)
-    alone = plan_moves(a, [Move(b)], six_axis_limits).trajectory.duration
+    plan = plan_moves(a, [Move(b, fly=FlyPercent(50.0)), Move(c)], SIX_AXES)
+    alone = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
     assume(plan.targets[0].how != "stopped")
-    interpolator = ready(six_axis_limits, a, fly=50.0)
+    interpolator = ready(SIX_AXES, a, fly=50.0)
     queue(interpolator, [b])
     # Somewhere between where the corner would begin and the stop.
-    corner_begins = _last_shared(plan.trajectory, a, b, six_axis_limits)
+    corner_begins = _last_shared(plan.trajectory, a, b, SIX_AXES)
     wait = int((corner_begins + late * (alone - corner_begins)) / PERIOD)
     steps = [interpolator.get_next_step() for _ in range(wait + 1)]
     assume(steps[-1].elapsed_time >= corner_begins and steps[-1].status >= 0)
     assume(steps[-1].status != Status.FINAL_STEP)
     assert interpolator.set_next_target(2, c) >= 0
     steps += steps_to_rest(interpolator)
-    stopping = plan_moves(a, [Move(b, fly=Stop()), Move(c)], six_axis_limits).trajectory
+    stopping = plan_moves(a, [Move(b, fly=Stop()), Move(c)], SIX_AXES).trajectory
     q, _, _ = stopping.sample(PERIOD * np.arange(1, len(steps) + 1))
     np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
     assert events(steps) == [(EventKind.VIA_POINT_PASSED, 1), (EventKind.MOTION_ENDED, 2)]
@@ -173,9 +172,9 @@ def _last_shared(flown, a, b, limits):
     return times[np.argmax(apart > 1e-9)]
 
 
-def test_after_the_end_a_new_target_begins_a_new_motion(six_axis_limits, random_points):
+def test_after_the_end_a_new_target_begins_a_new_motion():
     a, b, c = random_points(9, 3)
-    interpolator = ready(six_axis_limits, a, fly=100.0)
+    interpolator = ready(SIX_AXES, a, fly=100.0)
     queue(interpolator, [b])
     first = steps_to_rest(interpolator)
     np.testing.assert_array_equal(first[-1].position, b)
@@ -185,7 +184,7 @@ def test_after_the_end_a_new_target_begins_a_new_motion(six_axis_limits, random_
     assert interpolator.get_current_target_id() is None
     queue(interpolator, [c], first=2)
     second = steps_to_rest(interpolator)
-    other = ready(six_axis_limits, b)
+    other = ready(SIX_AXES, b)
     queue(other, [c], first=2)
     np.testing.assert_array_equal(positions(second), positions(steps_to_rest(other)))
     assert events(first + second) == [(EventKind.MOTION_ENDED, 1), (EventKind.MOTION_ENDED, 2)]
@@ -195,9 +194,9 @@ def test_after_the_end_a_new_target_begins_a_new_motion(six_axis_limits, random_
 
 
 @pytest.mark.parametrize("advance", [0, 1, 3])
-def test_data_are_asked_for_while_few_targets_are_ahead(six_axis_limits, random_points, advance):
+def test_data_are_asked_for_while_few_targets_are_ahead(advance):
     points = random_points(30, 6)
-    interpolator = ready(six_axis_limits, points[0], fly=50.0, advance=advance)
+    interpolator = ready(SIX_AXES, points[0], fly=50.0, advance=advance)
     answers = [interpolator.set_next_target(k, point) for k, point in enumerate(points[1:])]
     asked = [answer == Status.NEED_MORE_DATA for answer in answers]
     assert asked == [known <= advance for known in range(1, 6)]
@@ -212,21 +211,21 @@ def test_data_are_asked_for_while_few_targets_are_ahead(six_axis_limits, random_
 
 @given(st.integers(0, 10**6), st.floats(1.0, 6.0))
 @settings(max_examples=15, deadline=None)
-def test_a_motion_time_is_met(six_axis_limits, random_points, seed, factor):
+def test_a_motion_time_is_met(seed, factor):
     a, b, c = random_points(seed, 3)
-    shortest = plan_moves(a, [Move(b)], six_axis_limits).trajectory.duration
-    interpolator = ready(six_axis_limits, a)
+    shortest = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
+    interpolator = ready(SIX_AXES, a)
     assert interpolator.set_motion_time(factor * shortest) == Status.OK
     queue(interpolator, [b, c])  # the time is that of one move
-    first = plan_moves(b, [Move(c)], six_axis_limits).trajectory.duration
+    first = plan_moves(b, [Move(c)], SIX_AXES).trajectory.duration
     last = steps_to_rest(interpolator)[-1].elapsed_time
     assert last == pytest.approx(factor * shortest + first, rel=1e-9)
 
 
-def test_a_motion_time_too_short_is_refused(six_axis_limits, random_points):
+def test_a_motion_time_too_short_is_refused():
     a, b = random_points(40, 2)
-    shortest = plan_moves(a, [Move(b)], six_axis_limits).trajectory.duration
-    interpolator = ready(six_axis_limits, a)
+    shortest = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
+    interpolator = ready(SIX_AXES, a)
     interpolator.set_motion_time(0.999 * shortest)
     assert interpolator.set_next_target(1, b) == Status.TIME_TOO_SHORT == -25
     assert interpolator.get_next_step().status == Status.NO_TARGET
@@ -236,9 +235,9 @@ def test_a_motion_time_too_short_is_refused(six_axis_limits, random_points):
     assert steps_to_rest(interpolator)[-1].elapsed_time == pytest.approx(shortest)
 
 
-def test_the_interpolation_time_changes_the_steps_not_the_motion(six_axis_limits, random_points):
+def test_the_interpolation_time_changes_the_steps_not_the_motion():
     a, b = random_points(41, 2)
-    fine, coarse = ready(six_axis_limits, a), ready(six_axis_limits, a)
+    fine, coarse = ready(SIX_AXES, a), ready(SIX_AXES, a)
     assert coarse.set_interpolation_time(2.0 * PERIOD) == Status.OK
     queue(fine, [b])
     queue(coarse, [b])
@@ -256,14 +255,14 @@ STOP = np.array([1.0, 2.0, 3.0]) + PACE_ROUNDING
 
 
 @pytest.fixture(scope="module")
-def points(random_points):
+def points():
     return random_points(100, 4)
 
 
 @pytest.fixture(scope="module")
-def flown(six_axis_limits, points):
+def flown(points):
     moves = [Move(point, fly=FlyPercent(50.0)) for point in points[1:]]
-    return plan_moves(points[0], moves, six_axis_limits).trajectory
+    return plan_moves(points[0], moves, SIX_AXES).trajectory
 
 
 @pytest.fixture(scope="module")
@@ -305,10 +304,8 @@ def run(interpolator, commands):
     )
 )
 @settings(max_examples=20, deadline=None)
-def test_an_override_changes_when_and_never_where(
-    six_axis_limits, points, flown, off_path, changes
-):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+def test_an_override_changes_when_and_never_where(points, flown, off_path, changes):
+    interpolator = ready(SIX_AXES, points[0], fly=50.0)
     queue(interpolator, points[1:])
     commands = {}
     last = max((when for when, _ in changes), default=0)
@@ -317,16 +314,14 @@ def test_an_override_changes_when_and_never_where(
         commands.setdefault(when, []).append(order)
     q = positions(run(interpolator, commands))
     assert off_path(q) <= 1e-9
-    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= OVERRIDE)
+    assert np.all(worst_ratios(points[0], q, SIX_AXES) <= OVERRIDE)
     np.testing.assert_array_equal(q[-1], points[-1])
 
 
 @given(st.integers(1, 1200), st.integers(0, 300), st.sampled_from([100.0, 60.0, 5.0]))
 @settings(max_examples=20, deadline=None)
-def test_stop_and_continue_stay_on_the_path(
-    six_axis_limits, points, off_path, when, pause, percent
-):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+def test_stop_and_continue_stay_on_the_path(points, off_path, when, pause, percent):
+    interpolator = ready(SIX_AXES, points[0], fly=50.0)
     interpolator.set_override_speed(percent)
     queue(interpolator, points[1:])
     commands = {
@@ -337,7 +332,7 @@ def test_stop_and_continue_stay_on_the_path(
     steps = run(interpolator, commands)
     q = positions(steps)
     assert off_path(q) <= 1e-9
-    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= STOP)
+    assert np.all(worst_ratios(points[0], q, SIX_AXES) <= STOP)
     told = [kind for kind, _ in events(steps)]
     assert told.count(EventKind.VIA_POINT_PASSED) == 2
     still = np.all(np.diff(q, axis=0) == 0.0, axis=1)
@@ -346,11 +341,11 @@ def test_stop_and_continue_stay_on_the_path(
 
 
 @pytest.mark.parametrize("after", [20, 60, 120, 180, 199])
-def test_an_override_that_is_no_change_disturbs_nothing(six_axis_limits, points, after):
+def test_an_override_that_is_no_change_disturbs_nothing(points, after):
     """By then it gathers speed so fast that under the bounds of an override it would overshoot."""
 
     def go_on(*, again):
-        interpolator = ready(six_axis_limits, points[0], fly=50.0)
+        interpolator = ready(SIX_AXES, points[0], fly=50.0)
         queue(interpolator, points[1:])
         commands = {
             200: [interpolator.stop_motion],
@@ -362,8 +357,8 @@ def test_an_override_that_is_no_change_disturbs_nothing(six_axis_limits, points,
     np.testing.assert_allclose(go_on(again=True), go_on(again=False), rtol=0, atol=1e-12)
 
 
-def test_a_stopped_arm_stands_until_it_may_go_on(six_axis_limits, points):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+def test_a_stopped_arm_stands_until_it_may_go_on(points):
+    interpolator = ready(SIX_AXES, points[0], fly=50.0)
     queue(interpolator, points[1:])
     for _ in range(200):
         interpolator.get_next_step()
@@ -381,9 +376,9 @@ def test_a_stopped_arm_stands_until_it_may_go_on(six_axis_limits, points):
     assert events(steps_to_rest(interpolator))[-1] == (EventKind.MOTION_ENDED, 3)
 
 
-def test_a_stop_outlasts_the_end_of_the_motion(six_axis_limits, points):
+def test_a_stop_outlasts_the_end_of_the_motion(points):
     """An arm that was told to stop does not set off for a target that comes later."""
-    interpolator = ready(six_axis_limits, points[0])
+    interpolator = ready(SIX_AXES, points[0])
     queue(interpolator, points[1:2])
     steps = []
     while interpolator.get_current_target_id() is not None:
@@ -401,10 +396,8 @@ def test_a_stop_outlasts_the_end_of_the_motion(six_axis_limits, points):
 
 @given(st.integers(1, 1000), st.booleans())
 @settings(max_examples=20, deadline=None)
-def test_a_cancelled_motion_leaves_the_arm_on_its_path(
-    six_axis_limits, points, off_path, when, stopped
-):
-    interpolator = ready(six_axis_limits, points[0], fly=50.0)
+def test_a_cancelled_motion_leaves_the_arm_on_its_path(points, off_path, when, stopped):
+    interpolator = ready(SIX_AXES, points[0], fly=50.0)
     queue(interpolator, points[1:])
     steps = [interpolator.get_next_step() for _ in range(when)]
     assume(not any(kind is EventKind.MOTION_ENDED for kind, _ in events(steps)))
@@ -422,7 +415,7 @@ def test_a_cancelled_motion_leaves_the_arm_on_its_path(
     queue(interpolator, points[:1], first=9)
     back = steps_to_rest(interpolator)
     q = positions(steps + back)
-    assert np.all(worst_ratios(points[0], q, six_axis_limits) <= STOP)
+    assert np.all(worst_ratios(points[0], q, SIX_AXES) <= STOP)
     np.testing.assert_array_equal(q[-1], points[0])
     assert events(back) == [(EventKind.MOTION_ENDED, 9)]
 
@@ -430,9 +423,9 @@ def test_a_cancelled_motion_leaves_the_arm_on_its_path(
 # -- refusals -----------------------------------------------------------------------------
 
 
-def test_nothing_is_done_before_initialize_and_after_terminate(six_axis_limits, random_points):
+def test_nothing_is_done_before_initialize_and_after_terminate():
     a, b = random_points(50, 2)
-    interpolator = Interpolator(six_axis_limits, PERIOD)
+    interpolator = Interpolator(SIX_AXES, PERIOD)
     for _ in range(2):
         for refused in (
             interpolator.set_initial_position(a),
@@ -495,11 +488,11 @@ REFUSED = {
     ("service", "arguments"),
     [(service, arguments) for service, each in REFUSED.items() for arguments in each],
 )
-def test_a_refused_service_changes_nothing(six_axis_limits, random_points, service, arguments):
+def test_a_refused_service_changes_nothing(service, arguments):
     points = random_points(51, 3)
 
     def run(*, disturbed):
-        interpolator = ready(six_axis_limits, points[0], fly=80.0)
+        interpolator = ready(SIX_AXES, points[0], fly=80.0)
         if disturbed:
             assert getattr(interpolator, service)(*arguments) == Status.INCONSISTENT == -76
             assert interpolator.refusal
@@ -510,9 +503,9 @@ def test_a_refused_service_changes_nothing(six_axis_limits, random_points, servi
 
 
 @pytest.mark.parametrize("wanted", ["joint", 5, None, [0], np.zeros(2)])
-def test_a_step_in_any_other_format_is_refused(six_axis_limits, random_points, wanted):
+def test_a_step_in_any_other_format_is_refused(wanted):
     a, b = random_points(57, 2)
-    interpolator = ready(six_axis_limits, a)
+    interpolator = ready(SIX_AXES, a)
     queue(interpolator, [b])
     assert interpolator.get_next_step(wanted).status == Status.OUTPUT_FORMAT
     assert interpolator.get_next_step(np.int64(0)).status >= 0
@@ -520,9 +513,9 @@ def test_a_step_in_any_other_format_is_refused(six_axis_limits, random_points, w
 
 @pytest.mark.parametrize("bring_to_rest", ["stop_motion", "cancel_motion"])
 @pytest.mark.parametrize("service", ["initialize", "reset", "terminate"])
-def test_a_moving_arm_is_not_forgotten(six_axis_limits, random_points, service, bring_to_rest):
+def test_a_moving_arm_is_not_forgotten(service, bring_to_rest):
     a, b = random_points(58, 2)
-    interpolator = ready(six_axis_limits, a)
+    interpolator = ready(SIX_AXES, a)
     queue(interpolator, [b])
     moving = [interpolator.get_next_step() for _ in range(50)]
     assert getattr(interpolator, service)() == Status.INCONSISTENT
@@ -530,15 +523,15 @@ def test_a_moving_arm_is_not_forgotten(six_axis_limits, random_points, service, 
     assert getattr(interpolator, service)() == Status.INCONSISTENT  # it still comes to rest
     steps = moving + steps_to_rest(interpolator)
     assert np.max(np.abs(np.diff(positions(steps), axis=0))) < 1.01 * PERIOD * np.max(
-        six_axis_limits.velocity
+        SIX_AXES.velocity
     )
     assert getattr(interpolator, service)() == Status.OK
     assert interpolator.get_current_target_id() is None
 
 
-def test_a_planner_that_died_leaves_the_motion_before(six_axis_limits, random_points):
+def test_a_planner_that_died_leaves_the_motion_before():
     points = random_points(53, 3)
-    interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=True)
+    interpolator = ready(SIX_AXES, points[0], fly=50.0, isolated=True)
     queue(interpolator, points[1:2])
 
     dead = in_child(os.getpid)
@@ -552,7 +545,7 @@ def test_a_planner_that_died_leaves_the_motion_before(six_axis_limits, random_po
     assert in_child(os.getpid) != dead
 
 
-def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, monkeypatch):
+def test_a_corner_that_would_jump_is_not_taken(monkeypatch):
     points = random_points(55, 3)
 
     def careless(legs, fly):
@@ -560,12 +553,12 @@ def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, m
         return planned._replace(leave=0.9 * planned.leave)
 
     monkeypatch.setattr("planner.interpolator.corner", careless)
-    interpolator = ready(six_axis_limits, points[0], fly=50.0, isolated=False)
+    interpolator = ready(SIX_AXES, points[0], fly=50.0, isolated=False)
     queue(interpolator, points[1:2])
     assert interpolator.set_next_target(2, points[2]) == Status.FATAL
     steps = steps_to_rest(interpolator)
     assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
-    assert max(worst_ratios(points[0], positions(steps), six_axis_limits)) <= 1.0 + 1e-5
+    assert max(worst_ratios(points[0], positions(steps), SIX_AXES)) <= 1.0 + 1e-5
 
 
 @pytest.mark.parametrize(
@@ -578,34 +571,32 @@ def test_a_corner_that_would_jump_is_not_taken(six_axis_limits, random_points, m
         (PERIOD, {"stop_bounds": (1.2, 3.0)}),
     ],
 )
-def test_an_interpolator_that_cannot_be_is_refused(six_axis_limits, period, options):
+def test_an_interpolator_that_cannot_be_is_refused(period, options):
     with pytest.raises(InvalidSetting):
-        Interpolator(six_axis_limits, period, **options)
+        Interpolator(SIX_AXES, period, **options)
 
 
-def test_joints_at_an_end_of_their_range_are_flagged(six_axis_limits):
+def test_joints_at_an_end_of_their_range_are_flagged():
     start = np.zeros(6)
     target = np.zeros(6)
-    target[[1, 4]] = six_axis_limits.upper[1], six_axis_limits.lower[4]
-    interpolator = ready(six_axis_limits, start)
+    target[[1, 4]] = SIX_AXES.upper[1], SIX_AXES.lower[4]
+    interpolator = ready(SIX_AXES, start)
     queue(interpolator, [target])
     steps = steps_to_rest(interpolator)
     assert steps[-1].joint_limits == 0b010010
     assert not any(step.joint_limits for step in steps[:-2])
 
 
-def test_without_a_planning_process_it_is_not_initialized(
-    six_axis_limits, random_points, monkeypatch
-):
+def test_without_a_planning_process_it_is_not_initialized(monkeypatch):
     def fails(*_):
         raise PlannerNotStarted(1)
 
     monkeypatch.setattr("planner.interpolator.in_child", fails)
-    interpolator = Interpolator(six_axis_limits, PERIOD)
+    interpolator = Interpolator(SIX_AXES, PERIOD)
     assert interpolator.initialize() == Status.FATAL
     assert "could not be started" in interpolator.refusal
     assert interpolator.set_initial_position(random_points(0, 1)[0]) == Status.INCONSISTENT
-    assert Interpolator(six_axis_limits, PERIOD, isolated=False).initialize() == Status.OK
+    assert Interpolator(SIX_AXES, PERIOD, isolated=False).initialize() == Status.OK
 
 
 # -- any services in any order ------------------------------------------------------------

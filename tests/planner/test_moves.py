@@ -26,7 +26,7 @@ from planner.moves import Fly, FlyDistance, FlyPercent, Move, Overrides, Stop, p
 from planner.piecewise_cubic import Block
 from planner.straight import StraightMoves
 from planner.verify import check_smooth
-from tests.planner.conftest import rows_of
+from tests.planner.six_axes import SIX_AXES, random_points, rows_of
 
 
 def decades(low: float, high: float) -> st.SearchStrategy[float]:
@@ -212,12 +212,10 @@ class TestShares:
     """What overrides and shares of moves change, and what they leave."""
 
     @pytest.mark.parametrize(("name", "ramp"), [("acceleration", 0), ("deceleration", 1)])
-    def test_an_override_of_one_ramp_leaves_the_other(
-        self, six_axis_limits, random_points, name, ramp
-    ):
+    def test_an_override_of_one_ramp_leaves_the_other(self, name, ramp):
         start, end = random_points(3, 2)
-        full = plan_moves(start, [Move(end)], six_axis_limits)
-        gentle = plan_moves(start, [Move(end)], six_axis_limits, Overrides(**{name: 0.25}))
+        full = plan_moves(start, [Move(end)], SIX_AXES)
+        gentle = plan_moves(start, [Move(end)], SIX_AXES, Overrides(**{name: 0.25}))
         changed, unchanged = ramps(gentle)[ramp], ramps(gentle)[1 - ramp]
         np.testing.assert_allclose(changed, 0.25 * ramps(full)[ramp], rtol=1e-3)
         np.testing.assert_allclose(unchanged, ramps(full)[1 - ramp], rtol=1e-3)
@@ -234,15 +232,13 @@ class TestShares:
             ("joint_jerk", None, "jerk"),
         ],
     )
-    def test_a_share_of_one_joint_binds_that_joint_alone(
-        self, six_axis_limits, random_points, of_move, of_program, quantity
-    ):
+    def test_a_share_of_one_joint_binds_that_joint_alone(self, of_move, of_program, quantity):
         start, end = random_points(5, 2)
         share = np.array([1.0, 1.0, 1.0, 0.05, 1.0, 1.0])
         move = Move(end, **({of_move: share} if of_move else {}))
         overrides = Overrides(**({of_program: share} if of_program else {}))
-        reached = plan_moves(start, [move], six_axis_limits, overrides).trajectory.extrema()
-        used = getattr(reached, quantity) / getattr(six_axis_limits, quantity)
+        reached = plan_moves(start, [move], SIX_AXES, overrides).trajectory.extrema()
+        used = getattr(reached, quantity) / getattr(SIX_AXES, quantity)
         assert used[3] == pytest.approx(0.05, rel=0.03)
         assert used[3] <= 0.05
         assert np.all(used <= 1.0)
@@ -251,25 +247,25 @@ class TestShares:
 class TestCorners:
     """How fly-by shapes a whole motion."""
 
-    def test_corners_not_rounded_as_asked_are_reported(self, six_axis_limits, random_points):
+    def test_corners_not_rounded_as_asked_are_reported(self):
         a, b, c = random_points(7, 3)
-        repeated = plan_moves(a, [Move(p, fly=FlyPercent(50)) for p in (b, b, c)], six_axis_limits)
+        repeated = plan_moves(a, [Move(p, fly=FlyPercent(50)) for p in (b, b, c)], SIX_AXES)
         assert (repeated.reduced_corners, repeated.stopped_corners) == (0, 0)  # nothing to round
         reduced = 0
         for seed in range(300):
             a, b, c = random_points(seed, 3)
             # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
-            moves = [Move(p, fly=FlyPercent(100)) for p in (six_axis_limits.upper, c)]
-            motion = plan_moves(a, moves, six_axis_limits)
+            moves = [Move(p, fly=FlyPercent(100)) for p in (SIX_AXES.upper, c)]
+            motion = plan_moves(a, moves, SIX_AXES)
             assert motion.reduced_corners == (motion.targets[0].how == "reduced")
             assert motion.stopped_corners == (motion.targets[0].how == "stopped")
             reduced += motion.reduced_corners
         assert reduced > 0
 
-    def test_more_fly_is_faster_and_rounder(self, six_axis_limits):
+    def test_more_fly_is_faster_and_rounder(self):
         # Ranges, time against stopping everywhere and passing distances as measured elsewhere.
         narrow = np.pi / 180.0 * np.array([[180, 92, 78, 200, 125, 200], [0, 33, -87, 0, 0, 0]])
-        limits = replace(six_axis_limits, lower=narrow[1] - narrow[0], upper=narrow[1] + narrow[0])
+        limits = replace(SIX_AXES, lower=narrow[1] - narrow[0], upper=narrow[1] + narrow[0])
         draws = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 6, 6))
         sets = narrow[1] + draws * narrow[0]
         durations, distances = [], []
@@ -287,9 +283,9 @@ class TestCorners:
         assert distances == sorted(distances)
         np.testing.assert_allclose(distances[3:], [2.6, 8.0, 16.0], rtol=0.3)
 
-    def test_a_motion_that_goes_nowhere_takes_no_time(self, six_axis_limits, random_points):
+    def test_a_motion_that_goes_nowhere_takes_no_time(self):
         point = random_points(13, 1)[0]
-        motion = plan([point, point, point], six_axis_limits)
+        motion = plan([point, point, point], SIX_AXES)
         assert motion.duration == 0.0
         q, qd, _ = motion.sample(np.array([0.0, 1.0]))
         np.testing.assert_array_equal(q, [point, point])
@@ -342,21 +338,21 @@ def lengthened(limits, fly: Fly, count: int) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fly", [FlyPercent(25.0), FlyPercent(50.0)])
-def test_to_half_of_the_ramps_none_of_ten_thousand_grows(six_axis_limits, fly):
+def test_to_half_of_the_ramps_none_of_ten_thousand_grows(fly):
     # Not a law: the solver misses the fastest join at a few isolated states, and now and then all
     # the shares next to each other that it is asked about fall on such. The steps of speed here
     # are large, so that what they gain hides a small miss; docs/motion.md tells the rate of it.
-    assert lengthened(six_axis_limits, fly, 3400) == []
+    assert lengthened(SIX_AXES, fly, 3400) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fly", [FlyPercent(75.0), FlyDistance(0.02)])
-def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(six_axis_limits, fly):
+def test_beyond_half_of_the_ramps_a_few_in_ten_thousand_grow(fly):
     # A joint can be unable to take just so long from one moving state to another: it is too fast
     # to come to rest on the way, and too slow without. At a higher speed the cuts of a fixed share
     # lie at faster states, so that a corner can fall into such a gap that it cleared before. Within
     # a distance short moves use more than half, too, and the share is searched for.
-    grown = lengthened(six_axis_limits, fly, 3400)
+    grown = lengthened(SIX_AXES, fly, 3400)
     assert 0 < len(grown) < 30
     assert max(grown) < 0.1
 
@@ -398,23 +394,23 @@ def test_a_setting_out_of_range_is_refused_by_name(make, name):
     assert refusal.value.name == name
 
 
-def test_moves_of_another_arm_are_refused(six_axis_limits, random_points):
+def test_moves_of_another_arm_are_refused():
     a, b = random_points(8, 2)
     for start, moves in ((a, [Move(b[:5])]), (a[:5], [Move(b[:5])]), (a, [])):
         with pytest.raises(InvalidViaPoints):
-            plan_moves(start, moves, six_axis_limits)
+            plan_moves(start, moves, SIX_AXES)
     with pytest.raises(InvalidSetting, match="joint override"):
-        plan_moves(a, [Move(b)], six_axis_limits, Overrides(joint=[1.0] * 5))
+        plan_moves(a, [Move(b)], SIX_AXES, Overrides(joint=[1.0] * 5))
 
 
 @example(np.nextafter(1.0, 2.0))
 @given(st.floats(1.0, 1e9, exclude_min=True))
 @settings(max_examples=20)
-def test_a_via_point_out_of_limits_is_named(six_axis_limits, random_points, factor):
+def test_a_via_point_out_of_limits_is_named(factor):
     points = random_points(15)
-    points[2, 4] = six_axis_limits.lower[4] * factor
+    points[2, 4] = SIX_AXES.lower[4] * factor
     with pytest.raises(InvalidViaPoints, match=r"via point 2, joint 4: .* outside"):
-        plan(points, six_axis_limits)
+        plan(points, SIX_AXES)
 
 
 NO_NUMBERS = (np.nan, np.inf, -np.inf)
@@ -433,9 +429,9 @@ NO_NUMBERS = (np.nan, np.inf, -np.inf)
         *(([[0.0] * 6, [bad] * 6], "point 1, joint 0: .* not a finite") for bad in NO_NUMBERS),
     ],
 )
-def test_via_points_that_are_none_are_refused(six_axis_limits, points, problem):
+def test_via_points_that_are_none_are_refused(points, problem):
     with pytest.raises(InvalidViaPoints, match=problem):
-        plan(points, six_axis_limits)
+        plan(points, SIX_AXES)
 
 
 def with_position(motion: PiecewiseCubic, value: float) -> PiecewiseCubic:
@@ -448,36 +444,34 @@ class TestFinalCheck:
     """What is checked on a finished motion."""
 
     @pytest.mark.parametrize("quantity", ["velocity", "acceleration", "jerk"])
-    def test_it_finds_each_kind_of_excess(self, six_axis_limits, random_points, quantity):
-        motion = plan(random_points(18), six_axis_limits)
-        check_limits(motion, six_axis_limits)
+    def test_it_finds_each_kind_of_excess(self, quantity):
+        motion = plan(random_points(18), SIX_AXES)
+        check_limits(motion, SIX_AXES)
         with pytest.raises(LimitExceeded) as refusal:
-            check_limits(motion, six_axis_limits.scaled(**{quantity: 0.9}))
+            check_limits(motion, SIX_AXES.scaled(**{quantity: 0.9}))
         assert refusal.value.quantity == quantity
         assert refusal.value.value > refusal.value.bound
 
-    def test_it_finds_positions_jumps_and_what_is_no_number(self, six_axis_limits, random_points):
-        motion = plan(random_points(19), six_axis_limits)
+    def test_it_finds_positions_jumps_and_what_is_no_number(self):
+        motion = plan(random_points(19), SIX_AXES)
         with pytest.raises(NotSmooth) as refusal:
             jumped = with_position(motion, motion.coefficients[2][7, 0] + 1e-8)
-            check_smooth(jumped, six_axis_limits)
+            check_smooth(jumped, SIX_AXES)
         assert (refusal.value.quantity, refusal.value.joint) == ("position", 2)
         with pytest.raises(LimitExceeded):
-            check_limits(with_position(motion, np.nan), six_axis_limits)
+            check_limits(with_position(motion, np.nan), SIX_AXES)
         with pytest.raises(LimitExceeded) as refusal:
-            outside = with_position(motion, six_axis_limits.upper[2] + 0.1)
-            check_limits(outside, six_axis_limits)
+            outside = with_position(motion, SIX_AXES.upper[2] + 0.1)
+            check_limits(outside, SIX_AXES)
         assert (refusal.value.quantity, refusal.value.joint) == ("position", 2)
 
-    def test_a_motion_that_is_not_what_a_plan_promises_is_refused(
-        self, six_axis_limits, random_points, monkeypatch
-    ):
+    def test_a_motion_that_is_not_what_a_plan_promises_is_refused(self, monkeypatch):
         monkeypatch.setattr("planner.moves.SEGMENT_JERK", 1.1)
         points = random_points(20)
         with pytest.raises(LimitExceeded, match="jerk"):
-            plan(points, six_axis_limits, fly=0.0)
+            plan(points, SIX_AXES, fly=0.0)
         with pytest.raises(LimitExceeded, match="jerk"):
-            plan_moves(points[0], [Move(points[1])], six_axis_limits)
+            plan_moves(points[0], [Move(points[1])], SIX_AXES)
 
 
 def bits(motion: PiecewiseCubic) -> bytes:
@@ -511,13 +505,13 @@ class TestPopulation:
         ]
         assert bits(plan_moves(points[index][0], moves, limits).trajectory) == bits(alone)
 
-    def test_what_cannot_be_planned_is_an_error_in_its_place(self, six_axis_limits, random_points):
+    def test_what_cannot_be_planned_is_an_error_in_its_place(self):
         good, outside, unknown = random_points(0), random_points(1), random_points(2)
         outside[3, 2] = 50.0
         unknown[0, 0] = np.nan
-        assert plan_chunk([], np.ones((0, 6)), six_axis_limits, 0.5) == []
+        assert plan_chunk([], np.ones((0, 6)), SIX_AXES, 0.5) == []
         individuals = [good, outside, good[:1], unknown, good[:, :5], good[:3], good]
-        planned = plan_chunk(individuals, np.ones((7, 6)), six_axis_limits, 0.5)
+        planned = plan_chunk(individuals, np.ones((7, 6)), SIX_AXES, 0.5)
         assert [isinstance(each, InvalidViaPoints) for each in planned] == [False] + [True] * 4 + [
             False
         ] * 2

@@ -14,6 +14,7 @@ from scipy.interpolate import PPoly
 from planner import InvalidLimits, InvalidTrajectory, JointLimits, NotSmooth, PiecewiseCubic, plan
 from planner.piecewise_cubic import Block
 from planner.verify import check_rest, check_smooth
+from tests.planner.six_axes import SIX_AXES, random_points
 
 numbers = st.floats(-10.0, 10.0)
 
@@ -123,8 +124,8 @@ def test_refuses_stored_data_that_are_no_trajectory(damage):
         PiecewiseCubic.from_dict({**good, **damage})
 
 
-def test_tables_are_read_only(six_axis_limits, random_points):
-    motion = plan(random_points(0), six_axis_limits)
+def test_tables_are_read_only():
+    motion = plan(random_points(0), SIX_AXES)
     with pytest.raises(ValueError, match="read-only"):
         motion.coefficients[0][0, 0] = 1.0
     restored = PiecewiseCubic.from_dict(motion.to_dict())
@@ -201,20 +202,20 @@ def moving(column: int, value: float, at_end: bool) -> PiecewiseCubic:
 
 @pytest.mark.parametrize("at_end", [False, True])
 @pytest.mark.parametrize(("column", "quantity"), [(1, "velocity"), (2, "acceleration")])
-def test_what_is_left_of_a_rate_at_an_end_is_named(six_axis_limits, column, quantity, at_end):
+def test_what_is_left_of_a_rate_at_an_end_is_named(column, quantity, at_end):
     with pytest.raises(NotSmooth) as refusal:
-        check_rest(moving(column, 1e-3, at_end), six_axis_limits)
+        check_rest(moving(column, 1e-3, at_end), SIX_AXES)
     assert (refusal.value.joint, refusal.value.time) == (3, 2.0 if at_end else 0.0)
     assert refusal.value.quantity in (quantity, "velocity")
 
 
-def test_a_rate_that_is_no_number_is_refused(six_axis_limits):
+def test_a_rate_that_is_no_number_is_refused():
     with pytest.raises(NotSmooth):
-        check_rest(moving(1, np.nan, False), six_axis_limits)
+        check_rest(moving(1, np.nan, False), SIX_AXES)
 
 
-def test_every_plan_is_at_rest_and_smooth(six_axis_limits, random_points):
+def test_every_plan_is_at_rest_and_smooth():
     for seed in range(10):
-        motion = plan(random_points(seed), six_axis_limits)
-        check_rest(motion, six_axis_limits)
-        check_smooth(motion, six_axis_limits)
+        motion = plan(random_points(seed), SIX_AXES)
+        check_rest(motion, SIX_AXES)
+        check_smooth(motion, SIX_AXES)

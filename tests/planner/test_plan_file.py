@@ -17,6 +17,7 @@ from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_m
 from planner.plan_file import PlanFile
 from planner.toml_text import degrees_text, radians_of, toml_key, toml_value
 from tests.motion_table import MotionTable
+from tests.planner.six_axes import SIX_AXES, random_points
 
 NAMES = tuple(f"joint_{i}" for i in range(1, 7))
 
@@ -93,13 +94,13 @@ def test_degrees_are_those_of_everyone_else():
 
 
 @pytest.fixture
-def planned(six_axis_limits, random_points):
+def planned():
     points = random_points(3)
     flies = [FlyPercent(50.0), FlyPercent(100.0), Stop(), FlyDistance(0.05), Stop()]
     return plan_moves(
         points[0],
         [Move(target, speed=0.8, fly=fly) for target, fly in zip(points[1:], flies, strict=True)],
-        six_axis_limits,
+        SIX_AXES,
         Overrides(deceleration=0.7),
     )
 
@@ -334,8 +335,8 @@ class TestMotionAsCsv:
     """A motion as a table that spreadsheets and other programs read."""
 
     @pytest.mark.parametrize("rate", [7.0, 100.0, 1000.0 / 3.0])
-    def test_holds_every_bit_of_the_samples(self, six_axis_limits, random_points, rate):
-        motion = plan(random_points(1), six_axis_limits)
+    def test_holds_every_bit_of_the_samples(self, rate):
+        motion = plan(random_points(1), SIX_AXES)
         table = MotionTable.of(to_csv(motion, rate, JOINTS))
         assert table.joint_names == JOINTS
         assert table.duration == motion.duration
@@ -345,15 +346,15 @@ class TestMotionAsCsv:
         for ours, theirs in zip(rows, motion.sample(table.time), strict=True):
             assert ours.tobytes() == np.ascontiguousarray(theirs).tobytes()
 
-    def test_headings_name_joint_quantity_and_unit(self, six_axis_limits, random_points):
-        motion = plan(random_points(1), six_axis_limits)
+    def test_headings_name_joint_quantity_and_unit(self):
+        motion = plan(random_points(1), SIX_AXES)
         heading = to_csv(motion, 10.0, [f"j{i}" for i in range(6)]).splitlines()[0]
         assert heading.startswith(
             "time [s],j0.position [rad],j0.velocity [rad/s],j0.acceleration [rad/s^2],j1.position"
         )
 
-    def test_refuses_a_rate_or_names_that_do_not_fit(self, six_axis_limits, random_points):
-        motion = plan(random_points(1), six_axis_limits)
+    def test_refuses_a_rate_or_names_that_do_not_fit(self):
+        motion = plan(random_points(1), SIX_AXES)
         for rate in (0.0, -1.0, np.nan, np.inf, 1.01e5):
             with pytest.raises(InvalidSetting):
                 to_csv(motion, rate, JOINTS)
@@ -362,8 +363,8 @@ class TestMotionAsCsv:
         with pytest.raises(InvalidSetting, match="different"):
             to_csv(motion, 10.0, JOINTS[:5] + JOINTS[:1])
 
-    def test_a_motion_of_no_duration_is_refused_for_no_table_can_tell_it(self, six_axis_limits):
-        standing = plan(np.zeros((2, 6)), six_axis_limits)
+    def test_a_motion_of_no_duration_is_refused_for_no_table_can_tell_it(self):
+        standing = plan(np.zeros((2, 6)), SIX_AXES)
         assert standing.duration == 0.0
         with pytest.raises(InvalidSetting, match="duration"):
             to_csv(standing, 100.0, JOINTS)

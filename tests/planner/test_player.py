@@ -27,17 +27,16 @@ from planner import (
 from planner.piecewise_cubic import Block
 from planner.player import PathReader
 from planner.time_law import ramp, slowing_bounds, within
+from tests.planner.six_axes import SIX_AXES, random_points
 
 PERIOD = 0.002
 
 
 @pytest.fixture(scope="module")
-def motions(six_axis_limits, random_points):
+def motions():
     """Some motions at full speed, and one as short as motions get."""
     short = random_points(0, 1) + np.array([[0.0], [1e-4]])
-    return [plan(random_points(seed, 4), six_axis_limits) for seed in range(6)] + [
-        plan(short, six_axis_limits)
-    ]
+    return [plan(random_points(seed, 4), SIX_AXES) for seed in range(6)] + [plan(short, SIX_AXES)]
 
 
 def play(player, stop_after=None, extra=5, times=None):
@@ -65,11 +64,11 @@ def play(player, stop_after=None, extra=5, times=None):
 
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=20)
-def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, six_axis_limits, seed):
+def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, seed):
     offset = np.random.default_rng(seed).uniform(-1e-3, 1e-3, 6)
-    reference = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    reference = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     reference.begin(reference.start)
-    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+    player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     player.begin(player.start + offset)
     exact, shifted = play(reference, 300), play(player, 300)
     np.testing.assert_allclose(shifted[0] - exact[0], np.tile(offset, (len(exact[0]), 1)))
@@ -77,8 +76,8 @@ def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, six
 
 
 @pytest.mark.parametrize("away", [1.001e-3, -0.5, np.nan, np.inf])
-def test_an_arm_that_is_elsewhere_is_refused(motions, six_axis_limits, away):
-    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+def test_an_arm_that_is_elsewhere_is_refused(motions, away):
+    player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     position = player.start.copy()
     position[3] += away
     with pytest.raises(StartMismatch) as refusal:
@@ -96,9 +95,9 @@ def test_an_arm_that_is_elsewhere_is_refused(motions, six_axis_limits, away):
 @example(which=0, share=1.0, period=0.002)
 @example(which=6, share=0.5, period=0.001)
 def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
-    motions, six_axis_limits, which, share, period
+    motions, which, share, period
 ):
-    motion, limits = motions[which], six_axis_limits
+    motion, limits = motions[which], SIX_AXES
     player = TrajectoryPlayer(motion, period, limits)
     offset = np.linspace(-9e-4, 9e-4, 6)
     player.begin(player.start + offset)
@@ -130,8 +129,8 @@ def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
     np.testing.assert_allclose(positions[1 + played :], q[1 + played :], rtol=0, atol=1e-12)
 
 
-def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions, six_axis_limits):
-    player = TrajectoryPlayer(motions[1], PERIOD, six_axis_limits)
+def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions):
+    player = TrajectoryPlayer(motions[1], PERIOD, SIX_AXES)
     player.begin(player.start + 5e-4)
     player.stop()
     assert player.finished
@@ -140,8 +139,8 @@ def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions, six_axi
     assert not np.any(velocity)
 
 
-def test_beginning_again_plays_the_whole_motion_again(motions, six_axis_limits):
-    player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+def test_beginning_again_plays_the_whole_motion_again(motions):
+    player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
     player.begin(player.start)
     first = play(player)[0]
     player.begin(player.start)
@@ -165,18 +164,18 @@ def test_beginning_again_plays_the_whole_motion_again(motions, six_axis_limits):
         ("start_tolerance", -1e-3),
     ],
 )
-def test_settings_outside_their_range_are_refused(motions, six_axis_limits, name, value):
+def test_settings_outside_their_range_are_refused(motions, name, value):
     settings = {"period": PERIOD, name: value}
     with pytest.raises(InvalidSetting) as refusal:
-        TrajectoryPlayer(motions[0], limits=six_axis_limits, **settings)
+        TrajectoryPlayer(motions[0], limits=SIX_AXES, **settings)
     assert refusal.value.name == name
 
 
 @pytest.mark.parametrize("quantity", ["acceleration", "jerk"])
-def test_a_stop_must_not_be_gentler_than_an_override(motions, six_axis_limits, quantity):
+def test_a_stop_must_not_be_gentler_than_an_override(motions, quantity):
     settings = {f"override_{quantity}": 4.0, f"stop_{quantity}": 3.9}
     with pytest.raises(InvalidSetting, match=f"stop_{quantity} = 3.9 .* override_{quantity}"):
-        TrajectoryPlayer(motions[0], PERIOD, six_axis_limits, **settings)
+        TrajectoryPlayer(motions[0], PERIOD, SIX_AXES, **settings)
 
 
 def test_limits_of_another_arm_are_refused(motions):
@@ -186,10 +185,8 @@ def test_limits_of_another_arm_are_refused(motions):
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables(
-    motions, six_axis_limits, moved
-):
-    player = TrajectoryPlayer(motions[0], PERIOD, six_axis_limits)
+def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables(motions, moved):
+    player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     if moved:
         player.begin(player.start)
         for _ in range(200):
@@ -221,11 +218,11 @@ def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables
     assert not copy._path._pieces.flags.writeable
 
 
-def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused(six_axis_limits):
-    upper = six_axis_limits.upper
+def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused():
+    upper = SIX_AXES.upper
     points = np.array([np.zeros(6), upper, np.zeros(6)])
-    motion = plan(points, six_axis_limits, fly=0.0)
-    player = TrajectoryPlayer(motion, 0.002, six_axis_limits)
+    motion = plan(points, SIX_AXES, fly=0.0)
+    player = TrajectoryPlayer(motion, 0.002, SIX_AXES)
     player.begin(player.start)
     beside = np.zeros(6)
     beside[2] = 9e-4
@@ -243,14 +240,14 @@ class TestCarriedOn:
     LONG = 0.7  # of the motion, in which the arm moves fast
 
     @pytest.fixture
-    def carried(self, motions, six_axis_limits):
-        player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+    def carried(self, motions):
+        player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
         player.begin(player.start)
         given = [player.advance()[0] for _ in range(int(self.LONG * player.duration / PERIOD))]
         return player, given[-1], given[-1] - given[-2]
 
     @pytest.mark.parametrize("k", [0, 1, 3, 5])
-    def test_it_stops_on_its_path_within_the_bounds(self, carried, six_axis_limits, motions, k):
+    def test_it_stops_on_its_path_within_the_bounds(self, carried, motions, k):
         player, last, step = carried
         player.go_on_from(last + k * step, step / PERIOD, 2 * k)
         player.stop()
@@ -258,18 +255,18 @@ class TestCarriedOn:
         while not player.finished:
             given.append(player.advance()[0])
         acceleration = np.diff(given, 2, axis=0) / PERIOD**2
-        assert np.all(np.abs(acceleration) <= 2.0 * six_axis_limits.acceleration * (1 + 1e-6))
+        assert np.all(np.abs(acceleration) <= 2.0 * SIX_AXES.acceleration * (1 + 1e-6))
         planned = motions[2].sample(np.arange(0.0, player.duration, 1e-4))[0]
         assert cKDTree(planned).query(given)[0].max() < 2e-3
 
     @pytest.mark.parametrize("k", [3, 5])
-    def test_gap_after_gap_it_is_at_rest_as_many_set_points_later(self, k, six_axis_limits):
+    def test_gap_after_gap_it_is_at_rest_as_many_set_points_later(self, k):
         """Else somebody's stop would be void on a link that answers every fourth packet."""
-        cruise = replace(six_axis_limits, velocity=np.full(6, 0.5))
+        cruise = replace(SIX_AXES, velocity=np.full(6, 0.5))
         line = plan([np.zeros(6), np.full(6, 1.8)], cruise)
 
         def set_points_to_rest(gaps):
-            player = TrajectoryPlayer(line, PERIOD, six_axis_limits)
+            player = TrajectoryPlayer(line, PERIOD, SIX_AXES)
             player.begin(player.start)
             before, last = ([player.advance()[0] for _ in range(int(0.2 / PERIOD))])[-2:]
             player.stop()
@@ -285,9 +282,9 @@ class TestCarriedOn:
 
         assert set_points_to_rest(True) <= 2 * set_points_to_rest(False)
 
-    def test_however_many_gaps_it_stays_within_twice_the_tolerance(self, motions, six_axis_limits):
+    def test_however_many_gaps_it_stays_within_twice_the_tolerance(self, motions):
         """A controller that leads it 0.4 mrad aside at each gap is not followed without end."""
-        player = TrajectoryPlayer(motions[2], PERIOD, six_axis_limits)
+        player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
         player.begin(player.start)
         aside = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-4])
         played = [player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))]
@@ -413,9 +410,9 @@ class Motions(list):
 
 
 @pytest.fixture(scope="module")
-def live_motions(six_axis_limits, random_points):
+def live_motions():
     """Fast and slow, long and microscopic, of cubics and not, at the very limits and below."""
-    limits = six_axis_limits
+    limits = SIX_AXES
     short = random_points(0, 1) + np.array([[0.0], [1e-4]])
     middle = (limits.lower + limits.upper) / 2
 
@@ -524,9 +521,9 @@ waits = st.one_of(st.integers(0, 5), st.integers(0, 400))
     6, 0.001, [(1, ("hold", 0.0)), (0, ("override", 0.2)), (0, ("resume", 0.0))], "stop", 5e-288
 )
 def test_nothing_that_can_be_asked_for_is_refused_by_the_guard(
-    live_motions, six_axis_limits, which, period, script, end, before
+    live_motions, which, period, script, end, before
 ):
-    arm = Arm(live_motions[which], six_axis_limits, period, offset=np.linspace(-9e-4, 9e-4, 6))
+    arm = Arm(live_motions[which], SIX_AXES, period, offset=np.linspace(-9e-4, 9e-4, 6))
     if before is not None:
         arm.ask("override", before)
     arm.begin()
@@ -548,11 +545,11 @@ def test_nothing_that_can_be_asked_for_is_refused_by_the_guard(
         assert arm.player.rate == 0.0
 
 
-def test_bounds_say_what_each_set_point_keeps(live_motions, six_axis_limits):
-    arm = Arm(live_motions[0], six_axis_limits).begin().run(300)
+def test_bounds_say_what_each_set_point_keeps(live_motions):
+    arm = Arm(live_motions[0], SIX_AXES).begin().run(300)
     assert set(arm.bounds) == {"plan"}
-    allowed = slowing_bounds(six_axis_limits, 1.3, 1.7, live_motions[0].extrema())
-    stopping = slowing_bounds(six_axis_limits, 2.0, 3.0, live_motions[0].extrema())
+    allowed = slowing_bounds(SIX_AXES, 1.3, 1.7, live_motions[0].extrema())
+    stopping = slowing_bounds(SIX_AXES, 2.0, 3.0, live_motions[0].extrema())
     slower = ramp(1.0, 0.0, 0.5, within(allowed, stopping))
     arm.ask("override", 0.5).run(1000)
     changing = int(np.ceil(slower.duration / PERIOD))
@@ -573,25 +570,21 @@ def test_bounds_say_what_each_set_point_keeps(live_motions, six_axis_limits):
 
 
 def test_an_override_asked_for_while_resuming_keeps_the_wider_bounds_only_where_it_must(
-    live_motions, six_axis_limits
+    live_motions,
 ):
-    gentle = (
-        Arm(live_motions[0], six_axis_limits).begin().run(300).ask("hold").run(500).ask("resume")
-    )
+    gentle = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("hold").run(500).ask("resume")
     gentle.run(3).ask("override", 0.4).run(1000)
     assert gentle.bounds[-1] == "plan"
     assert gentle.bounds[803] == "override"  # hardly gathering speed yet
-    steep = (
-        Arm(live_motions[0], six_axis_limits).begin().run(300).ask("hold").run(500).ask("resume")
-    )
+    steep = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("hold").run(500).ask("resume")
     steep.run(80).ask("override", 0.4).run(1000)
     assert steep.bounds[880] == "stop"
     assert steep.player.rate == gentle.player.rate == 0.4
 
 
-def test_nothing_resumes_after_a_stop(live_motions, six_axis_limits):
+def test_nothing_resumes_after_a_stop(live_motions):
     for end in ("stop", "cancel"):
-        arm = Arm(live_motions[1], six_axis_limits).begin().run(500).ask("hold").run(20).ask(end)
+        arm = Arm(live_motions[1], SIX_AXES).begin().run(500).ask("hold").run(20).ask(end)
         arm.ask("resume").ask("override", 1.0).ask("hold").ask("resume").run(1000)
         assert arm.player.finished
         assert arm.player.rate == 0.0
@@ -599,27 +592,18 @@ def test_nothing_resumes_after_a_stop(live_motions, six_axis_limits):
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
-def test_at_rest_at_the_start_a_rate_is_taken_up_at_once(live_motions, six_axis_limits, fraction):
-    arm = Arm(live_motions[0], six_axis_limits).begin().ask("override", fraction).run(100)
+def test_at_rest_at_the_start_a_rate_is_taken_up_at_once(live_motions, fraction):
+    arm = Arm(live_motions[0], SIX_AXES).begin().ask("override", fraction).run(100)
     assert set(arm.bounds) == {"plan"}
     np.testing.assert_allclose(arm.times, fraction * PERIOD * np.arange(1, 101), atol=1e-15)
-    held = Arm(live_motions[0], six_axis_limits).begin().ask("hold").run(100)
+    held = Arm(live_motions[0], SIX_AXES).begin().ask("hold").run(100)
     assert set(held.times) == {0.0}
     held.ask("override", fraction).ask("resume").run(100)
     np.testing.assert_array_equal(held.times[100:], arm.times)
 
 
-def test_an_override_lasts_from_one_beginning_to_the_next_and_a_hold_does_not(
-    live_motions, six_axis_limits
-):
-    arm = (
-        Arm(live_motions[0], six_axis_limits)
-        .begin()
-        .run(300)
-        .ask("override", 0.5)
-        .ask("hold")
-        .run(9)
-    )
+def test_an_override_lasts_from_one_beginning_to_the_next_and_a_hold_does_not(live_motions):
+    arm = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("override", 0.5).ask("hold").run(9)
     arm.begin()
     assert arm.player.rate == 0.5
     arm.ask("override", 1.0)
@@ -629,18 +613,16 @@ def test_an_override_lasts_from_one_beginning_to_the_next_and_a_hold_does_not(
 
 
 @pytest.mark.parametrize("fraction", [-1e-9, 1.0 + 1e-9, np.nan, np.inf])
-def test_a_fraction_that_is_none_is_refused_and_changes_nothing(
-    live_motions, six_axis_limits, fraction
-):
-    arm = Arm(live_motions[0], six_axis_limits).begin().run(300)
+def test_a_fraction_that_is_none_is_refused_and_changes_nothing(live_motions, fraction):
+    arm = Arm(live_motions[0], SIX_AXES).begin().run(300)
     with pytest.raises(InvalidSetting, match="override"):
         arm.player.override(fraction)
     arm.run(100)
     assert arm.player.rate == 1.0
 
 
-def test_the_session_may_override_and_stop_it(live_motions, six_axis_limits):
-    player = TrajectoryPlayer(live_motions[0], PERIOD, six_axis_limits)
+def test_the_session_may_override_and_stop_it(live_motions):
+    player = TrajectoryPlayer(live_motions[0], PERIOD, SIX_AXES)
     stop_cycles = int(0.5 / PERIOD)
     execution = MotionExecution(player, 6, settle_cycles=3, stop_cycles=stop_cycles)
     assert execution.override(0.9) is None  # before it begins, as after
@@ -655,9 +637,9 @@ def test_the_session_may_override_and_stop_it(live_motions, six_axis_limits):
     assert execution.override(1.5) is not None
 
 
-def test_a_motion_that_ends_in_the_middle_of_a_hold_is_over(live_motions, six_axis_limits):
+def test_a_motion_that_ends_in_the_middle_of_a_hold_is_over(live_motions):
     cycles = int(live_motions[1].duration / PERIOD)
-    arm = Arm(live_motions[1], six_axis_limits).begin().run(cycles - 10).ask("hold").run(1000)
+    arm = Arm(live_motions[1], SIX_AXES).begin().run(cycles - 10).ask("hold").run(1000)
     assert arm.player.finished
     rate, bounds = arm.player.rate, arm.player.bounds
     assert rate > 0.0  # of a time that moves nothing any more

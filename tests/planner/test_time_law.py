@@ -17,6 +17,7 @@ from planner.time_law import (
     ramp,
     slowing_bounds,
 )
+from tests.planner.six_axes import SIX_AXES, random_points
 
 fractions = st.one_of(st.sampled_from([0.0, 0.2, 1.0]), st.floats(0.0, 1.0))
 bounds_of_any_size = st.builds(RateBounds, st.floats(0.01, 100.0), st.floats(0.01, 1000.0))
@@ -184,8 +185,8 @@ def test_a_path_that_uses_less_than_its_limits_may_slow_faster(joints, used, mor
 
 
 @pytest.fixture(scope="module")
-def motions(six_axis_limits, random_points):
-    return [plan(random_points(seed, 4), six_axis_limits) for seed in range(6)]
+def motions():
+    return [plan(random_points(seed, 4), SIX_AXES) for seed in range(6)]
 
 
 @given(
@@ -197,9 +198,9 @@ def motions(six_axis_limits, random_points):
 )
 @settings(max_examples=60)
 def test_a_change_of_rate_keeps_its_bounds_between_the_set_points_too(
-    motions, six_axis_limits, which, share, factors, from_rate, to_rate
+    motions, which, share, factors, from_rate, to_rate
 ):
-    motion, limits = motions[which], six_axis_limits
+    motion, limits = motions[which], SIX_AXES
     way = ramp(from_rate, 0.0, to_rate, slowing_bounds(limits, *factors, motion.extrema()))
     t = np.linspace(0.0, way.duration, 2000)
     s, r, dr = np.array([way.sample(float(x)) for x in t]).T[:, :, None]

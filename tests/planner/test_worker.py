@@ -25,6 +25,7 @@ from planner.worker import (
     plan_in_child,
     stream_in_children,
 )
+from tests.planner.six_axes import SIX_AXES, join, random_points
 
 # Legal states that crash community ruckig 0.19.4: |a| exactly at its limit.
 CRASH = {
@@ -113,7 +114,7 @@ def test_the_solver_crashes_on_legal_input():
     assert done.returncode == -signal.SIGSEGV
 
 
-def test_the_states_that_crash_the_solver_are_not_asked_for(join):
+def test_the_states_that_crash_the_solver_are_not_asked_for():
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
@@ -121,17 +122,17 @@ def test_the_states_that_crash_the_solver_are_not_asked_for(join):
     assert join(np.array([[p, -v, a]]), np.array([[p, v, a]]), limits, 0.1) is None
 
 
-def test_planning_in_a_child_is_planning(six_axis_limits, random_points):
+def test_planning_in_a_child_is_planning():
     points = random_points(3)
-    motion = plan_in_child(points, six_axis_limits, fly=0.25)
-    assert same(motion, plan(points, six_axis_limits, fly=0.25))
+    motion = plan_in_child(points, SIX_AXES, fly=0.25)
+    assert same(motion, plan(points, SIX_AXES, fly=0.25))
     assert not motion.knots[0].flags.writeable
     assert not motion.coefficients[0].flags.writeable
 
 
-def test_errors_come_back_whole(six_axis_limits, random_points):
+def test_errors_come_back_whole():
     with pytest.raises(InvalidSetting, match="fly = 2") as caught:
-        plan_in_child(random_points(3), six_axis_limits, fly=2.0)
+        plan_in_child(random_points(3), SIX_AXES, fly=2.0)
     assert (caught.value.name, caught.value.value) == ("fly", 2.0)
 
 
@@ -172,30 +173,28 @@ def together(children, points, limits, speed=None):
     return map_in_children(children, plan_chunk, chunks_of(len(points), 32), arguments)
 
 
-def test_a_solver_that_aborts_ends_the_child_only(aborting_solver, six_axis_limits, random_points):
+def test_a_solver_that_aborts_ends_the_child_only(aborting_solver):
     points = random_points(5)
     with WorkerProcess() as child:
         before = child.call(os.getpid)
         assert child.call(os.getpid) == before == child.pid  # kept warm
         for _ in range(2):
             with pytest.raises(PlannerCrashed, match="signal 6") as caught:
-                child.call(plan, points, six_axis_limits, speed=CREEP)
+                child.call(plan, points, SIX_AXES, speed=CREEP)
             assert caught.value.status == -signal.SIGABRT
         assert child.call(os.getpid) != before
-        assert same(child.call(plan, points, six_axis_limits), plan(points, six_axis_limits))
+        assert same(child.call(plan, points, SIX_AXES), plan(points, SIX_AXES))
     assert gone(before, 5.0)
     with pytest.raises(PlannerCrashed):
-        plan_in_child(points, six_axis_limits, speed=CREEP)
-    assert same(plan_in_child(points, six_axis_limits), plan(points, six_axis_limits))
+        plan_in_child(points, SIX_AXES, speed=CREEP)
+    assert same(plan_in_child(points, SIX_AXES), plan(points, SIX_AXES))
 
 
-def test_a_process_that_cannot_start_is_an_error_of_its_own(
-    tmp_path, monkeypatch, six_axis_limits, random_points
-):
+def test_a_process_that_cannot_start_is_an_error_of_its_own(tmp_path, monkeypatch):
     (tmp_path / "ruckig.py").write_text("raise SystemExit(3)", encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     with workers(2) as children, pytest.raises(PlannerNotStarted, match="status 3"):
-        together(children, [random_points(0)] * 3, six_axis_limits)
+        together(children, [random_points(0)] * 3, SIX_AXES)
     with WorkerProcess() as child:
         with pytest.raises(PlannerNotStarted, match="status 3"):
             child.call(abs, -1)
@@ -228,20 +227,20 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert gone(int(done.stdout), 2.0), done.stderr
 
 
-def test_a_crash_costs_a_search_one_individual(aborting_solver, six_axis_limits, random_points):
+def test_a_crash_costs_a_search_one_individual(aborting_solver):
     points = np.array([random_points(seed) for seed in range(80)])
     speed = np.ones((80, 6))
     deadly = [0, 41, 79]
     speed[deadly, 0] = CREEP
     with workers(2) as children:
-        planned = together(children, points, six_axis_limits, speed)
+        planned = together(children, points, SIX_AXES, speed)
         assert [
             i for i, motion in enumerate(planned) if isinstance(motion, PlannerCrashed)
         ] == deadly
         for index in sorted({*range(80)} - {*deadly}):
-            (alone,) = plan_chunk(points[[index]], speed[[index]], six_axis_limits, 0.5)
+            (alone,) = plan_chunk(points[[index]], speed[[index]], SIX_AXES, 0.5)
             assert same(planned[index], alone)
-        again = together(children, points[:40], six_axis_limits)  # both are whole
+        again = together(children, points[:40], SIX_AXES)  # both are whole
         assert not any(isinstance(motion, Exception) for motion in again)
 
 
@@ -318,20 +317,18 @@ def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
         assert child.receive() == child.pid
 
 
-def test_a_worker_used_on_both_sides_of_a_fork_gives_each_its_own_motions(
-    six_axis_limits, random_points
-):
+def test_a_worker_used_on_both_sides_of_a_fork_gives_each_its_own_motions():
     points = np.array([random_points(seed) for seed in range(64)])
     with workers(1) as children:
-        before = together(children, points, six_axis_limits)
+        before = together(children, points, SIX_AXES)
 
         def backwards() -> bool:
-            motions = together(children, points[::-1], six_axis_limits)
+            motions = together(children, points[::-1], SIX_AXES)
             children[0].close()
             return all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
 
         assert in_fork(backwards)
-        after = together(children, points, six_axis_limits)
+        after = together(children, points, SIX_AXES)
         assert all(same(a, b) for a, b in zip(after, before, strict=True))
 
 
