@@ -230,6 +230,10 @@ class TestDigest:
         ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
         assert digest.take([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
 
+    def test_everything_else_passes_in_order(self):
+        changed = [StateChanged(State.OPEN, State.EXITING, k) for k in range(50)]
+        assert Digest().take(changed, 0.0) == changed
+
 
 class TestControlBlock:
     def test_each_field_keeps_its_own_value(self):

@@ -566,6 +566,14 @@ def test_what_keeps_its_bounds_passes(jerk_shares, bounds):
         assert len(passed(correcting(kind), rows, bounds)) == len(rows)
 
 
+def test_wider_bounds_of_corrections_last_until_no_difference_reaches_back():
+    checks = correcting("velocity")
+    rows = profile([290.0] * 10, 2)
+    for cycle, row in enumerate(rows[:7]):
+        checks.check_motion(row, "stop" if cycle < 5 else "plan", cycle)
+    refused(JerkLimit, checks.check_motion, rows[7], "plan", 7)
+
+
 @given(st.integers(0, N - 1), st.sampled_from([np.nan, np.inf, -np.inf]))
 def test_no_correction_that_is_not_finite_passes(joint, value):
     row, checks = at(joint, 1.0), correcting("velocity")
