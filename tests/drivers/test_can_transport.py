@@ -98,15 +98,18 @@ class TestUdpMulticast(CanContract):
         far.close()
 
 
+def slcan(port: str, profile: str = "fd", period: float = 0.002) -> CanSpec:
+    return CanSpec("slcan", port, profile, period=period, options={"sleep_after_open": 0.0})
+
+
 class TestSlcan(CanContract):
     """Through pyserial on a pseudo-terminal to a small emulated adapter."""
 
     @pytest.fixture
     def link(self, profile):
         bus = SlcanBus()
-        options = {"sleep_after_open": 0.0}
-        near = CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open()
-        far = open_far_end(CanSpec("slcan", bus.ports[1], profile, period=0.002, options=options))
+        near = slcan(bus.ports[0], profile).open()
+        far = open_far_end(slcan(bus.ports[1], profile))
         far.receive(0.0)
         yield near, Far(far)
         near.close()
@@ -116,8 +119,7 @@ class TestSlcan(CanContract):
 
     def test_the_adapter_is_told_the_bit_rates(self, profile):
         bus = SlcanBus()
-        options = {"sleep_after_open": 0.0}
-        CanSpec("slcan", bus.ports[0], profile, period=0.002, options=options).open().close()
+        slcan(bus.ports[0], profile).open().close()
         bus.close()
         assert [rate for rate in bus.rates[0] if rate] == (
             ["S8", "Y5"] if profile == "fd" else ["S8"]
@@ -125,8 +127,7 @@ class TestSlcan(CanContract):
 
     def test_an_adapter_that_is_pulled_out_is_a_closed_link(self):
         bus = SlcanBus()
-        options = {"sleep_after_open": 0.0}
-        near = CanSpec("slcan", bus.ports[0], period=0.002, options=options).open()
+        near = slcan(bus.ports[0]).open()
         bus.close()
         with pytest.raises(TransportClosed):
             for _ in range(20):
@@ -336,9 +337,8 @@ def test_an_adapter_that_refuses_the_bit_rate_is_let_go(monkeypatch, caplog):
 
     monkeypatch.setattr(can.interfaces.slcan.slcanBus, "set_bitrate", refuse)
     bus = SlcanBus()
-    options = {"sleep_after_open": 0.0}
     with pytest.raises(TransportError, match="no such rate") as caught:
-        CanSpec("slcan", bus.ports[0], period=0.002, options=options).open()
+        slcan(bus.ports[0]).open()
     del caught
     gc.collect()
     bus.close()
@@ -475,10 +475,9 @@ def test_a_motion_survives_lost_cycles(profile):
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_whole_session_over_two_serial_adapters(profile):
     bus = SlcanBus()
-    options = {"sleep_after_open": 0.0}
     ends = (
-        CanSpec("slcan", bus.ports[0], profile, period=PERIOD, options=options).open(),
-        open_far_end(CanSpec("slcan", bus.ports[1], profile, period=PERIOD, options=options)),
+        slcan(bus.ports[0], profile, PERIOD).open(),
+        open_far_end(slcan(bus.ports[1], profile, PERIOD)),
     )
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     bus.close()

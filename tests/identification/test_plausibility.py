@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pinocchio as pin
@@ -327,7 +327,7 @@ def test_all_torques_negated_are_one_finding(model: RobotModel) -> None:
     assert "all torques seem to have the other sign" in finding.words
 
 
-@pytest.fixture(scope="module")
+@cache
 def arm() -> tuple[RobotModel, Array, Array, Array]:
     """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
     urdf = packaged_urdf("ur5_robot.urdf")
@@ -343,18 +343,14 @@ def arm() -> tuple[RobotModel, Array, Array, Array]:
     return model, values, position, diagonal
 
 
-def test_the_diagonal_is_that_of_the_composite_rigid_body_algorithm(
-    arm: tuple[RobotModel, Array, Array, Array],
-) -> None:
-    model, values, position, diagonal = arm
+def test_the_diagonal_is_that_of_the_composite_rigid_body_algorithm() -> None:
+    model, values, position, diagonal = arm()
     matrices = inertia_matrices(model, values, position)
     np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
 
 
-def test_a_joint_that_is_off_is_named_and_a_silent_one_is_not(
-    arm: tuple[RobotModel, Array, Array, Array],
-) -> None:
-    model, values, position, diagonal = arm
+def test_a_joint_that_is_off_is_named_and_a_silent_one_is_not() -> None:
+    model, values, position, diagonal = arm()
     theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
     found = inertia_ratio(model, values, position, theirs)
     assert found is not None
@@ -365,6 +361,6 @@ def test_a_joint_that_is_off_is_named_and_a_silent_one_is_not(
     assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
 
 
-def test_zeros_are_no_inertia(arm: tuple[RobotModel, Array, Array, Array]) -> None:
-    model, values, position, diagonal = arm
+def test_zeros_are_no_inertia() -> None:
+    model, values, position, diagonal = arm()
     assert inertia_ratio(model, values, position, 0.0 * diagonal) is None
