@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from traceback import extract_tb
 from typing import Any, Final, cast
 
 import numpy as np
@@ -193,7 +194,8 @@ class JudgedSession(Judged):
         try:
             self.deliver(packet, now - self.now)
         except AssertionError as error:
-            self.broken.append(str(error).partition("\n")[0])
+            line = extract_tb(error.__traceback__)[-1].line
+            self.broken.append(str(error).partition("\n")[0] or str(line))
         return self._heard.replies[-1] or None
 
     def tick(self, now: float) -> None:
