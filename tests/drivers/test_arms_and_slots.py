@@ -127,10 +127,6 @@ class Bench:
         assert len(reply) == oracle.length(len(self.slots))
         return received, oracle.parse(reply, len(self.slots))
 
-    def obey(self, answer: oracle.Packet) -> None:
-        for slot in self.joint_slots:
-            self.d1[slot] = answer.axes[slot].floats[0]
-
     def set_joints(self, mode: int) -> None:
         for slot in self.joint_slots:
             self.modes[slot] = mode

@@ -52,39 +52,21 @@ TRUTH = PlantTruth(*map(np.array, _PLANTED))
 FRICTIONLESS = PlantTruth.frictionless(TRUTH.rotor_inertia)
 
 
-@dataclass
-class SmoothMotion:
-    """Sinusoids with a soft start and end, all axes at once, DH angles."""
-
-    time: Array
-    q: Array
-    qd: Array
-    qdd: Array
-
-
-def _smooth_motion() -> SmoothMotion:
+def _smooth_motion() -> tuple[Array, Array]:
     """Three seconds within the NS 16's limits at up to about a third of its speeds."""
     duration, n = 3.0, int(3.0 / PERIOD)
-    t = np.arange(n + 1) * PERIOD
-    s = t / duration
+    s = np.arange(n + 1) * PERIOD / duration
     window = 30 * s**2 * (1 - s) ** 2 / duration  # dx/dt of the quintic from 0 to 1
     phase = 10 * s**3 - 15 * s**4 + 6 * s**5
-    rate = 60 * s * (1 - s) * (1 - 2 * s) / duration**2
     centre = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
     swing = np.radians([40.0, 25.0, 30.0, 70.0, 40.0, 90.0])
     turns = np.array([2, 2, 2, 2, 3, 2]) * pi
     angle = phase[:, None] * turns
-    q = centre + swing * np.sin(angle)
-    qd = swing * turns * np.cos(angle) * window[:, None]
-    qdd = (
-        swing
-        * turns
-        * (np.cos(angle) * rate[:, None] - turns * np.sin(angle) * window[:, None] ** 2)
-    )
-    return SmoothMotion(t, q, qd, qdd)
+    return centre + swing * np.sin(angle), swing * turns * np.cos(angle) * window[:, None]
 
 
-SMOOTH = _smooth_motion()
+SMOOTH_Q, SMOOTH_QD = _smooth_motion()
+"""Sinusoids with a soft start and end, all axes at once, DH angles: rad and rad/s, (m, 6)."""
 
 
 @dataclass
@@ -149,10 +131,10 @@ def play(
         settings,
         seed=seed,
         effects=effects or UnmodelledEffects(),
-        initial_position=SMOOTH.q[0],
+        initial_position=SMOOTH_Q[0],
     )
     turn = motor_matrix(drive)
-    angles = SMOOTH.q * drive.joint_sign + drive.joint_offset
+    angles = SMOOTH_Q * drive.joint_sign + drive.joint_offset
     targets = angles @ turn.T + drive.calibration
-    deltas = (SMOOTH.qd * drive.joint_sign) @ turn.T * PERIOD
+    deltas = (SMOOTH_QD * drive.joint_sign) @ turn.T * PERIOD
     return controller, MinimalPC(controller, targets, deltas).run()

@@ -33,7 +33,7 @@ from sim_fixtures import (
 from sim_fixtures.controller import RUN_UP, OwnMotion
 from sim_fixtures.program import MISSING, Answer, LoopProgram, StartStep
 from tests.fault_matrix import small_cell
-from tests.sim_fixtures.bench import DRIVE, SMOOTH, TRUTH, make_drive, motor_matrix, play
+from tests.sim_fixtures.bench import DRIVE, SMOOTH_Q, TRUTH, make_drive, motor_matrix, play
 
 Array = NDArray[np.float64]
 Fields = dict[int, Any]
@@ -280,7 +280,7 @@ class TestFollowing:
         assert np.all(error < 0.2 * np.array(DRIVE.following_error))
         assert np.all(np.abs(d[:, :, 4]).max(axis=0) < 0.75 * np.array(DRIVE.current_limit))
         # the arm really was where the motion wanted it, one cycle after the target was sent
-        np.testing.assert_allclose(log.q[1:], SMOOTH.q[:-1], atol=4e-3)
+        np.testing.assert_allclose(log.q[1:], SMOOTH_Q[:-1], atol=4e-3)
         assert np.abs(log.qd).max() > 1.0
 
     def test_the_stated_velocity_is_that_of_the_motion(self) -> None:
