@@ -31,7 +31,7 @@ from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from sim_fixtures.can_end import CanFarEnd
-from tests.drivers.rig import limits, smooth_move
+from tests.drivers.rig import MOVE, limits, smooth_move
 from tests.drivers.transport_contract import TransportContract
 
 N = 6
@@ -202,7 +202,6 @@ def ns16_controller(**settings) -> SimulatedController:
     )
 
 
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 PERIOD = 0.002
 
 

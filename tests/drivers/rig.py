@@ -31,6 +31,7 @@ N = 6
 PERIOD_MS = 2
 PERIOD = 0.002
 START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
+MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 NOT_SET_POINTS = (Mode.DRIVE_OFF_REQUEST, Mode.FOLLOWING_ERROR)
 
 
@@ -211,6 +212,12 @@ def smooth_move(distance, cycles: int, start=START) -> Table:
     s = np.linspace(0.0, 1.0, cycles + 1)[:, None]
     share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
     return Table(np.asarray(start) + share * np.asarray(distance))
+
+
+def accelerating(acceleration: float, cycles: int = 40) -> np.ndarray:
+    """Joint 2 leaves with a jump in acceleration; limits on jerk have to be wide."""
+    t = np.arange(cycles)[:, None] * PERIOD
+    return START + 0.5 * acceleration * t**2 * np.eye(N)[1]
 
 
 class Unspeakable(BaseException):

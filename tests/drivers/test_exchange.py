@@ -21,9 +21,7 @@ from drivers import (
     exchange,
 )
 from drivers.exchange.loop import MOST_KINDS
-from tests.drivers.rig import PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
-
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
+from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
 
 
 class Controller:

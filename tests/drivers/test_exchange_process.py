@@ -41,6 +41,7 @@ from drivers.transports.base import TransportError
 from drivers.transports.udp import UdpSpec, UdpTransport
 from hil.demo_link import free_port
 from tests.drivers.rig import (
+    MOVE,
     PERIOD,
     START,
     Cruise,
@@ -187,7 +188,6 @@ class UdpController:
         )
 
 
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 ORDINARY = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
 
 

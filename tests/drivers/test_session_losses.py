@@ -27,6 +27,7 @@ from drivers.packets import LAST_NUMBER
 from drivers.session import Sequence
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
+    MOVE,
     PERIOD,
     START,
     Cruise,
@@ -357,9 +358,6 @@ class TestAfterAGapWithoutAMotion:
         rig.axes["d"][0] = 3.0
         rig.cycle()
         assert rig.state is State.EXITING
-
-
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
 
 def planned() -> TrajectoryPlayer:

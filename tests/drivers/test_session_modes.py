@@ -30,6 +30,7 @@ from drivers.packets import DRIVE_ON, MODE_FIELDS
 from drivers.states import CORRECTION_MODES, HOLDABLE, INCREMENTAL, POSITION_MODES
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
+    MOVE,
     PERIOD,
     START,
     Correction,
@@ -39,6 +40,7 @@ from tests.drivers.rig import (
     Rig,
     Table,
     Unspeakable,
+    accelerating,
     all_drive_off,
     assert_refused,
     bump,
@@ -51,7 +53,6 @@ from tests.drivers.rig import (
     smooth_move,
 )
 
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 HEIGHT = np.array([0.01, -0.005, 0.02, 0.01, -0.01, 0.005])
 AMPERES = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 0.25])
 MOVED = (2, 7, 8)
@@ -425,15 +426,12 @@ class TestCorrections:
         assert not d[3, 1:3].any()
 
 
-WAY = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
-
-
-def player(start=START) -> TrajectoryPlayer:
+def player() -> TrajectoryPlayer:
     bounds = limits()
     of_joints = JointLimits(
         bounds.lower, bounds.upper, bounds.velocity, bounds.acceleration, bounds.jerk
     )
-    path = plan(np.vstack((start, start + WAY)), of_joints, fly=0.0)
+    path = plan(np.vstack((START, START + MOVE)), of_joints, fly=0.0)
     return TrajectoryPlayer(path, PERIOD, of_joints)
 
 
@@ -488,7 +486,7 @@ class TestHold:
         assert not at_rest(rig)
         rig.run_to("completed")
         end = rig.train.joint_position(rig.axes["d"][:, 0])
-        np.testing.assert_allclose(end, START + WAY, atol=1e-6)
+        np.testing.assert_allclose(end, START + MOVE, atol=1e-6)
 
     @pytest.mark.parametrize("cycles", [3, 300])
     def test_a_stop_ends_a_hold(self, cycles):
@@ -613,21 +611,15 @@ WIDE = {"jerk": np.full(N, 1e9)}
 
 
 class Overridable(GoesOn):
-    """Has the bounds that it was given from the first override on."""
+    """Has the bounds of an override from the first on."""
 
-    def __init__(self, positions, then="override"):
+    def __init__(self, positions):
         super().__init__(positions)
-        self.then = then
         self.fractions = []
 
     def override(self, fraction):
         self.fractions.append(fraction)
-        self.bounds = self.then
-
-
-def accelerating(acceleration: float, cycles: int = 40) -> np.ndarray:
-    t = np.arange(cycles)[:, None] * PERIOD
-    return START + 0.5 * acceleration * t**2 * np.array([0, 1, 0, 0, 0, 0])
+        self.bounds = "override"
 
 
 def test_it_may_be_told_before_the_motion_begins():

@@ -16,6 +16,7 @@ from drivers import (
 from drivers.errors import FirstSetPointUnknown, MotionUnknown
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
+    MOVE,
     PERIOD,
     START,
     Cruise,
@@ -31,8 +32,6 @@ from tests.drivers.rig import (
     smooth_move,
     still,
 )
-
-MOVE = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
 
 
 class TestFromRequestToRest:

@@ -46,6 +46,7 @@ from tests.drivers.rig import (
     Rig,
     Table,
     Unspeakable,
+    accelerating,
     all_drive_off,
     assert_refused,
     bump,
@@ -70,13 +71,6 @@ def play(rows, velocities=None, bounds="plan", **options) -> tuple[Rig, CyclicPa
     return rig, rig.cycle(len(rows) - 1)
 
 
-def constant_acceleration(acceleration: float, cycles: int = 40) -> np.ndarray:
-    """Joint 2 leaves with a jump in acceleration; limits on jerk have to be wide."""
-    t = np.arange(cycles)[:, None] * 0.002
-    direction = np.array([0, 1, 0, 0, 0, 0])
-    return START + 0.5 * acceleration * t**2 * direction
-
-
 class TestRefusedSetPoints:
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("part", ["position", "velocity"])
@@ -96,8 +90,8 @@ class TestRefusedSetPoints:
                 rig.session.stop()
             return rig, rig.cycle(len(rows) - 1)
 
-        assert play_on(constant_acceleration(8.0 * factor * 0.999))[0].state is State.OPEN
-        rig, answer = play_on(constant_acceleration(8.0 * factor * 1.001)[:3])
+        assert play_on(accelerating(8.0 * factor * 0.999))[0].state is State.OPEN
+        rig, answer = play_on(accelerating(8.0 * factor * 1.001)[:3])
         assert_refused(rig, answer, AccelerationLimit)
 
     @pytest.mark.parametrize("bounds", ["override", "stop"])

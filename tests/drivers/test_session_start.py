@@ -25,6 +25,7 @@ from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_answer
 from drivers.session import MAX_GAP
 from tests.drivers.rig import (
+    MOVE,
     PERIOD,
     START,
     N,
@@ -572,14 +573,13 @@ class TestAcceptedInit:
 
     def test_records_and_set_points_use_them(self):
         rig = self.adopting(self.GEAR, ("calibration", 4, 0.75))
-        move = np.array([0.15, -0.1, 0.125, -0.15, 0.1, 0.2])
-        rig.session.request(smooth_move(move, 300))
+        rig.session.request(smooth_move(MOVE, 300))
         rig.open()
         np.testing.assert_allclose(rig.records[-1]["position"], START, atol=1e-6)
         rig.run_to("completed")
         end = rig.axes["d"][:, 0]
-        np.testing.assert_allclose(rig.train.joint_position(end), START + move, atol=1e-6)
-        motor = drive_train().motor_revolutions(START + move)
+        np.testing.assert_allclose(rig.train.joint_position(end), START + MOVE, atol=1e-6)
+        motor = drive_train().motor_revolutions(START + MOVE)
         assert abs(end[2] - motor[2]) > 0.01
         np.testing.assert_allclose(end[4] - motor[4], 0.5, atol=1e-5)
 
