@@ -40,7 +40,6 @@ LONG: Final = (
     "hil/test_batch_dask.py",
     "hil/test_batch_trend.py",
     "hil/test_campaign_day.py",
-    "hil/test_campaign_from_python.py",
     "hil/test_campaign_plan.py",
     "hil/test_cli.py",
     "hil/test_compare.py",

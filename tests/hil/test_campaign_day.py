@@ -1,25 +1,32 @@
-"""A day with a campaign, and how it was run, as its folder tells it."""
+"""A campaign as its document, a script and its folder have it."""
 
 from __future__ import annotations
 
 import gc
+import hashlib
 import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import hil
 from hil.archive.header import motion_name
-from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, Stop
+from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, MotionRefusedError, Stop
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
+from hil.campaign.intervals import at_limit, way
 from hil.campaign.operator import RunStatus, Unattended
 from hil.campaign.status import conduct_of
 from hil.campaign.warmup import WarmMotion, WarmUp
@@ -27,10 +34,13 @@ from hil.cell import Cell
 from hil.cli import app
 from hil.design import DesignResult
 from hil.identify import identify_campaign
+from hil.motion_checks import MotionChecks
+from hil.move import straight_way
 from hil.progress import Silent
 from hil.recording import dated_anew, origin_of
 from hil.report.page import when
 from hil.version import software
+from planner import TrajectoryPlayer
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
@@ -83,9 +93,6 @@ def test_every_command_of_the_document_does_what_it_says(day: dict[str, str]) ->
     assert day["run runs/mine --accept-dry-run"].rstrip().splitlines()[-1].startswith("The model")
     assert "every step is done" in day["status runs/mine"]
     assert day["report runs/mine"].rstrip().endswith("report.html")
-
-
-def test_status_as_json_names_every_step(day: dict[str, str]) -> None:
     found = json.loads(day["status runs/mine --json"])
     assert [(step["name"], step["state"]) for step in found["steps"]] == [
         (name, "done")
@@ -215,7 +222,7 @@ def folder(ran: Campaign, tmp_path: Path) -> CampaignFolder:
     return CampaignFolder(tmp_path / "campaign")
 
 
-def test_every_archive_is_told_with_its_cycles(ran: Campaign) -> None:
+def test_every_archive_and_what_was_left_out_is_in_the_conduct(ran: Campaign) -> None:
     found = conduct_of(ran.folder)
     assert [one.archive for one in found.recorded] == [e.name for e in ran.folder.manifest()]
     for one in found.recorded:
@@ -223,13 +230,12 @@ def test_every_archive_is_told_with_its_cycles(ran: Campaign) -> None:
         assert one.seconds == pytest.approx((one.cycles - 1) * ran.cell.period, abs=1e-6)
         assert (one.missed, one.late, one.lost, one.why) == (0, 0, 0, "")
     assert found.warm_up is None
-
-
-def test_what_was_left_out_is_said(ran: Campaign) -> None:
     steps = {one.step: one for one in conduct_of(ran.folder).steps}
     assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
     assert not steps["dry run"].done
     assert steps["repetitions"].words.startswith("2 whole")
+    found = identify_campaign(ran.folder.root, Silent())
+    assert found.results.conduct == conduct_of(ran.folder)
 
 
 def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolder) -> None:
@@ -259,14 +265,11 @@ def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolde
     assert (found.recorded[-1].outcome, found.recorded[-1].why) == ("rejected", "it was held")
 
 
-def test_what_is_of_another_plan_does_not_count(folder: CampaignFolder) -> None:
+def test_what_is_of_another_plan_or_unreadable_does_not_count(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
     (step,) = (one for one in conduct_of(folder).steps if one.step == "rehearsal")
     assert not step.done and "another cell, URDF or plan" in step.words
-
-
-def test_what_cannot_be_read_is_told_and_stops_nothing(folder: CampaignFolder) -> None:
     for path in (folder.rehearsal, folder.dry_run, folder.warmup):
         path.write_text("{")
     gone = folder.manifest()[-1]
@@ -279,12 +282,7 @@ def test_what_cannot_be_read_is_told_and_stops_nothing(folder: CampaignFolder) -
     assert gone.name not in {one.archive for one in found.recorded}
 
 
-def test_identify_puts_it_into_the_results(ran: Campaign) -> None:
-    found = identify_campaign(ran.folder.root, Silent())
-    assert found.results.conduct == conduct_of(ran.folder)
-
-
-def test_a_motion_in_real_time_has_the_date_on_which_it_began_and_virtual_time_has_none() -> None:
+def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     cell = Cell.load(CELL_PATH)
     assert "recorded_at" not in origin_of(cell)
     said = origin_of(cell, virtual=False)
@@ -293,9 +291,6 @@ def test_a_motion_in_real_time_has_the_date_on_which_it_began_and_virtual_time_h
     earlier = {**said, "recorded_at": "2026-03-01T08:00:00+00:00"}
     assert dated_anew(earlier)["recorded_at"] >= said["recorded_at"]
     assert "recorded_at" not in dated_anew({"simulated": "yes"})
-
-
-def test_the_report_says_from_when_to_when(ran: Campaign) -> None:
     recorded = conduct_of(ran.folder).recorded
     assert when(recorded).startswith("No date")
     dates = ("2026-03-01T10:05:00+00:00", "2026-03-01T08:01:30+00:00")
@@ -315,3 +310,199 @@ def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
     )
     lost = MotionFailedError(motion_name("dryrun", 1), "lost", "the link went silent")
     assert lost.sentence == "dry run 2 was lost: the link went silent"
+
+
+# A campaign as a script has it: what it may be given, what it says of itself, and its bytes.
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """A plan of one repetition; only read it."""
+    folder = tmp_path_factory.mktemp("designed")
+    return fast_campaign(folder / "campaign", fast_cell(folder, repetitions=1), rehearsed=False)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory, planned: Campaign) -> Campaign:
+    """The same, run without a rehearsal; only read it."""
+    root = tmp_path_factory.mktemp("done") / "a"
+    campaign = Campaign.create(root, planned.cell, planned.plan)
+    campaign.run(unrehearsed=True, durable=False)
+    return campaign
+
+
+@pytest.fixture
+def campaign(tmp_path: Path, planned: Campaign) -> Campaign:
+    return Campaign.create(tmp_path / "campaign", planned.cell, planned.plan)
+
+
+# --- what it may be given
+
+
+def test_folders_may_be_text_and_arguments_have_their_names(
+    tmp_path: Path, planned: Campaign
+) -> None:
+    root = str(tmp_path / "named")
+    made = Campaign.create(folder=root, cell=planned.cell, excitation=planned.plan)
+    assert Campaign.open(root).folder.plan_hash == made.folder.plan_hash
+    assert made.plan.to_text() == planned.plan.to_text()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"folder": None}, "folder: is None; give the path of a folder"),
+        ({"cell": "cell.toml"}, r"cell: is an object of type str; give .*hil\.Cell\.load"),
+        ({"excitation": None}, "excitation: is None; give an Excitation"),
+        ({"excitation": 3.0}, "excitation: is an object of type float"),
+    ],
+)
+def test_what_is_of_another_type_is_refused_as_a_type_error(
+    wrong: dict[str, object], sentence: str, tmp_path: Path, planned: Campaign
+) -> None:
+    given = {"folder": tmp_path / "c", "cell": planned.cell, "excitation": planned.plan, **wrong}
+    with pytest.raises(TypeError, match=sentence) as refused:
+        Campaign.create(**given)  # type: ignore[arg-type]
+    assert isinstance(refused.value, hil.errors.InputError)
+    assert not (tmp_path / "c").exists()
+
+
+class TestExistOk:
+    """`exist_ok` opens a campaign that fits, so that a script can be run again."""
+
+    def test_what_fits_is_opened_with_what_it_holds(
+        self, campaign: Campaign, planned: Campaign
+    ) -> None:
+        pass_rehearsal(campaign.folder)
+        for excitation in (planned.plan, planned.plan.excitation):
+            again = Campaign.create(campaign.folder.root, planned.cell, excitation, exist_ok=True)
+            assert again.folder.plan_hash == campaign.folder.plan_hash
+            assert again.folder.rehearsal.exists()
+
+    def test_another_cell_or_excitation_is_refused(
+        self, campaign: Campaign, planned: Campaign, tmp_path: Path
+    ) -> None:
+        root, cell = campaign.folder.root, fast_cell(tmp_path, repetitions=7)
+        with pytest.raises(hil.errors.InputError, match="a campaign with another cell"):
+            Campaign.create(root, cell, planned.plan, exist_ok=True)
+        other = replace(planned.plan, validation=planned.plan.validation[:0])
+        with pytest.raises(hil.errors.InputError, match="a campaign with another excitation"):
+            Campaign.create(root, planned.cell, other, exist_ok=True)
+
+    def test_without_it_and_for_other_things_in_the_folder(
+        self, campaign: Campaign, planned: Campaign, tmp_path: Path
+    ) -> None:
+        with pytest.raises(hil.errors.InputError, match="is not empty"):
+            Campaign.create(campaign.folder.root, planned.cell, planned.plan)
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine" / "notes.txt").touch()
+        with pytest.raises(hil.errors.InputError, match="is not empty"):
+            Campaign.create(tmp_path / "mine", planned.cell, planned.plan, exist_ok=True)
+        made = Campaign.create(tmp_path / "new", planned.cell, planned.plan, exist_ok=True)
+        assert made.folder.plan.exists()
+
+
+def test_the_errors_are_there_after_import_hil() -> None:
+    look = "import hil, sys; print(hil.errors.UnsafeError.exit_code, 'numpy' in sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert shown.stdout == "3 False\n"
+
+
+# --- its bytes
+
+
+def checksums(campaign: Campaign) -> dict[str, str]:
+    archives = sorted(campaign.folder.archives.iterdir())
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in archives}
+
+
+def test_one_seed_gives_the_same_bytes_whatever_the_folder_is_called(
+    tmp_path: Path, done: Campaign
+) -> None:
+    again = Campaign.create(tmp_path / "another name", done.cell, done.plan)
+    again.run(unrehearsed=True, durable=False)
+    assert checksums(again) == checksums(done)
+    assert len(checksums(done)) >= 4
+
+
+# --- ways
+
+
+def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(planned: Campaign) -> None:
+    cell, limits = planned.cell, planned.cell.joint_limits
+    start = limits.lower - 4e-7 * (limits.upper - limits.lower)
+    assert np.array_equal(at_limit(start, limits), limits.lower)
+    motions = [way(cell, start, cell.home).trajectory, straight_way(cell, start, cell.home)]
+    assert MotionChecks.of(cell).refusal(motions[0]) is None  # type: ignore[arg-type]
+    player = TrajectoryPlayer(motions[0], cell.period, limits)  # type: ignore[arg-type]
+    player.begin(start)
+    first, _ = player.advance()
+    assert np.abs(first - start).max() < 1e-3
+
+
+@pytest.mark.parametrize("plan_way", [way, straight_way])
+def test_an_arm_beyond_its_limit_is_told_so_in_degrees(
+    plan_way: Callable[..., object], planned: Campaign
+) -> None:
+    cell, start = planned.cell, planned.cell.joint_limits.lower.copy()
+    start[1] -= np.radians(0.5)
+    elbow = np.degrees(start[1])
+    with pytest.raises(
+        MotionRefusedError, match=f"elbow stands at {elbow:.6g}°, its limits are .*jog the arm"
+    ):
+        plan_way(cell, start, cell.home)
+
+
+# --- status
+
+
+def test_a_status_asks_for_gates_as_the_run_does(done: Campaign, campaign: Campaign) -> None:
+    steps = {step.name: step for step in done.status().steps}
+    assert steps["rehearse"].sentence == "left out, as a simulated arm allows"
+    assert steps["dry run"].state == steps["validation"].state == "done"
+    assert done.status().next_command.startswith("hil identify ")
+    (name, *_) = [path.name for path in done.folder.completed("excitation")]
+    (campaign.folder.archives / name).write_bytes((done.folder.archives / name).read_bytes())
+    campaign.folder.add(name, "completed")
+    assert campaign.status().next_command.startswith("hil rehearse ")
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("rehearsal.json", "hil rehearse {} --again"),
+        ("dry_run.json", ""),
+        ("results.json", "hil identify {}"),
+        ("cell.toml", ""),
+    ],
+)
+def test_status_never_names_itself_where_a_file_is_damaged(
+    name: str, command: str, campaign: Campaign, done: Campaign
+) -> None:
+    """Following it leads to an end: to the step's own command, or to a sentence for a person."""
+    folder = campaign.folder
+    for entry in done.folder.manifest():
+        (folder.archives / entry.name).write_bytes((done.folder.archives / entry.name).read_bytes())
+        folder.add(entry.name, entry.outcome)
+    path = folder.root / name
+    path.write_text(path.read_text("utf-8") + "\n# edited" if path.exists() else "{", "utf-8")
+    status = Campaign.open(folder.root).status()
+    assert not status.complete
+    assert status.next_command == command.format(shlex.quote(str(folder.root)))
+    stuck = next(step for step in status.steps if step.state == "next")
+    assert name in stuck.sentence or command
+
+
+def test_a_torn_archive_that_was_replaced_is_nothing_to_run_again(
+    campaign: Campaign, done: Campaign
+) -> None:
+    whole = done.folder.completed("excitation")[0]
+    folder = campaign.folder
+    (folder.archives / "excitation_000_a1.mcap").write_bytes(b"torn")
+    (folder.archives / "move_000_a1.mcap").write_bytes(b"torn")
+    (folder.archives / "excitation_000_a2.mcap").write_bytes(whole.read_bytes())
+    folder.add("excitation_000_a2.mcap", "completed")
+    assert campaign.status().notes == (
+        "excitation_000_a1.mcap was left by a run that was killed; nothing is missing without it",
+        "move_000_a1.mcap was left by a run that was killed; nothing is missing without it",
+    )
