@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -88,34 +89,24 @@ def test_a_flag_has_no_type_in_the_help(arguments: list[str]) -> None:
     assert "<bool>" not in told.stdout
 
 
-class TestInstallCommand:
-    """An extra is installed from where `hil` itself came."""
-
-    class Distribution:
-        def __init__(self, text: str | None) -> None:
-            self._text = text
-
-        def read_text(self, name: str) -> str | None:
-            assert name == "direct_url.json"
-            return self._text
-
-    @pytest.mark.parametrize(
-        ("direct", "command"),
-        [
-            (None, "pip install 'hil[live]'"),
-            (
-                '{"url": "file:///home/a%20b/hil", "dir_info": {"editable": true}}',
-                "pip install -e '/home/a b/hil[live]'",
-            ),
-            ('{"url": "file:///home/hil", "dir_info": {}}', "pip install '/home/hil[live]'"),
-            ('{"url": "https://x.org/hil.whl", "archive_info": {}}', "pip install 'hil[live]'"),
-        ],
-    )
-    def test_is_what_works(
-        self, direct: str | None, command: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("hil.version.distribution", lambda _: self.Distribution(direct))
-        assert install_command("live") == command
+@pytest.mark.parametrize(
+    ("direct", "command"),
+    [
+        (None, "pip install 'hil[live]'"),
+        (
+            '{"url": "file:///home/a%20b/hil", "dir_info": {"editable": true}}',
+            "pip install -e '/home/a b/hil[live]'",
+        ),
+        ('{"url": "file:///home/hil", "dir_info": {}}', "pip install '/home/hil[live]'"),
+        ('{"url": "https://x.org/hil.whl", "archive_info": {}}', "pip install 'hil[live]'"),
+    ],
+)
+def test_an_extra_is_installed_from_where_hil_itself_came(
+    direct: str | None, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = {"direct_url.json": direct}.__getitem__
+    monkeypatch.setattr("hil.version.distribution", lambda _: SimpleNamespace(read_text=read))
+    assert install_command("live") == command
 
 
 def test_the_version_is_that_of_the_package_and_of_what_its_numbers_depend_on() -> None:

@@ -20,7 +20,6 @@ from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import POSTURES, blocks, draw_design
-from hil.plots.plan_picture import broken
 from hil.plots.posture_strip import Strip, covered, outlines, posture_times
 from identification.excitation import correlation, information
 from identification.excitation.constraints import sampled
@@ -140,12 +139,21 @@ class TestArm:
         hull = ConvexHull(surface_points(shape))
         assert 0.93 * volume < hull.volume < 1.0001 * volume
 
-    def test_a_shape_is_placed_as_the_description_says(self):
+    def test_shapes_are_placed_or_replaced_by_bars(self):
         (solid,) = Arm.from_urdf(SHAPES.format('<box size="0.2 0.3 0.4"/>')).solids
         np.testing.assert_allclose(solid.vertices.mean(axis=0), [0.3, -0.1, 0.2], atol=1e-12)
         turned = Rotation.from_euler("xyz", [0.4, 0.5, 0.6])  # fixed axes, as URDF has it
         corner = turned.apply([0.1, 0.15, 0.2]) + np.array([0.3, -0.1, 0.2])
         assert np.min(np.linalg.norm(solid.vertices - corner, axis=1)) < 1e-9
+        lost = Arm.from_urdf(SHAPES.format('<mesh filename="package://nowhere/link.stl"/>'))
+        assert not lost.has_shapes
+        arm = Arm.from_urdf(TWO_LINK.read_text())
+        assert not arm.has_shapes
+        np.testing.assert_allclose(
+            arm.bones(np.zeros((1, 2)))[0],
+            [[[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0], [0.01, 0.0, 1.2]]],
+            atol=1e-12,
+        )
 
     @settings(max_examples=20)
     @given(st.integers(0, 1000))
@@ -161,17 +169,6 @@ class TestArm:
             expected = solid.vertices @ pose.rotation.T + pose.translation
             np.testing.assert_allclose(corners[0], expected, atol=1e-12)
 
-    def test_an_arm_without_shapes_becomes_bars_from_joint_to_joint(self):
-        lost = Arm.from_urdf(SHAPES.format('<mesh filename="package://nowhere/link.stl"/>'))
-        assert not lost.has_shapes
-        arm = Arm.from_urdf(TWO_LINK.read_text())
-        assert not arm.has_shapes
-        np.testing.assert_allclose(
-            arm.bones(np.zeros((1, 2)))[0],
-            [[[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]], [[0.0, 0.0, 1.0], [0.01, 0.0, 1.2]]],
-            atol=1e-12,
-        )
-
 
 class TestPostures:
     def test_a_closed_motion_does_not_show_its_beginning_twice(self, ns16):
@@ -183,7 +180,7 @@ class TestPostures:
         assert times[-1] < back.duration
         np.testing.assert_allclose(np.diff(times), back.duration / 5.0)
 
-    def test_all_that_the_arm_does_is_on_the_paper(self, ns16):
+    def test_the_strip_shows_all_that_the_arm_does(self, ns16, two_link):
         motion = wandering(ns16)
         strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
         fine = Arm.from_urdf(ns16.urdf).corners(
@@ -193,8 +190,6 @@ class TestPostures:
             low, high = strip.extents[axis]
             assert all(low < c[..., axis].min() and c[..., axis].max() < high for c in fine)
         assert strip.extents[2][0] < ns16.workspace.floor
-
-    def test_an_obstacle_nearby_is_shown_and_a_far_one_does_not_shrink_the_arm(self, two_link):
         arm, motion = Arm.from_urdf(two_link.urdf), wandering(two_link)
         near = Strip.of(arm, motion, two_link.workspace, 5).extents
         assert near[0][1] > 0.7
@@ -263,8 +258,6 @@ class TestFront:
         assert "polished" not in " ".join(said)
         assert axes.get_xlim()[1] < 120.0 and axes.get_ylim()[0] > 95.0  # C does not flatten it
         assert not front_axes(draw_design(excitation(two_link, wandering(two_link)), two_link))
-
-    def test_a_polished_motion_shows_where_it_grew_from(self, two_link):
         criteria = excitation(two_link, wandering(two_link)).criteria
         determinant, index = criteria.log10_det, criteria.coupling_index
         front = front_of([determinant - 3.0, determinant - 1.0], [index + 1.0, index + 3.0])
@@ -309,19 +302,6 @@ class TestPage:
         assert "position [deg, controller angles]" in texts(figure)
         equal = [axes for axes in figure.axes if axes.get_aspect() == 1.0 and not axes.images]
         assert len(equal) == 2 * POSTURES  # each from the side and from above
-
-    @pytest.mark.parametrize(
-        ("name", "shown"),
-        [
-            ("joint_2", "joint_2"),
-            ("shoulder_pan_joint", "shoulder_\npan_joint"),
-            ("wrist_3_joint", "wrist_3_\njoint"),
-            ("aVeryLongNameWithoutBreaks7", "aVery…reaks7"),
-            ("left_arm_shoulder_lift_joint_4", "left_arm_\nshoul…oint_4"),
-        ],
-    )
-    def test_long_names_of_joints_are_broken(self, name, shown):
-        assert broken(name) == shown
 
     def test_names_of_joints_do_not_run_into_each_other(self, two_link):
         long = two_link.urdf.replace('name="shoulder"', 'name="shoulder_pan_and_lift_joint_1"')
@@ -397,3 +377,36 @@ class TestPage:
             ]
         for (first, a), (second, b) in combinations(boxes, 2):
             assert not a.overlaps(b), f"{first!r} upon {second!r}"
+
+
+# The arm as it is drawn.
+
+
+SHAPE = '<collision><geometry><box size="0.3 0.1 0.1"/></geometry></collision>'
+URDF = (
+    f'<robot name="r"><link name="base"/><link name="upper">{SHAPE}{SHAPE}</link>'
+    '<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>'
+    '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("<collision>", '<collision><origin xyz="0 0 1e300"/>'), ("0.3 0.1", "0.3 1e308")],
+)
+def test_of_a_shape_beyond_every_robot_nothing_is_drawn(old: str, new: str) -> None:
+    arm = Arm.from_urdf(URDF.replace(old, new, 1))
+    assert len(Arm.from_urdf(URDF).solids) == 2
+    assert len(arm.solids) == 1
+    assert np.isfinite(arm.tips(np.zeros((1, 1)))).all()
+
+
+def test_the_end_of_an_arm_whose_only_shape_is_a_point_is_that_point() -> None:
+    arm = Arm.from_urdf(URDF.replace("0.3 0.1 0.1", "0 0 0"))
+    assert arm.tip.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("size", ["0.3 0.1 0.1", "0.3 0.1 0", "0.3 0 0", "0 0 0", "1e6 1e-9 1"])
+def test_a_body_has_a_surface_however_flat_it_is(size: str) -> None:
+    arm = Arm.from_urdf(URDF.replace("0.3 0.1 0.1", size))
+    assert [solid.faces.shape for solid in arm.solids] == [(12, 3)] * 2

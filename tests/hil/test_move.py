@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import select
 import shutil
-import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +20,7 @@ from hil.move import posture, straight_way, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT, commands
+from tests.hil.screen_rig import on_terminal
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +98,6 @@ class TestOnlyAxis:
         assert isinstance(result.exception, InputError)
         assert "joint 4 moves by the motors of axes 4, 5, 6" in str(result.exception)
 
-    def test_a_posture_needs_all_axes(self) -> None:
-        result = CliRunner().invoke(app, ["move", str(CELL_PATH), "--to", "home", "--only-axis"])
-        assert isinstance(result.exception, InputError)
-
 
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:
     root = tmp_path / "campaign"
@@ -156,16 +148,16 @@ def test_the_way_itself_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
         straight_way(walled, left, right)
 
 
-@pytest.mark.parametrize("text", ["there", "1,2,3", "1,2,3,4,5,nan"])
-def test_what_is_no_posture_is_refused(text: str, ns16: Cell) -> None:
-    with pytest.raises(InputError, match="6 angles in degrees"):
-        posture(ns16, text)
-
-
-@pytest.mark.parametrize("arguments", [[], ["--to", "home", "--joint", "1"], ["--joint", "1"]])
-def test_one_target_is_asked_for(arguments: list[str]) -> None:
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["--to", "home", "--joint", "1"], ["--joint", "1"], ["--to", "home", "--only-axis"],
+     ["--to", "there"], ["--to", "1,2,3"], ["--to", "1,2,3,4,5,nan"]],
+)  # fmt: skip
+def test_one_target_of_six_angles_is_asked_for(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, ["move", str(CELL_PATH), *arguments])
     assert isinstance(result.exception, InputError)
+    if len(arguments) == 2 and arguments[1] != "1":
+        assert "6 angles in degrees" in str(result.exception)
 
 
 def test_a_real_controller_is_not_driven_unless_a_person_confirms(
@@ -197,29 +189,17 @@ def test_nothing_is_connected_while_a_run_is_at_work_on_the_campaign(
     assert not connected
 
 
-@pytest.mark.parametrize("answer", [b"n\n", b"\x03"], ids=["no", "Ctrl-C"])
-def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path, answer: bytes) -> None:
-    master, slave = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hil", "move", str(CELL_PATH), "--to", "home", "-o", str(tmp_path)],
-        stdin=slave, stdout=slave, stderr=slave, close_fds=True,
-        preexec_fn=lambda: (os.login_tty(slave), signal.signal(signal.SIGINT, signal.SIG_DFL)),
-    )  # fmt: skip
-    os.close(slave)
-    said, patience = b"", 0.0
-    while True:
+@pytest.mark.parametrize("answer", ["n\n", "\x03"], ids=["no", "Ctrl-C"])
+def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path, answer: str) -> None:
+    with on_terminal("-m", "hil", "move", CELL_PATH, "--to", "home", "-o", tmp_path) as end:
+        end.await_seen(b"[y/N]")
         # Pressed in the moment between question and reading, Python forgets it: pressed again.
-        if b"[y/N]" in said and not select.select([master], [], [], patience)[0]:
-            os.write(master, answer)
-            patience = 2.0
-        try:
-            said += os.read(master, 4096)
-        except OSError:  # the terminal's other end is closed
-            break
-    os.close(master)
-    assert process.wait(30) == 130
-    text = said.decode()
-    assert "joint_5" in text
-    assert "peak speed" in text
-    assert "nothing was sent" in text
+        while end.process.poll() is None:
+            end.press(answer)
+            until = time.monotonic() + 2.0
+            while end.process.poll() is None and time.monotonic() < until:
+                end.look()
+        assert end.end() == 130
+        for words in (b"joint_5", b"peak speed", b"nothing was sent"):
+            assert words in end.seen
     assert not list(tmp_path.iterdir())

@@ -59,7 +59,7 @@ def two_joints(tmp_path: Path) -> Path:
     return path
 
 
-def test_limits_come_from_the_urdf_and_what_it_does_not_state_is_unknown(
+def test_what_a_urdf_does_not_state_is_unknown_and_all_named(
     two_joints: Path, tmp_path: Path
 ) -> None:
     summary = new(two_joints, tmp_path / "cell.toml")
@@ -70,12 +70,6 @@ def test_limits_come_from_the_urdf_and_what_it_does_not_state_is_unknown(
     assert limits["torque"] == [150.0, 60.0]
     assert limits["acceleration_deg"] == limits["jerk_deg"] == ["?", "?"]
     assert {"limits.lower_deg", "limits.jerk_deg", "workspace.walls"} <= set(summary["unknown"])
-
-
-def test_a_file_that_is_not_filled_in_is_refused_by_the_names_of_all_that_is_missing(
-    two_joints: Path, tmp_path: Path
-) -> None:
-    summary = new(two_joints, tmp_path / "cell.toml")
     with pytest.raises(UnknownFieldsError) as refused:
         Cell.load(tmp_path / "cell.toml")
     named = [field.partition(" ")[0] for field in refused.value.fields]
@@ -292,7 +286,9 @@ def test_an_archive_whose_cell_names_no_arm_is_of_the_first(arm: str, tmp_path: 
     assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
 
 
-def test_whoever_names_a_pipe_is_told_to_write_it_to_a_file(tmp_path: Path) -> None:
+def test_a_pipe_or_another_encoding_is_told_how_to_be_saved(
+    tmp_path: Path, two_joints: Path
+) -> None:
     """As `hil new --urdf <(xacro robot.xacro)` does."""
     reading, writing = os.pipe()
     os.write(writing, TWO_JOINTS.encode())
@@ -305,9 +301,6 @@ def test_whoever_names_a_pipe_is_told_to_write_it_to_a_file(tmp_path: Path) -> N
         os.close(reading)
     with pytest.raises(InputError, match="name a URDF"):
         cell_of_urdf(tmp_path, {})
-
-
-def test_a_urdf_that_is_no_utf8_is_to_be_saved_as_such(two_joints: Path) -> None:
     two_joints.write_bytes(TWO_JOINTS.replace("hip", "h\xfc").encode("latin-1"))
     with pytest.raises(InputError, match="save it as UTF-8"):
         cell_of_urdf(two_joints, {})

@@ -7,6 +7,7 @@ The planted truth itself: friction laws, and what the URDF is wrong by.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -132,40 +133,28 @@ def test_friction_columns_of_the_wrong_sign_are_red(
 
 def cell_with(third: str, overrides: dict[str, str], planted: str) -> Cell:
     """The NS 16 with these third laws, and these planted coefficients of them."""
-    text = CELL_PATH.read_text("utf-8")
-    lines = []
-    table = ""
-    for line in text.splitlines():
-        table = line.strip("[] ") if line.startswith("[") else table
-        if table == "simulation" and line.startswith("third ="):
-            line = f"third = {planted}"
-        lines.append(line)
-    lines += [f'[robot.friction.joints.{name}]\nthird = "{law}"' for name, law in overrides.items()]
-    base = Cell.load(CELL_PATH)
-    text = "\n".join(lines).replace('third = "quadratic"', f'third = "{third}"', 1)
-    return Cell.from_texts(text, base.urdf, base.path)
+    base = Cell.load(CELL_PATH).with_values({"simulation.third": json.loads(planted)})
+    lines = [f'[robot.friction.joints.{name}]\nthird = "{law}"' for name, law in overrides.items()]
+    text = base.text.replace('third = "quadratic"', f'third = "{third}"', 1)
+    return Cell.from_texts("\n".join([text, *lines]), base.urdf, base.path)
 
 
-@pytest.mark.parametrize("law", ["quadratic", "cubic"])
-def test_the_law_is_that_of_the_joints_planted_with_a_third_term(law: str) -> None:
-    cell = cell_with("none", {"joint_2": law}, "[0, 1.5, 0, 0, 0, 0]")
-    assert planted_truth(cell).third_law == law
-
-
-def test_joints_without_a_planted_term_do_not_count() -> None:
-    cell = cell_with("none", {"joint_1": "quadratic", "joint_2": "cubic"}, "[0, 1.5, 0, 0, 0, 0]")
-    assert planted_truth(cell).third_law == "cubic"
-
-
-def test_two_laws_in_one_simulated_arm_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("laws", "found"),
+    [
+        ({"joint_2": "quadratic"}, "quadratic"),
+        ({"joint_2": "cubic"}, "cubic"),
+        ({"joint_1": "quadratic", "joint_2": "cubic"}, "cubic"),
+    ],
+)
+def test_the_law_is_that_of_the_joints_planted_with_a_third_term(
+    laws: dict[str, str], found: str
+) -> None:
+    """Joints without a planted term do not count; two laws in one arm are refused."""
+    assert planted_truth(cell_with("none", laws, "[0, 1.5, 0, 0, 0, 0]")).third_law == found
     cell = cell_with("none", {"joint_1": "quadratic", "joint_2": "cubic"}, "[1, 1.5, 0, 0, 0, 0]")
     with pytest.raises(CellError, match=r"robot\.friction\.joints.*joint_1, joint_2.*same third"):
         planted_truth(cell)
-
-
-def cell_scaled(scale: list[float]) -> Cell:
-    """The NS 16 whose links are so many times those of its URDF."""
-    return Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": scale})
 
 
 class TestInertiaScale:
@@ -190,7 +179,7 @@ class TestInertiaScale:
             assert moved[name] == pytest.approx(value, rel=1e-11, abs=1e-11), name
 
     def test_without_it_the_urdf_is_right(self) -> None:
-        cell = cell_scaled([])
+        cell = Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": []})
         b = cell.model.base.rank
         np.testing.assert_array_equal(planted_truth(cell).inertia_scale, np.ones(6))
         rotors = np.array(cell.simulation.rotor_inertia)
@@ -201,4 +190,4 @@ class TestInertiaScale:
     @pytest.mark.parametrize("scale", [[1.1], [1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
     def test_one_positive_factor_per_joint_is_needed(self, scale: list[float]) -> None:
         with pytest.raises(CellError, match=r"simulation\.inertia_scale"):
-            cell_scaled(scale)
+            Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": scale})
