@@ -35,10 +35,12 @@ from tests.hil.fast_cell import fast_campaign, fast_cell
 
 
 class Watcher:
-    """Wishes what a script says at a moment of the motion."""
+    """Requests what a script says of the time of the motion and of how often it was asked."""
 
-    def __init__(self, script: Callable[[float], OperatorRequest]) -> None:
-        self._script, self._time, self._held = script, 0.0, 0
+    def __init__(
+        self, script: Callable[[float, int], OperatorRequest] = lambda *_: OperatorRequest()
+    ) -> None:
+        self._script, self._time, self._asked = script, 0.0, 0
         self.seen: list[MotionProgress] = []
 
     def show(self, progress: MotionProgress) -> None:
@@ -46,7 +48,8 @@ class Watcher:
         self._time = progress.motion_time or 0.0
 
     def request(self) -> OperatorRequest:
-        return self._script(self._time)
+        self._asked += 1
+        return self._script(self._time, self._asked)
 
 
 @dataclass
@@ -56,22 +59,32 @@ class WatchedArm:
     cell: Cell
     link: Link
     motion: PiecewiseCubic
+    path: Path
 
     @classmethod
-    def connected(cls, cell: Cell) -> WatchedArm:
+    def connected(cls, cell: Cell, path: Path) -> WatchedArm:
         link = simulated_link(cell)
         where = link.connect(Stop())
         away = where + 0.6 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
         moves = (Move(away, speed=0.6), Move(where, speed=0.6))
-        return cls(cell, link, plan_moves(where, moves, cell.joint_limits).trajectory)
+        return cls(cell, link, plan_moves(where, moves, cell.joint_limits).trajectory, path)
 
-    def run(
-        self, path: Path, watch: Watcher, stop: Stop | None = None, override: float = 1.0
-    ) -> MotionEnded:
-        player = player_of(self.cell, self.motion)
-        return self.link.run(
-            player, spec(self.cell, path), stop or Stop(), override=override, watch=watch
-        )
+    def run(self, watch: Watcher, stop: Stop | None = None, override: float = 1.0) -> MotionEnded:
+        player, given = player_of(self.cell, self.motion), spec(self.cell, self.path)
+        return self.link.run(player, given, stop or Stop(), override=override, watch=watch)
+
+    @property
+    def archive(self) -> Archive:
+        return open_archive(self.path)
+
+    def commanded(self) -> np.ndarray:
+        """Set-points (k, n) that were sent; each lies on the path, whatever the time law."""
+        rows = self.archive.columns["commanded_position"]
+        points = rows[np.isfinite(rows).all(axis=1)]
+        planned = self.motion.sample(np.linspace(0.0, self.motion.duration, 40_000))[0]
+        for point in points[:: len(points) // 50 + 1]:
+            assert np.abs(planned - point).max(axis=1).min() < 2e-4
+        return points
 
 
 def spec(cell: Cell, path: Path) -> ArchiveSpec:
@@ -82,101 +95,76 @@ def spec(cell: Cell, path: Path) -> ArchiveSpec:
 
 
 @pytest.fixture
-def arm(cell: Cell) -> WatchedArm:
-    return WatchedArm.connected(cell)
+def arm(cell: Cell, tmp_path: Path) -> WatchedArm:
+    return WatchedArm.connected(cell, tmp_path / "a.mcap")
 
 
-def commanded(archive: Archive) -> np.ndarray:
-    """Set-points (k, n) that were sent."""
-    rows = archive.columns["commanded_position"]
-    return rows[np.isfinite(rows).all(axis=1)]
-
-
-def require_on_path(arm: WatchedArm, points: np.ndarray) -> None:
-    """Each set-point lies on the planned path, whatever the time law."""
-    times = np.linspace(0.0, arm.motion.duration, 40_000)
-    planned = arm.motion.sample(times)[0]
-    for point in points[:: len(points) // 50 + 1]:
-        assert np.abs(planned - point).max(axis=1).min() < 2e-4
-
-
-def test_a_dry_run_is_slow_from_its_first_cycle(arm: WatchedArm, tmp_path: Path) -> None:
-    person = Watcher(lambda _: OperatorRequest())
-    ended = arm.run(tmp_path / "a.mcap", person, override=0.2)
-    assert ended.outcome == "completed"
-    points = commanded(open_archive(tmp_path / "a.mcap"))
+def test_a_dry_run_is_slow_from_its_first_cycle(arm: WatchedArm) -> None:
+    person = Watcher()
+    assert arm.run(person, override=0.2).outcome == "completed"
+    points = arm.commanded()
     steps = np.abs(np.diff(points, axis=0)).max(axis=0) / arm.cell.period
     planned = np.abs(arm.motion.sample(np.linspace(0, arm.motion.duration, 9999))[1]).max(axis=0)
     np.testing.assert_allclose(steps, 0.2 * planned, rtol=1e-3)
     assert len(points) * arm.cell.period == pytest.approx(5.0 * arm.motion.duration, abs=1.0)
-    require_on_path(arm, points)
     assert {progress.override for progress in person.seen} == {0.2}
 
 
-def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: WatchedArm, tmp_path: Path) -> None:
-    person = Watcher(lambda time: OperatorRequest(0.1 if time > 0.3 else 1.0))
-    arm.run(tmp_path / "a.mcap", person, override=0.2)
+def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: WatchedArm) -> None:
+    person = Watcher(lambda time, _: OperatorRequest(0.1 if time > 0.3 else 1.0))
+    arm.run(person, override=0.2)
     assert {progress.override for progress in person.seen} == {0.2, 0.1}
     assert person.seen[-2].rate == pytest.approx(0.1)
 
 
-def test_a_hold_rests_on_the_path_and_is_gone_on_from(arm: WatchedArm, tmp_path: Path) -> None:
-    asked = 0
+def test_a_hold_rests_on_the_path_and_is_resumed(arm: WatchedArm) -> None:
+    held = 0
 
-    def script(time: float) -> OperatorRequest:
-        nonlocal asked
-        held = time > 0.4 and asked < 12
-        asked += held
-        return OperatorRequest(0.5, held)
+    def script(time: float, _: int) -> OperatorRequest:
+        nonlocal held
+        hold = time > 0.4 and held < 12
+        held += hold
+        return OperatorRequest(0.5, hold)
 
     person = Watcher(script)
-    ended = arm.run(tmp_path / "a.mcap", person)
-    assert ended.outcome == "completed"
-    held = [progress for progress in person.seen if progress.held]
-    assert held
-    assert held[-1].rate == 0.0
-    points = commanded(open_archive(tmp_path / "a.mcap"))
+    assert arm.run(person).outcome == "completed"
+    assert [progress for progress in person.seen if progress.held][-1].rate == 0.0
+    points = arm.commanded()
     rests = (np.diff(points, axis=0) == 0.0).all(axis=1)
     moving = np.flatnonzero(~rests)
     assert rests[moving[0] : moving[-1]].sum() > 10, "no rest in the midst of the motion"
-    require_on_path(arm, points)
     np.testing.assert_allclose(points[-1], arm.motion.sample(np.array([1e9]))[0][0], atol=2e-3)
 
 
-def test_a_stop_ends_a_hold(arm: WatchedArm, tmp_path: Path) -> None:
-    stop, asked = Stop(), 0
+def test_a_stop_ends_a_hold(arm: WatchedArm) -> None:
+    stop, held = Stop(), 0
 
-    def script(time: float) -> OperatorRequest:
-        nonlocal asked
-        asked += time > 0.4
-        stop.requested = asked > 20
+    def script(time: float, _: int) -> OperatorRequest:
+        nonlocal held
+        held += time > 0.4
+        stop.requested = held > 20
         return OperatorRequest(held=time > 0.4)
 
-    ended = arm.run(tmp_path / "a.mcap", Watcher(script), stop)
-    assert ended.outcome == "stopped"
-    archive = open_archive(tmp_path / "a.mcap")
-    assert archive.complete
-    require_on_path(arm, commanded(archive))
+    assert arm.run(Watcher(script), stop).outcome == "stopped"
+    assert arm.archive.complete
+    arm.commanded()
 
 
-def test_nothing_begins_while_a_hold_is_wished_for(arm: WatchedArm, tmp_path: Path) -> None:
-    stop, asked = Stop(), 0
+def test_nothing_begins_while_a_hold_is_requested(arm: WatchedArm) -> None:
+    stop = Stop()
 
-    def script(_: float) -> OperatorRequest:
-        nonlocal asked
-        asked += 1
+    def script(_: float, asked: int) -> OperatorRequest:
         stop.requested = asked > 5
         return OperatorRequest(held=True)
 
-    person = Watcher(script)
-    ended = arm.run(tmp_path / "a.mcap", person, stop)
+    ended = arm.run(Watcher(script), stop)
     assert (ended.outcome, ended.interval) == ("stopped", -1)
-    assert not open_archive(tmp_path / "a.mcap").n_samples
+    assert not arm.archive.n_samples
 
 
 @pytest.mark.parametrize("what", ["stop", "hold"])
 def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
-    arm: WatchedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+    arm: WatchedArm, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """A slow disk: nothing has been asked of the controller yet, and nothing is."""
     stop, pressed = Stop(), 0
@@ -188,54 +176,41 @@ def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
         stop.requested = what == "stop"
         return opened(given)
 
-    def script(_: float) -> OperatorRequest:
+    def script(*_: float) -> OperatorRequest:
         nonlocal pressed
         pressed += pressed > 0
         stop.requested = stop.requested or pressed > 5
         return OperatorRequest(held=pressed > 0)
 
     monkeypatch.setattr(arm.link, "_open", slowly)
-    ended = arm.run(tmp_path / "a.mcap", Watcher(script), stop)
+    ended = arm.run(Watcher(script), stop)
     assert (ended.outcome, ended.reason, ended.interval) == ("stopped", "it had not begun", -1)
-    archive = open_archive(tmp_path / "a.mcap")
-    assert archive.complete
-    assert not archive.n_samples
+    assert arm.archive.complete
+    assert not arm.archive.n_samples
 
 
-def test_a_motion_held_before_it_begins_rests_and_what_was_wished_is_archived(
-    arm: WatchedArm, tmp_path: Path
-) -> None:
-    asked = 0
+def test_a_motion_held_before_it_begins_rests_and_requests_are_archived(arm: WatchedArm) -> None:
+    def script(_: float, asked: int) -> OperatorRequest:  # from the moment it was asked for on
+        return OperatorRequest() if asked <= 2 else OperatorRequest(0.5, held=asked < 20)
 
-    def script(_: float) -> OperatorRequest:
-        nonlocal asked
-        asked += 1
-        if asked <= 2:  # until it was asked for
-            return OperatorRequest()
-        return OperatorRequest(0.5, held=asked < 20)
-
-    ended = arm.run(tmp_path / "a.mcap", Watcher(script))
-    assert ended.outcome == "completed"
-    archive = open_archive(tmp_path / "a.mcap")
-    names = [event.name for event in archive.events]
+    assert arm.run(Watcher(script)).outcome == "completed"
+    events = arm.archive.events
+    names = [event.name for event in events]
     assert names.index("HoldChanged") < names.index("MotionStarted")
-    told = [(event.name, *event.data.values()) for event in archive.events if event.data]
-    assert told == [("OverrideChanged", 0.5), ("HoldChanged", True), ("HoldChanged", False)]
-    points = commanded(archive)
+    changes = [(event.name, *event.data.values()) for event in events if event.data]
+    assert changes == [("OverrideChanged", 0.5), ("HoldChanged", True), ("HoldChanged", False)]
+    points = arm.commanded()
     assert (points[:50] == points[0]).all()
-    require_on_path(arm, points)
 
 
-def test_what_is_shown_is_what_is_archived(arm: WatchedArm, tmp_path: Path) -> None:
-    person = Watcher(lambda _: OperatorRequest())
-    arm.run(tmp_path / "a.mcap", person)
-    columns = open_archive(tmp_path / "a.mcap").columns
+def test_what_is_shown_is_what_is_archived(arm: WatchedArm) -> None:
+    person = Watcher()
+    arm.run(person)
+    columns = arm.archive.columns
     moving = [progress for progress in person.seen if progress.state is State.OPEN]
     assert moving
     ratio, table = arm.cell.drive_train.gear_ratio[0], arm.cell.drive_table
     for progress in moving:
-        assert progress.position is not None
-        assert progress.current is not None
         same = (columns["position"] == progress.position).all(axis=1)
         same &= (columns["target_current"] == progress.current).all(axis=1)
         row = int(np.argmax(same))
@@ -266,16 +241,14 @@ class Stubborn:
     def stop(self) -> None: ...
 
 
-def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm, tmp_path: Path) -> None:
+def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm) -> None:
+    """And an override is a fraction."""
     with pytest.raises(ControllerFault, match="knows no override"):
-        arm.link.run(Stubborn(), spec(arm.cell, tmp_path / "a.mcap"), Stop(), override=0.2)  # type: ignore[arg-type]
-    assert not (tmp_path / "a.mcap").exists()
-
-
-@pytest.mark.parametrize("override", [-0.1, 1.1, float("nan")])
-def test_an_override_is_a_fraction(override: float) -> None:
-    with pytest.raises(ValueError, match="override"):
-        OperatorRequest(override)
+        arm.link.run(Stubborn(), spec(arm.cell, arm.path), Stop(), override=0.2)  # type: ignore[arg-type]
+    assert not arm.path.exists()
+    for override in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match="override"):
+            OperatorRequest(override)
 
 
 class Exchange:
@@ -295,15 +268,22 @@ class Exchange:
         return said
 
 
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    at = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(live_link, "time", SimpleNamespace(monotonic=lambda: at.now))
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    at = Clock()
+    monkeypatch.setattr(live_link, "time", SimpleNamespace(monotonic=at))
     return at
 
 
 @pytest.fixture
-def exchange(clock: SimpleNamespace) -> Exchange:
+def exchange(clock: Clock) -> Exchange:
     return Exchange()
 
 
@@ -323,12 +303,7 @@ def view(exchange: Exchange) -> ExchangeView:
     ],
 )
 def test_a_motion_that_does_not_begin_is_given_up(
-    view: ExchangeView,
-    exchange: Exchange,
-    clock: SimpleNamespace,
-    state: State,
-    waits: float,
-    words: str,
+    view: ExchangeView, exchange: Exchange, clock: Clock, state: State, waits: float, words: str
 ) -> None:
     exchange.state = state
     clock.now += waits
@@ -339,17 +314,13 @@ def test_a_motion_that_does_not_begin_is_given_up(
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
 def test_a_motion_that_began_or_may_have_is_not_given_up(
-    view: ExchangeView, exchange: Exchange, clock: SimpleNamespace, event: Any
+    view: ExchangeView, exchange: Exchange, clock: Clock, event: Any
 ) -> None:
     exchange.said.append(event)
     view.look()
     clock.now += 3600.0
     assert view.not_begun() is None
-
-
-def test_the_count_tells_an_end_whose_event_was_lost(
-    view: ExchangeView, exchange: Exchange
-) -> None:
+    # An end whose event was lost is known from the count.
     assert not view.motion_ended
     exchange.ended_count += 1
     assert view.motion_ended
@@ -357,13 +328,6 @@ def test_the_count_tells_an_end_whose_event_was_lost(
 
 
 # --- Signs of life are given only while the supervision itself is alive
-
-
-class Clock:
-    now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def beats_in(heart: Heartbeat, clock: Clock, given: list[float], seconds: float) -> int:
@@ -435,7 +399,7 @@ def watch(operator: Failing) -> RunWatch:
     return RunWatch(operator, Stop())
 
 
-def test_a_screen_that_shows_nothing_is_still_asked(operator: Failing, watch: RunWatch) -> None:
+def test_a_screen_that_fails_is_asked_all_the_same(operator: Failing, watch: RunWatch) -> None:
     operator.fails = True
     for _ in range(3):
         watch.note("good")
@@ -445,13 +409,10 @@ def test_a_screen_that_shows_nothing_is_still_asked(operator: Failing, watch: Ru
     assert not watch.stop.requested
     (trouble,) = watch.troubles
     assert "no picture" in trouble
-
-
-def test_a_request_that_is_none_leaves_the_last(operator: Failing, watch: RunWatch) -> None:
     for answer, expected in ((0.4, 0.4), (None, 0.4), (0.3, 0.3)):
         operator.answer = None if answer is None else OperatorRequest(answer)
         assert watch.request() == OperatorRequest(expected)
-    assert "None is no OperatorRequest" in watch.troubles[0]
+    assert "None is no OperatorRequest" in watch.troubles[-1]
     assert not watch.stop.requested
 
 
