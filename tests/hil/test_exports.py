@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -54,14 +55,8 @@ SLIDER = """<robot name="slider"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0.01 -0.3"/><mass value="1.5"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
 """
-ALL = {
-    "parameters.json",
-    "parameters.csv",
-    "standard.csv",
-    "friction.txt",
-    "friction.py",
-    "identified.urdf",
-}
+ALL = {"parameters.json", "parameters.csv", "standard.csv", "friction.txt", "friction.py",
+       "identified.urdf"}  # fmt: skip
 PROVENANCE = {"robot": "arm", "archives": "run_1.mcap sha256 0a1b", "verdict": "good: 1.1%"}
 BARE = "import json, runpy, sys; f = runpy.run_path(sys.argv[1]); " + (
     "print(json.dumps([f['torques'](v) for v in json.load(sys.stdin)]))"
@@ -78,6 +73,19 @@ def exported(arm: IdentifiedArm, folder: Path) -> Exports:
     return write_exports(
         folder, arm.cell, arm.estimate, consistent, essential=names, provenance=PROVENANCE
     )
+
+
+def parameters_of(arm: IdentifiedArm, folder: Path) -> dict[str, Any]:
+    """`parameters.json` of the exported arm."""
+    exported(arm, folder)
+    return json.loads((folder / "parameters.json").read_text())
+
+
+def command(*words: object) -> Any:
+    """`hil` with these words; a verdict may be good or not."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    assert result.exit_code in (0, 5), result.output
+    return result
 
 
 def test_six_files_are_written_and_say_where_they_come_from(
@@ -119,14 +127,13 @@ def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
     any_arm: IdentifiedArm, tmp_path: Path
 ) -> None:
     """By files alone: pinocchio on the URDF, numbers of the JSON, friction of a bare process."""
-    exported(any_arm, tmp_path)
+    parameters = parameters_of(any_arm, tmp_path)
     model, consistent = any_arm.cell.model, any_arm.consistency.consistent
     motion = a_motion(model.n_joints, seed=5)
     every = slice(None, None, 40)
     q, qd, qdd = (array[every] for array in motion[1:4])
     moving = np.all(np.abs(qd) > 0.02, axis=1)
     q, qd, qdd = q[moving], qd[moving], qdd[moving]
-    parameters = json.loads((tmp_path / "parameters.json").read_text())
     rigid = rigid_torque(tmp_path / "identified.urdf", parameters, q, qd, qdd)
     rotors = qdd @ np.array(parameters["standard"]["rotor_matrix"])
     total = rigid + rotors + bare_friction(tmp_path / "friction.py", qd)
@@ -134,7 +141,7 @@ def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
     np.testing.assert_allclose(total, expected, atol=1e-7 * np.abs(expected).max())
 
 
-def rigid_torque(urdf: Path, parameters: dict, q: Array, qd: Array, qdd: Array) -> Array:  # type: ignore[type-arg]
+def rigid_torque(urdf: Path, parameters: dict[str, Any], q: Array, qd: Array, qdd: Array) -> Array:
     """Inverse dynamics by pinocchio, joints by name, locked ones held."""
     model = pin.buildModelFromUrdf(str(urdf))
     held = pin.neutral(model)
@@ -155,13 +162,9 @@ def rigid_torque(urdf: Path, parameters: dict, q: Array, qd: Array, qdd: Array) 
 
 def bare_friction(source: Path, speeds: Array) -> Array:
     """Friction torques by an interpreter that sees no package at all."""
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", BARE, str(source)],
-        input=json.dumps(speeds.tolist()),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    given = json.dumps(speeds.tolist())
+    words = [sys.executable, "-I", "-S", "-c", BARE, str(source)]
+    done = subprocess.run(words, input=given, capture_output=True, text=True, check=True)
     return np.array(json.loads(done.stdout))
 
 
@@ -170,9 +173,8 @@ def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
-def test_without_consistent_parameters_there_is_no_urdf_and_an_old_one_goes(
-    arm: IdentifiedArm, tmp_path: Path
-) -> None:
+def test_possible_parameters_alone_become_a_urdf(arm: IdentifiedArm, tmp_path: Path) -> None:
+    """Without them an old one goes; friction is then that of the free estimate."""
     exported(arm, tmp_path)
     (tmp_path / "mine.urdf").write_text("kept")
     found = write_exports(tmp_path, arm.cell, arm.estimate, "the solver gave up")
@@ -181,23 +183,18 @@ def test_without_consistent_parameters_there_is_no_urdf_and_an_old_one_goes(
     left = {path.name for path in tmp_path.iterdir()}
     assert left == (ALL - set(found.withheld)) | {"mine.urdf"}
     free = arm.estimate.values[arm.cell.model.base.rank :]
-    taken = bare_friction(tmp_path / "friction.py", np.array([[1.0, 1.0]]))[0]
-    np.testing.assert_allclose(taken, free.reshape(-1, 2).sum(axis=0), rtol=1e-12)
-
-
-def test_impossible_parameters_are_not_written_as_a_urdf(
-    arm: IdentifiedArm, tmp_path: Path
-) -> None:
+    torque = bare_friction(tmp_path / "friction.py", np.array([[1.0, 1.0]]))[0]
+    np.testing.assert_allclose(torque, free.reshape(-1, 2).sum(axis=0), rtol=1e-12)
     broken = arm.consistency.consistent.standard.copy()
     broken[arm.cell.model.layout.links[1, 9]] = -1.0
-    found = write_exports(
-        tmp_path, arm.cell, arm.estimate, replace(arm.consistency.consistent, standard=broken)
-    )
+    impossible = replace(arm.consistency.consistent, standard=broken)
+    found = write_exports(tmp_path, arm.cell, arm.estimate, impossible)
     assert "no possible body" in found.withheld["identified.urdf"]
     assert not (tmp_path / "identified.urdf").exists()
 
 
-def test_names_of_archives_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
+def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
+    """Neither those of archives nor those in a URDF."""
     evil = {"archives": 'a --> ---> <robot> """ \x00\x1b[2J\nimport os\udc80 b', "robot": "€"}
     write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent, provenance=evil)
     model = arm.cell.model
@@ -205,9 +202,6 @@ def test_names_of_archives_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Pat
     assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
     assert len(table(tmp_path / "parameters.csv")) == model.n_parameters
     assert "€" in (tmp_path / "friction.txt").read_text(encoding="utf-8")
-
-
-def test_names_in_a_urdf_cannot_break_a_file(tmp_path: Path) -> None:
     evil = "a---&gt;'&quot;&quot;&quot; &lt;script&gt;alert(1)&lt;/script&gt;#"
     urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
     arm = identified_arm(urdf)
@@ -230,7 +224,7 @@ def test_provenance_has_digests_and_the_verdict(tmp_path: Path, good: bool, word
     assert found["robot"] == results.cell
 
 
-def test_a_joint_that_never_moved_keeps_what_its_description_says(tmp_path: Path) -> None:
+def test_a_joint_that_never_moved_keeps_its_description(tmp_path: Path) -> None:
     arm = identified_arm(SLIDER, still=(1,))
     assert {"f0_2", "f1_2"} <= set(arm.estimate.undetermined)
     exported(arm, tmp_path)
@@ -244,9 +238,6 @@ def test_a_joint_that_never_moved_keeps_what_its_description_says(tmp_path: Path
     assert float(rows["f0_2"]["std"]) == np.inf
     listed = json.loads((tmp_path / "parameters.json").read_text())["parameters"]
     assert {p["name"] for p in listed if not p["determined"]} == set(arm.estimate.undetermined)
-
-
-def test_a_joint_that_never_moved_does_not_disturb_the_others() -> None:
     arm = identified_arm(TWO_LINK, still=(1,))
     consistent = arm.consistency.consistent
     known = np.isfinite(arm.estimate.std)
@@ -299,13 +290,8 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     folder.mkdir(parents=True)
     write_exports(folder, arm.cell, arm.estimate, arm.consistency.consistent)
     (program,) = (code for language, code in CODE.findall(text) if language == "python")
-    done = subprocess.run(
-        [sys.executable, "-I", "-c", program],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    words = [sys.executable, "-I", "-c", program]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
     shown = np.fromstring(done.stdout.strip().strip("[]"), sep=" ")
     zero, speed = np.zeros((1, 2)), np.full((1, 2), 0.5)
     values = arm.consistency.consistent.estimate.values
@@ -390,8 +376,6 @@ class TestEnsemble:
         )
         np.testing.assert_array_equal(one, same)
         assert not np.array_equal(one, other)
-
-    def test_what_is_not_determined_stays(self) -> None:
         still = identified_arm(TWO_LINK, still=(0,))
         variants = sample_ensemble(still.cell.model, still.estimate, 5, 1)
         place = still.cell.model.parameter_names.index("f1_1")
@@ -403,10 +387,8 @@ class TestCommand:
 
     def test_an_arm_and_its_variants(self, log: Path, tmp_path: Path) -> None:
         output = tmp_path / "deep" / "arm.sdf"
-        words = [str(log), "--to", "sdf", "--ensemble", "3", "--seed", "2", "-o", str(output)]
-        result = CliRunner().invoke(app, ["export", *words, "--json"])
-        assert result.exit_code in (0, 5), result.output
-        found = json.loads(result.stdout)
+        words = (log, "--to", "sdf", "--ensemble", 3, "--seed", 2, "-o", output)
+        found = json.loads(command("export", *words, "--json").stdout)
         assert found["path"] == str(output)
         assert found["read_back"] < 1e-6
         assert "rotor inertias" in found["left_out"]
@@ -424,16 +406,13 @@ class TestCommand:
     ) -> None:
         monkeypatch.setitem(sys.modules, "mujoco", None)
         monkeypatch.chdir(tmp_path)
-        result = CliRunner().invoke(app, ["export", str(log), "--to", "mjcf"])
-        assert result.exit_code in (0, 5), result.output
-        assert "not read back: MuJoCo is not installed" in result.stdout
+        said = command("export", log, "--to", "mjcf").stdout
+        assert "not read back: MuJoCo is not installed" in said
         assert (tmp_path / "identified.xml").read_text().startswith("<mujoco")
 
     def test_a_replay_draws_and_says_how_far_models_stray(self, log: Path, tmp_path: Path) -> None:
         picture = tmp_path / "deep" / "replay.svg"
-        result = CliRunner().invoke(app, ["replay", str(log), "-o", str(picture), "--json"])
-        assert result.exit_code in (0, 5), result.output
-        models = json.loads(result.stdout)["models"]
+        models = json.loads(command("replay", log, "-o", picture, "--json").stdout)["models"]
         assert max(models["identified"]["rms"]) < min(models["nominal"]["rms"])
         assert 0.0 < max(models["spread of the ensemble"]["rms"]) < min(models["nominal"]["rms"])
         assert "</svg>" in picture.read_text()
@@ -444,14 +423,9 @@ class TestCommand:
         """Not into that of another estimate, and a new identification takes it out."""
         (tmp_path / log.name).write_bytes(log.read_bytes())
         reports = []
-        for command in (
-            ["identify"],
-            ["replay", "--ensemble", "2", "--estimator", "ols"],
-            ["replay", "--ensemble", "2"],
-            ["identify"],
-        ):
-            result = CliRunner().invoke(app, [*command, str(tmp_path)])
-            assert result.exit_code in (0, 5), result.output
+        few = ("replay", "--ensemble", "2")
+        for words in (("identify",), (*few, "--estimator", "ols"), few, ("identify",)):
+            command(*words, tmp_path)
             reports.append("Simulated forwards" in (tmp_path / "report.html").read_text())
         assert reports == [False, False, True, False]
 
