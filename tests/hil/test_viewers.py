@@ -83,13 +83,16 @@ def seen(copies: list[Path]) -> Messages:
 class TestCopies:
     """Beside what was measured and commanded stands what the model predicts."""
 
-    def test_each_archive_of_a_motion_has_one(
+    def test_each_archive_of_a_motion_has_one_that_is_no_archive(
         self, copies: list[Path], found: Identification
     ) -> None:
+        """Nobody fits one recording twice."""
         moving = {path.name for path in found.paths if "standstill" not in path.name}
         assert {path.name for path in copies} == moving
+        with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
+            open_archive(copies[0])
 
-    def test_the_prediction_stands_beside_the_torque(
+    def test_predicted_and_commanded_stand_beside_the_torque(
         self, seen: Messages, found: Identification
     ) -> None:
         """At the same instants, and as far from it as the results say."""
@@ -101,9 +104,7 @@ class TestCopies:
             found.cell.model, found.estimate.pooled.values
         )
         np.testing.assert_allclose(error[usable], expected[usable], atol=1e-9)
-
-    def test_no_commanded_number_is_missing(self, seen: Messages) -> None:
-        """The arm rests before the first set-point: the controller's own target stands there."""
+        # The arm rests before the first set-point: the controller's own target stands there.
         position = np.array([state.position for _, state in seen["/joint_states_commanded"]])
         velocity = np.array([state.velocity for _, state in seen["/joint_states_commanded"]])
         assert np.isfinite(position).all()
@@ -128,11 +129,6 @@ class TestCopies:
             begins.append(stamps[0][0])
         first = int(archive.columns["stamp"][0])
         assert begins == [first, 1_772_600_767 * 10**9, first]
-
-    def test_they_are_no_archives(self, copies: list[Path]) -> None:
-        """Nobody fits one recording twice."""
-        with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
-            open_archive(copies[0])
 
     def test_a_folder_is_needed(self, short_campaign: Campaign) -> None:
         archive = str(short_campaign.folder.archives / "excitation_000_a1.mcap")
@@ -236,6 +232,14 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
         "closed", "opening", "open", "exiting", "closed"
     ]  # fmt: skip
     assert any(name == "MotionEnded" for _, name, _, _ in view.events)
+    # In the unit of the controller's thresholds, by the drive train's own conversion.
+    columns, drives = open_archive(excitation).columns, campaign.cell.drive_train
+    error = drives.motor_revolutions(columns["target_position"]) - drives.motor_revolutions(
+        columns["position"]
+    )
+    traces = view_of(excitation).quantities[4].traces
+    for joint, trace in enumerate(traces):
+        assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
 
 
 class TestFrame:
@@ -251,24 +255,11 @@ class TestFrame:
             shown = columns["torque"][:, joint] * sign[joint]
             assert np.nanmax(trace.value) == shown.max()
             assert np.nanmin(trace.value) == shown.min()
-
-    def test_it_is_named(self, excitation: Path) -> None:
         view = view_of(excitation)
         frame = "angles, speeds and torques as on the teach pendant"
         assert view.frame == frame
         assert frame in html.unescape(archive_page(view).decode("utf-8"))
         assert any(frame in text.get_text() for text in draw_archive(view).texts)
-
-
-def test_following_errors_are_those_of_the_motors(excitation: Path, campaign: Campaign) -> None:
-    """In the unit of the controller's thresholds, by the drive train's own conversion."""
-    columns, drives = open_archive(excitation).columns, campaign.cell.drive_train
-    error = drives.motor_revolutions(columns["target_position"]) - drives.motor_revolutions(
-        columns["position"]
-    )
-    traces = view_of(excitation).quantities[4].traces
-    for joint, trace in enumerate(traces):
-        assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
 
 
 def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:
@@ -358,7 +349,9 @@ def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:
     assert "missed" not in header(replace(view, states=(), events=()))
 
 
-def test_the_shares_of_limits_are_told_to_a_script(excitation: Path, tmp_path: Path) -> None:
+def test_shares_of_limits_are_for_scripts_and_other_files_refused(
+    excitation: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "x.png"
     result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(target), "--json"])
     assert result.exit_code == 0
@@ -367,9 +360,6 @@ def test_the_shares_of_limits_are_told_to_a_script(excitation: Path, tmp_path: P
     shares = summary["peak_share_of_limit"]["motor current [A]"]
     assert set(shares) == {f"joint_{k}" for k in range(1, 7)}
     assert all(0.0 < share < 1.0 for share in shares.values())
-
-
-def test_what_is_no_archive_or_no_format_is_refused(excitation: Path, tmp_path: Path) -> None:
     (tmp_path / "no.mcap").write_bytes(b"no")
     result = CliRunner().invoke(app, ["plot", str(tmp_path / "no.mcap")])
     assert isinstance(result.exception, ArchiveError)
