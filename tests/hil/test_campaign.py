@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from drivers.states import State
 from drivers.transports.faults import Lose
@@ -93,7 +92,7 @@ def written(cell: Cell, old: str, new: str) -> Cell:
 class TestArchives:
     """What a finished campaign leaves."""
 
-    def test_every_interval_of_motion_is_one(self, campaign: Campaign) -> None:
+    def test_every_interval_of_motion_is_one_whole_in_itself(self, campaign: Campaign) -> None:
         names = [ArchiveName.parse(path) for path in campaign.folder.archives.glob("*.mcap")]
         assert sorted((name.kind, name.index) for name in names if name is not None) == [
             *(("excitation", i) for i in range(3)),
@@ -101,8 +100,6 @@ class TestArchives:
             ("standstill", 0),
             *(("validation", i) for i in range(2)),
         ]
-
-    def test_each_is_whole_in_itself(self, campaign: Campaign) -> None:
         archive = open_archive(campaign.folder.completed("excitation")[0])
         assert archive.complete
         assert set(archive.attachments) == {
@@ -111,7 +108,7 @@ class TestArchives:
         assert archive.header.entries["simulated"] == "yes"
         assert archive.outcome.entries["outcome"] == "completed"
 
-    def test_what_was_commanded_is_what_was_planned(self, campaign: Campaign) -> None:
+    def test_commanded_is_what_was_planned_and_the_arm_returns(self, campaign: Campaign) -> None:
         archive = open_archive(campaign.folder.completed("excitation")[0])
         commanded = archive.columns["commanded_position"]
         commanded = commanded[~np.isnan(commanded).any(axis=1)]
@@ -121,8 +118,6 @@ class TestArchives:
         assert commanded == pytest.approx(planned, abs=2e-6)
         velocity = np.abs(np.diff(commanded, axis=0)) / period
         assert np.all(velocity <= campaign.cell.joint_limits.velocity * (1 + 1e-6))
-
-    def test_the_arm_returns_to_where_it_was(self, campaign: Campaign) -> None:
         first = open_archive(campaign.folder.archives / "move_000_a1.mcap")
         last = open_archive(campaign.folder.archives / "move_001_a1.mcap")
         before, after = first.columns["target_position"][0], last.columns["target_position"][-1]
@@ -353,8 +348,14 @@ def test_folders_in_use_and_foreign_ones_are_named(campaign: Campaign, tmp_path:
 class TestPlan:
     """`plan.json`, and what of it is in the archives."""
 
-    def test_it_is_restored_to_the_bit(self, campaign: Campaign) -> None:
+    def test_it_is_restored_to_the_bit_with_what_it_was_made_of(self, campaign: Campaign) -> None:
         assert CampaignPlan.load(campaign.folder.plan).to_text() == campaign.plan.to_text()
+        file, _ = stored_plan(campaign, "validation_000_a1.mcap")
+        settings = campaign.cell.campaign
+        assert len(file.moves) == settings.n_via + 1
+        assert {move.fly for move in file.moves} == {FlyPercent(100.0 * settings.fly)}
+        speeds = {tuple(np.asarray(move.joint_speed)) for move in file.moves}
+        assert len(speeds) == 1 and len(set(speeds.pop())) == campaign.cell.joint_limits.n_joints
 
     @pytest.mark.parametrize(
         "name",
@@ -368,14 +369,6 @@ class TestPlan:
         assert file.joint_names == campaign.cell.joint_names
         assert replace(file, trajectory=None).plan().trajectory.to_dict() == motion.to_dict()
         assert file.plan().trajectory.to_dict() == motion.to_dict()
-
-    def test_validation_keeps_what_it_was_drawn_with(self, campaign: Campaign) -> None:
-        file, _ = stored_plan(campaign, "validation_000_a1.mcap")
-        settings = campaign.cell.campaign
-        assert len(file.moves) == settings.n_via + 1
-        assert {move.fly for move in file.moves} == {FlyPercent(100.0 * settings.fly)}
-        speeds = {tuple(np.asarray(move.joint_speed)) for move in file.moves}
-        assert len(speeds) == 1 and len(set(speeds.pop())) == campaign.cell.joint_limits.n_joints
 
     def test_version_1_without_moves_is_read_and_run(
         self, tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
@@ -449,41 +442,37 @@ def test_a_solver_that_crashes_ends_the_campaign_only(
     assert arm.campaign.folder.manifest() == []
 
 
-def overridden(player: TrajectoryPlayer) -> NDArray[np.float64]:
-    """The set-points of a motion that is slowed to a third on its way."""
-    player.begin(player.start)
-    before = [player.advance()[0] for _ in range(200)]
-    player.override(0.3)
-    return np.array(before + [player.advance()[0] for _ in range(300)])
-
-
 def test_an_override_changes_as_fast_as_the_bounds_allow(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    careful = written(
-        cell,
-        "override = { acceleration = 1.3, jerk = 1.7 }",
-        "override = { acceleration = 1.05, jerk = 1.1 }",
+    old, new = "acceleration = 1.3, jerk = 1.7", "acceleration = 1.05, jerk = 1.1"
+    arm = Arm.made(
+        tmp_path, written(cell, f"override = {{ {old} }}", f"override = {{ {new} }}"), plan
     )
-    arm = Arm.made(tmp_path, careful, plan)
 
-    class Taken(Exception):
+    class Sent(Exception):
         pass
 
-    def take(player: TrajectoryPlayer, *rest: object, **options: object) -> None:
-        raise Taken(player)
+    def sent(player: TrajectoryPlayer, *rest: object, **options: object) -> None:
+        raise Sent(player)
 
-    arm.link.run = take  # type: ignore[method-assign, assignment]
-    with pytest.raises(Taken) as taken:
+    arm.link.run = sent  # type: ignore[method-assign, assignment]
+    with pytest.raises(Sent) as found:
         execute(arm.campaign, arm.link)
-    (ours,) = taken.value.args
-    limits = cell.joint_limits
-    way = (Move(cell.home, speed=cell.campaign.approach_speed),)
-    trajectory = plan_moves(ours.start, way, limits).trajectory
-    careful_one, default = (
-        TrajectoryPlayer(trajectory, cell.period, limits, **bounds)
-        for bounds in ({"override_acceleration": 1.05, "override_jerk": 1.1}, {})
-    )
-    ramps = [overridden(player) for player in (ours, careful_one, default)]
-    np.testing.assert_array_equal(ramps[0], ramps[1])
-    assert np.max(np.abs(ramps[0] - ramps[2])) > 1e-3
+    (ours,) = found.value.args
+    limits, speed = cell.joint_limits, cell.campaign.approach_speed
+    trajectory = plan_moves(ours.start, (Move(cell.home, speed=speed),), limits).trajectory
+    slowed = []
+    for player in (
+        ours,
+        TrajectoryPlayer(
+            trajectory, cell.period, limits, override_acceleration=1.05, override_jerk=1.1
+        ),
+        TrajectoryPlayer(trajectory, cell.period, limits),
+    ):
+        player.begin(player.start)
+        before = [player.advance()[0] for _ in range(200)]
+        player.override(0.3)
+        slowed.append(np.array(before + [player.advance()[0] for _ in range(300)]))
+    np.testing.assert_array_equal(slowed[0], slowed[1])
+    assert np.max(np.abs(slowed[0] - slowed[2])) > 1e-3
