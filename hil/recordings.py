@@ -84,11 +84,9 @@ def recording_of(archive: Archive) -> Recording:
     """
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
-        raise ArchiveError(
-            archive.path,
-            f"holds no sample{f' ({archive.damage})' if archive.damage else ''}",
-            remedy="record it again",
-        )
+        problem = f"holds no sample{f' ({archive.damage})' if archive.damage else ''}"
+        remedy = "record it again"
+        raise ArchiveError(archive.path, problem, remedy=remedy)
     imported, own = archive.kind == "imported", archive.header.controllers_own
     provenance = {"archive": archive.path.name, **archive.header.entries}
     for key, value in (archive.outcome.entries if archive.outcome else {}).items():
@@ -116,12 +114,9 @@ def _time(archive: Archive) -> Array:
     columns, period = archive.columns, archive.period
     if "cycle" in columns:
         if period is None:
-            raise ArchiveError(
-                archive.path,
-                "has cycles but no period, so that their times are not known",
-                field="period",
-                remedy="copy it again from where it was recorded; something changed it",
-            )
+            problem = "has cycles but no period, so that their times are not known"
+            remedy = "copy it again from where it was recorded; something changed it"
+            raise ArchiveError(archive.path, problem, field="period", remedy=remedy)
         cycles = columns["cycle"]
         return np.asarray((cycles - cycles[0]) * period)
     elapsed = np.asarray((columns["stamp"] - columns["stamp"][0]) * 1e-9)

@@ -31,9 +31,8 @@ DRIFT: Final = 3.0
 class Replayed:
     """Position errors of models, simulated less recorded."""
 
-    #: (n,), degrees or mm
-    joint_names: tuple[str, ...]
-    units: tuple[str, ...]
+    joint_names: tuple[str, ...]  #: (n,)
+    units: tuple[str, ...]  #: of the errors of each joint (n,), degrees or mm
     time: Array  #: since the beginning of the first motion, one after the other (m,) [s]
     errors: dict[str, Array]  #: of each model by name (m, n), in `units`; NaN in gaps
     #: standard deviation of the positions of variants of the identified arm (m, n), in `units`;
@@ -41,9 +40,8 @@ class Replayed:
     spread: Array | None
     #: why the identified model drifts by more than its uncertainty, in sentences
     reasons: tuple[str, ...]
-    #: which motions, and what is said of the identified model, in words
-    tested_on: str
-    verdict: str
+    tested_on: str  #: which motions, in words
+    verdict: str  #: on the identified model, in a sentence
 
     @property
     def figures(self) -> dict[str, tuple[Array, Array]]:

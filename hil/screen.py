@@ -271,7 +271,7 @@ def status_line(status: RunStatus, left: str = "") -> str:
             for what, share in shares.items()
             if share is not None
         ]
-    if status.drift is not None and len(status.drift.change) > 1:
+    if status.drift is not None and np.isfinite(status.drift.change).any():
         parts.append(_drift_words(status.drift))
     return ", ".join([*parts, left or f"{clock(status.time_left)} left"])
 
@@ -376,8 +376,8 @@ def _drift(drift: DriftCurve, width: int) -> Text:
 
 
 def _drift_words(drift: DriftCurve) -> str:
-    change, threshold = 100.0 * drift.change[-1], 100.0 * drift.threshold
-    return f"friction changed by {change:.1f} % (warm below {threshold:g} %)"
+    change = 100.0 * drift.change[np.isfinite(drift.change)][-1]
+    return f"friction changed by {change:.1f} % (warm below {100.0 * drift.threshold:g} %)"
 
 
 def bar(share: float, width: int) -> Text:

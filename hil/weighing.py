@@ -113,12 +113,9 @@ def weigh(
 
 def _side(campaign: Campaign, name: str, side: str) -> Campaign:
     if not _NAME.fullmatch(name):
-        raise InputError(
-            None,
-            f"{name!r} is no name of a payload",
-            field="--payload",
-            remedy="use letters, digits, dots and dashes",
-        )
+        problem = f"{name!r} is no name of a payload"
+        remedy = "use letters, digits, dots and dashes"
+        raise InputError(None, problem, field="--payload", remedy=remedy)
     root = campaign.folder.root / FOLDER / name / side
     made = Campaign.create(root, campaign.cell, campaign.plan, exist_ok=True)
     rehearsal = Rehearsal.load(campaign.folder)

@@ -321,8 +321,7 @@ def open_archive(
         with opened(path) as stream:
             scan = Scan(stream, content.visit, topics=topics, times=times)
     except OSError as error:
-        remedy = _REMEDIES.get(error.errno or 0, "")
-        raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
+        raise refusal(path, error) from error
     except MemoryError as error:
         raise ArchiveError(
             path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
@@ -354,6 +353,12 @@ def open_archive(
         events=tuple(content.events),
         damage=lost,
     )
+
+
+def refusal(path: Path, error: OSError) -> ArchiveError:
+    """That the system does not let an archive be read."""
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    return ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy)
 
 
 def _unreadable(path: Path, scan: Scan) -> ArchiveError:

@@ -21,7 +21,7 @@ from hil.archive import container, header, schema
 from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.reader import open_archive
+from hil.archive.reader import open_archive, refusal
 from hil.archive.scan import Scan
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.files import replacing, sync_folder
@@ -44,7 +44,7 @@ def survey(path: Path, visit: Visit = lambda *_: None) -> Scan:
         with opened(path) as stream:
             return Scan(stream, visit, past_damage=True)
     except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+        raise refusal(path, error) from error
 
 
 @dataclass(frozen=True)

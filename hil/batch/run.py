@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar, cast, get_args
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -59,9 +59,13 @@ def reidentify(
     are read, and may refuse them.
 
     Raises:
-        InputError: a place does not exist, or there is not one archive that can be fitted.
+        InputError: a place does not exist, there is not one archive that can be fitted, or the
+            estimator is not one of a batch.
         CacheError: the cache cannot be written.
     """
+    if options.estimator not in (known := get_args(BatchEstimator)):
+        problem, remedy = f"{options.estimator!r} reads samples", f"use {', '.join(known)}"
+        raise InputError(None, problem, field="estimator", remedy=remedy)
     found = discover(roots, where, workers, reporter)
     check(found.refs)
     batch = _Batch(options, workers, where, reporter, [*found.broken])
@@ -149,7 +153,8 @@ class _Batch:
                 reason = found.reason
             else:
                 one.settings, broken = found.settings, [*found.broken]
-                reason = "" if arguments[0] else "it holds no excitation"
+                some = any(ref.use == "excitation" for ref in arguments[0])
+                reason = "" if some else "it holds no excitation"
             self.broken += broken
             paths = {other.path for other in broken}
             one.refs = [ref for ref in one.refs if ref.location not in paths]

@@ -107,7 +107,11 @@ class Cell:
         )
 
     def with_friction(self, **changes: Any) -> Cell:
-        """The cell with other entries of `[robot.friction]` for all joints; or CellError."""
+        """The cell with other entries of `[robot.friction]` for all joints.
+
+        Raises:
+            CellError: there is no such law.
+        """
         table = self.file.robot.friction
         joints = {
             name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))

@@ -61,9 +61,10 @@ class Identifying:
     standstill: Annotated[
         Literal["auto", "rests", "slow", "none"],
         typer.Option(
-            help="Rows that are not fitted: rests longer than 0.25 s; all slow rows and those near "
-            "a velocity reversal; or none. auto: slow rows, or rests where that predicts parts of "
-            "the fitted recordings better."
+            help="Rows that are not fitted: rests longer than 0.25 s, and the two rows between "
+            "which a velocity changes its sign; all slow rows and those near a velocity reversal; "
+            "or none. auto: slow rows, or rests where that predicts parts of the fitted "
+            "recordings better."
         ),
     ] = "auto"
     torque_bandwidth: Annotated[

@@ -112,17 +112,19 @@ class Described:
         if not math.isfinite(self.standstill):
             problem, remedy = f"{self.standstill} is no speed", "give rad/s, as in 0.01"
             raise InputError(None, problem, field="--standstill", remedy=remedy)
+        law = FrictionLaw.from_table(
+            {**friction_from(self.friction), "standstill": self.standstill}
+        )
         at = figures(self.locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
         joints = recorded() if self.lock_others else None
         if self.cell is not None:
             return Robot.from_cell(self.cell, gravity=self.gravity, locked=at, recorded=joints)
         path = self.urdf or self.dh
         assert path is not None
-        law = {**friction_from(self.friction), "standstill": self.standstill}
         return Robot.from_urdf(
             path,
             convention=None if self.dh is None else convention_of(self.convention),
-            friction=FrictionLaw.from_table(law),
+            friction=law,
             gravity=self.gravity or STANDARD_GRAVITY,
             locked=at,
             recorded=joints,

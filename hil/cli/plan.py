@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from json import dumps as json_text
-from math import isfinite, nan, radians
+from math import isfinite, radians
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -103,14 +103,15 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     """
     # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
     lines = enumerate(named_text(path).removeprefix("\ufeff").splitlines(), 1)
-    rows = [(k, re.split(r"[\s,;]+", line.split("#")[0].strip(" \t,;"))) for k, line in lines]
-    rows = [(number, cells) for number, cells in rows if cells != [""]]
-    if rows and not any(map(isfinite, map(_number, rows[0][1]))):
+    rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]
+    rows = [(number, cells) for number, cells in rows if cells]
+    if rows and all(_number(cell) is None for cell in rows[0][1]):  # names
         del rows[0]
     remedy = f"write one angle in degrees for each of the {frame.sign.size} joints"
     for number, cells in rows:
         for place, cell in enumerate(cells, 1):
-            if not isfinite(_number(cell)):
+            value = _number(cell)
+            if value is None or not isfinite(value):
                 field = f"line {number}, cell {place}"
                 raise InputError(path, f"{cell!r} is no finite number", field=field, remedy=remedy)
         if len(cells) != frame.sign.size:
@@ -118,15 +119,15 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     if len(rows) < 2:
         remedy = "a motion needs a start and a target"
         raise InputError(path, f"{len(rows)} via points", remedy=remedy)
-    return frame.urdf(np.array([[*map(_number, cells)] for _, cells in rows]))
+    return frame.urdf(np.array([[*map(float, cells)] for _, cells in rows]))
 
 
-def _number(cell: str) -> float:
-    """The number in a cell, or NaN; Python's own `1_000` is no number of a table."""
+def _number(cell: str) -> float | None:
+    """The number in a cell, or None; Python's own `1_000` is no number of a table."""
     try:
-        return nan if "_" in cell else float(cell)
+        return None if "_" in cell else float(cell)
     except ValueError:
-        return nan
+        return None
 
 
 _RATES = ("velocity", "acceleration", "jerk")

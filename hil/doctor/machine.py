@@ -102,7 +102,7 @@ _MOVE = "# or put the campaign folder on another, local disk"
 class DiskTrial:
     """What came of writing to the place of the archives: free bytes, seconds of each write.
 
-    Of none if writing failed; `error` says why.
+    `seconds` is empty if writing failed, and `error` says why.
     """
 
     folder: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,7 @@ import numpy as np
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ArchiveError
+from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.gains import Gains, identify_gains
 from identification.factor.phases import PhaseFactor, gain_factor, joined
@@ -29,7 +29,8 @@ class GainsFound:
     """Gains and what they are for."""
 
     gains: Gains  #: torque per current of each motor
-    loads: dict[str, Payload | None]  #: by archive name, what it carried; None for nothing
+    #: by archive name (path of those with one name), what it carried; None for nothing
+    loads: dict[str, Payload | None]
     motor_side: bool  #: whether gears are known; without, gains include them
 
 
@@ -48,22 +49,22 @@ def find_gains(
     "stated" takes it from the cell.
 
     Raises:
-        InputError: an archive cannot be used, or not together with the others.
-        IdentificationError: no recording has a payload, or there is not one usable row.
+        InputError: an archive cannot be used, or not together with the others; none has a payload.
+        IdentificationError: there is not one usable row.
     """
     factors: list[PhaseFactor] = []
     loads: dict[str, Payload | None] = {}
     first: Cell | None = None
-    with reporter.task("reading recordings", len(archives) + len(loaded)) as task:
+    names = [path.name for path in (*archives, *loaded)]
+    with reporter.task("reading recordings", len(names)) as task:
         for path in (*archives, *loaded):
             archive = open_archive(path)
             cell = cell_of(archive)
             source = source_of(archive, cell)
             current = source.recording.motor_current
             if current is None:
-                raise ArchiveError(
-                    path, "holds no motor currents", remedy="import them as motor_current"
-                )
+                problem, remedy = "holds no motor currents", "import them as motor_current"
+                raise ArchiveError(path, problem, remedy=remedy)
             own = motor_from_joint(source.recording)
             if cell.file.drive_train is not None:
                 own = np.asarray(cell.drive_train.motor_from_joint)
@@ -82,9 +83,18 @@ def find_gains(
                 samples = samples_of(replace(source, recording=without), cell, settings, model)
             except RecordingError as error:
                 raise ArchiveError(path, str(error), remedy="leave it out") from error
-            load = loads[path.name] = loaded.get(path, cell.model.payload)
+            load = loaded.get(path, cell.model.payload)
+            loads[path.name if names.count(path.name) == 1 else str(path)] = load
             factors.append(gain_factor(model, samples, current, payload=load, transmission=turns))
             task.advance(1, path.name)
     assert first is not None, "the command line asks for an archive"
+    _require_load(loads.values())
     gains = identify_gains(joined(factors), model.joint_names)
     return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+
+
+def _require_load(loads: Iterable[Payload | None]) -> None:
+    if not any(load is not None and load.parameters.any() for load in loads):
+        problem = "no recording has a known payload: gains and parameters can be scaled together"
+        remedy = "record the arm with a known load as well: --loaded ARCHIVE --mass KG"
+        raise InputError(None, problem, field="--loaded", remedy=remedy)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from hil.errors import InputError
 from identification.model.friction import ABSENT, TERMS
@@ -34,6 +34,9 @@ class Options:
 
     What is "auto" is chosen by predicting parts of what is fitted from the rest
     (:mod:`identification.selection.inner_prediction`).
+
+    Raises:
+        InputError: there is no such method or estimator.
     """
 
     #: "default" smooths positions only; "paper" smooths positions and torques and filters the
@@ -58,6 +61,12 @@ class Options:
     #: reversal, or "none"; None goes by the friction law
     standstill: LeftOut | Literal["auto"] | None = "auto"
     in_sample: bool = False  #: everything is fitted and nothing predicted: all errors are in-sample
+
+    def __post_init__(self) -> None:
+        for name, known in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):
+            if (value := getattr(self, name)) not in known:
+                remedy = f"use {', '.join(known)}"
+                raise InputError(None, f"{value!r} is no {name}", field=name, remedy=remedy)
 
 
 FRICTION_TERMS: Final = ", ".join(

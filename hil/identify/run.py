@@ -51,19 +51,16 @@ _MARGIN: Final = 1.0  # s of rest that is shown before and after the motion
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What an identification found, and the series its figures need.
+    """What an identification found, and the series its figures need."""
 
-    Essential parameters, and those that a machine can have, say in words why there are none.
-    """
-
-    paths: tuple[Path, ...]
-    prepared: Prepared
-    estimation: Estimation
-    essential: EssentialChoice | str
-    consistency: ConsistencyCheck | str
-    verdict: Verdict
-    results: Results
-    series: ReportSeries
+    paths: tuple[Path, ...]  #: the archives
+    prepared: Prepared  #: their recordings as samples
+    estimation: Estimation  #: the estimate, and what was computed beside it
+    essential: EssentialChoice | str  #: the essential parameters; in words why there are none
+    consistency: ConsistencyCheck | str  #: parameters that a machine can have, likewise
+    verdict: Verdict  #: on the estimate
+    results: Results  #: as they go into `results.json`
+    series: ReportSeries  #: for the figures of the report
 
     @property
     def cell(self) -> Cell:

@@ -69,11 +69,9 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
             arrays |= {f"{name}/{field}": column for field, column in columns.items()}
     if not arrays:
         reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
-        raise SourceError(
-            path,
-            f"has no topic whose messages can be read as columns ({reasons})",
-            remedy="record joint states and currents as ROS 2 messages of constant size",
-        )
+        problem = f"has no topic whose messages can be read as columns ({reasons})"
+        remedy = "record joint states and currents as ROS 2 messages of constant size"
+        raise SourceError(path, problem, remedy=remedy)
     return arrays
 
 
@@ -197,22 +195,16 @@ class ArrayFile:
         if array is None and isinstance(column, str):
             found = self._named(column, field)
             if found.ndim == 2 and 1 not in found.shape:
-                raise SourceError(
-                    self.path,
-                    f"array {column!r} has the shape {found.shape}",
-                    field=field,
-                    remedy="name an array of one dimension, or a column of it by index",
-                )
+                problem = f"array {column!r} has the shape {found.shape}"
+                remedy = "name an array of one dimension, or a column of it by index"
+                raise SourceError(self.path, problem, field=field, remedy=remedy)
             return found.ravel()
         whole = self._named(array, field)
         whole = whole[:, None] if whole.ndim == 1 else whole
         if not isinstance(column, int) or column >= whole.shape[1]:
-            raise SourceError(
-                self.path,
-                f"array {array or next(iter(self.stored))!r} has no column {column!r}",
-                field=field,
-                remedy=f"it has {whole.shape[1]}, counted from 0",
-            )
+            problem = f"array {array or next(iter(self.stored))!r} has no column {column!r}"
+            remedy = f"it has {whole.shape[1]}, counted from 0"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
         return np.asarray(whole[:, column])
 
     def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
@@ -289,11 +281,9 @@ def _readable(path: Path) -> Iterator[None]:
     except SourceError:
         raise
     except Exception as error:
-        raise SourceError(
-            path,
-            f"cannot be read ({error or type(error).__name__})",
-            remedy="save the arrays again as .npz, without objects (MATLAB: save -v7)",
-        ) from error
+        problem = f"cannot be read ({error or type(error).__name__})"
+        remedy = "save the arrays again as .npz, without objects (MATLAB: save -v7)"
+        raise SourceError(path, problem, remedy=remedy) from error
 
 
 def _npz(path: Path) -> dict[str, Stored]:

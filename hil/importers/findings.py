@@ -54,12 +54,9 @@ def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
             remedy="cut the recording where its clock runs backwards, or name another time column",
         )
     if steps.size and not steps.any():
-        raise SourceError(
-            path,
-            f"all {len(stamp)} samples have the same time",
-            field="time",
-            remedy="name the column of the time, or give sample_rate in its place",
-        )
+        problem = f"all {len(stamp)} samples have the same time"
+        remedy = "name the column of the time, or give sample_rate in its place"
+        raise SourceError(path, problem, field="time", remedy=remedy)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _NO_MOTION:
         raise SourceError(

@@ -134,20 +134,14 @@ class _Log:
         times = first.times(time.column, TIMES[time.unit], time.array)
         for other in others:
             if other.times(time.column, TIMES[time.unit], time.array) != times:
-                raise SourceError(
-                    other.path,
-                    f"has other times than {first.path.name}",
-                    field="time",
-                    remedy="name the file of the times that hold for all joints: [time] file",
-                )
+                problem = f"has other times than {first.path.name}"
+                remedy = "name the file of the times that hold for all joints: [time] file"
+                raise SourceError(other.path, problem, field="time", remedy=remedy)
         origin = 0 if min(times) >= 0 and max(times) < _LATEST else min(times)
         if max(times) - origin >= _LATEST:
-            raise SourceError(
-                first.path,
-                f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s",
-                field="time",
-                remedy="give the unit of its time: s, ms, us or ns",
-            )
+            problem = f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s"
+            remedy = "give the unit of its time: s, ms, us or ns"
+            raise SourceError(first.path, problem, field="time", remedy=remedy)
         return np.array([one - origin for one in times], np.int64), origin
 
     @property
@@ -204,12 +198,9 @@ class _Log:
             else:
                 values = file.matrix(quantity.array, field)
             if 1 not in values.shape:
-                raise SourceError(
-                    file.path,
-                    f"has the shape {values.shape}, where one column is wanted",
-                    field=field,
-                    remedy="say which one of each file, by name or by index from 0: columns = [1]",
-                )
+                problem = f"has the shape {values.shape}, where one column is wanted"
+                remedy = "say which one of each file, by name or by index from 0: columns = [1]"
+                raise SourceError(file.path, problem, field=field, remedy=remedy)
             found.append(values.ravel())
         places = [os.path.relpath(file.path, self._folder) for file in files]
         self.check_alike(dict(zip(places, found, strict=True)), "files", f"{name}.files")
@@ -265,12 +256,9 @@ class _Log:
         count, along = len(self.joints), quantity.joints_along
         if along is None:
             if matrix.shape == (count, count):
-                raise SourceError(
-                    path,
-                    f"{name} is a square matrix",
-                    field=f"{name}.joints_along",
-                    remedy='say whether joints lie along "columns" or "rows"',
-                )
+                problem = f"{name} is a square matrix"
+                remedy = 'say whether joints lie along "columns" or "rows"'
+                raise SourceError(path, problem, field=f"{name}.joints_along", remedy=remedy)
             along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
         upright = matrix.T if along == "rows" else matrix
         if upright.shape[1] != count:
@@ -286,12 +274,9 @@ class _Log:
 
     def _file(self, name: str | None, field: str) -> Table | ArrayFile:
         if name is None and self.path.is_dir():
-            raise SourceError(
-                self.path,
-                "is a folder",
-                field=field,
-                remedy='name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"',
-            )
+            problem = "is a folder"
+            remedy = 'name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"'
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
         path = self.path if name is None else self._folder / name
         if path not in self._files:
             arrays = path.suffix.lower() in READERS
@@ -353,12 +338,9 @@ class _Log:
 
     def _check_length(self, values: Sequence[object] | Array, field: str) -> None:
         if len(values) != len(self.joints):
-            raise SourceError(
-                self.path,
-                f"has {len(values)} entries",
-                field=field,
-                remedy=f"one for each of the joints {', '.join(self.joints)}",
-            )
+            problem = f"has {len(values)} entries"
+            remedy = f"one for each of the joints {', '.join(self.joints)}"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
 
 
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:

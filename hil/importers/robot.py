@@ -260,12 +260,9 @@ def write_imported(
     check_clock(samples.stamp, clock or source[0])
     unknown = [name for name in held_joints if name not in robot.joint_names]
     if unknown:
-        raise SourceError(
-            source[0],
-            f"no joint is called {unknown[0]!r}",
-            field="held joints",
-            remedy=f"the robot's joints are {', '.join(robot.joint_names)}",
-        )
+        problem = f"no joint is called {unknown[0]!r}"
+        remedy = f"the robot's joints are {', '.join(robot.joint_names)}"
+        raise SourceError(source[0], problem, field="held joints", remedy=remedy)
     findings = examine(samples, robot.joint_names, robot.urdf, locked=robot.locked)
     entries = {
         **metadata,

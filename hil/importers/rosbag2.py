@@ -153,12 +153,9 @@ def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
     with _connected(file) as bag:
         for number, (stamp, data) in enumerate(bag.execute(query, (topic,))):
             if not isinstance(stamp, int) or not isinstance(data, bytes):
-                raise SourceError(
-                    file,
-                    f"message {number} has no time or no data",
-                    field=topic,
-                    remedy="take it out, or record again",
-                )
+                problem = f"message {number} has no time or no data"
+                remedy = "take it out, or record again"
+                raise SourceError(file, problem, field=topic, remedy=remedy)
             yield stamp, data
 
 
@@ -180,11 +177,9 @@ def _connected(file: Path) -> Iterator[sqlite3.Connection]:
                 raise sqlite3.DatabaseError(f"it has no table {absent[0]}")
             yield bag
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise SourceError(
-            file,
-            f"is not a rosbag2 in sqlite3 storage, or damaged ({error})",
-            remedy="name the .db3 or .mcap file, or the bag's folder",
-        ) from error
+        problem = f"is not a rosbag2 in sqlite3 storage, or damaged ({error})"
+        remedy = "name the .db3 or .mcap file, or the bag's folder"
+        raise SourceError(file, problem, remedy=remedy) from error
 
 
 Array = NDArray[np.float64]
@@ -395,10 +390,7 @@ def _order(
     ours = [renamed.get(name, name) for name in names]
     missing = [joint for joint in joints if joint not in ours]
     if missing and len(missing) < len(joints):
-        raise SourceError(
-            source,
-            f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}",
-            field="joints",
-            remedy=f"give a URDF with the recorded names, or {NOT_RECORDED}",
-        )
+        problem = f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}"
+        remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
+        raise SourceError(source, problem, field="joints", remedy=remedy)
     return [] if missing else [ours.index(joint) for joint in joints]

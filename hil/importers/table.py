@@ -65,11 +65,9 @@ class Table:
             text = text_of(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
-            raise SourceError(
-                path,
-                f"cannot be read ({why})",
-                remedy="name a text file, or one that ends in .npz, .npy, .mat or .m",
-            ) from error
+            problem = f"cannot be read ({why})"
+            remedy = "name a text file, or one that ends in .npz, .npy, .mat or .m"
+            raise SourceError(path, problem, remedy=remedy) from error
         numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)

@@ -426,9 +426,14 @@ def draw_archive(view: ArchiveView) -> Figure:
                 axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
                 style.bare(axes)
                 axes.tick_params(labelbottom=j == rows - 1)
-                title = quantity.title if j == 0 else ""
                 share = f"{share} % of limit" if (share := _share(trace)) else ""
-                axes.set_title("\n".join(filter(None, (title, share))), loc="left")
+                # At a height of its own, or the power of ten of an axis moves it into the next one.
+                axes.set_title(share, loc="right", y=1.0, pad=2.0, fontsize=style.SMALL)
+                if j == 0:
+                    axes.annotate(
+                        quantity.title, (0.0, 1.0), xycoords="axes fraction", xytext=(0.0, 14.0),
+                        textcoords="offset points", fontsize=style.TEXT,
+                    )  # fmt: skip
                 axes.set_xlabel(_SECONDS if j == rows - 1 else "")
                 axes.set_ylabel("" if k else broken(drawing.label(view.joint_names[j])))
         simulated = "SIMULATED" if facts.metadata.get("simulated") == "yes" else ""

@@ -190,6 +190,8 @@ def _arm(axes: Axes, strip: Strip, k: int, view: View) -> None:
     end = strip.postures[k + 1] if k + 1 < len(strip.postures) else strip.time[-1]
     shown = (strip.time >= strip.postures[k]) & (strip.time <= end)
     way = strip.path[shown][:, view.axes]
+    if not len(way):  # a motion shorter than the steps between which it is looked at
+        return
     axes.plot(*way.T, color=_PATH, linewidth=1.3, zorder=3.0)
     axes.plot(*way[0], marker="o", markersize=3.2, color=_PATH, zorder=3.0)
     if np.ptp(way, axis=0).max() > _SHORT * np.ptp(axes.get_xlim()):

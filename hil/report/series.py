@@ -66,7 +66,7 @@ class ReportSeries:
     #: are fewer
     friction_speed: Annotated[Array, "cn"] = field(default_factory=_empty)
     friction_torque: Annotated[Array, "cn"] = field(default_factory=_empty)
-    #: along the friction law of a joint that slides
+    #: along the friction law of sliding, without presliding
     law_speed: Annotated[Array, "sn"] = field(default_factory=_empty)
     law_torque: Annotated[Array, "sn"] = field(default_factory=_empty)
     #: displacement since a reversal and torque of a joint that creeps forwards after it has gone

@@ -361,6 +361,13 @@ class TestBroken:
         assert name in names_of(result.broken)
         assert len(result.repetitions) == 3
 
+    def test_an_estimator_that_is_none_is_refused(self, tmp_path: Path) -> None:
+        """A name that nothing knows would be weighted least squares under that name."""
+        with pytest.raises(InputError, match="'lms' is no estimator; use auto, wls"):
+            Options(estimator="lms")  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="'huber' reads samples; use auto, wls, consistent"):
+            batch(tmp_path, estimator="huber")
+
     def test_nothing_to_fit_is_an_error(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="no archive"):
             batch(tmp_path)
@@ -372,12 +379,14 @@ class TestBroken:
         with pytest.raises(InputError, match=r"2 could not be used, the first of them \S+bad"):
             batch(tmp_path)
 
-    def test_a_campaign_of_validation_alone_costs_only_itself(
-        self, folder: Path, tmp_path: Path
+    @pytest.mark.parametrize("kinds", [["validation"], ["validation", "standstill"]])
+    def test_a_campaign_without_excitation_costs_only_itself(
+        self, folder: Path, tmp_path: Path, kinds: list[str]
     ) -> None:
         alone = tmp_path / "alone"
         alone.mkdir()
-        shutil.copy(folder / "archives" / "validation_000_a1.mcap", alone)
+        for kind in kinds:
+            shutil.copy(folder / "archives" / f"{kind}_000_a1.mcap", alone)
         with pytest.raises(InputError, match="alone could not be used: it holds no excitation"):
             batch(alone)
         found = batch(alone, folder)

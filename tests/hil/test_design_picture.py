@@ -20,7 +20,7 @@ from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import POSTURES, blocks, draw_design
-from hil.plots.posture_strip import Strip, covered, outlines, posture_times
+from hil.plots.posture_strip import Strip, covered, draw_strip, outlines, posture_times
 from identification.excitation import correlation, information
 from identification.excitation.constraints import sampled
 from identification.excitation.criteria import Criteria
@@ -196,6 +196,12 @@ class TestPostures:
         far_away = TWO_LINK_CELL.replace("0.7, -0.3", "7.7, -0.3").replace("0.9, 0.3", "8.9, 0.3")
         far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
         assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
+
+    def test_a_motion_of_an_instant_is_drawn(self, ns16):
+        points = np.array([ns16.home, ns16.home + 1e-4])
+        motion = plan(points, ns16.joint_limits)
+        strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
+        draw_strip(Figure().subplots(2, 7).tolist(), strip)
 
 
 class TestCorrelations:

@@ -1181,6 +1181,7 @@ NONSENSE = {
     "gains a.mcap --loaded a.mcap --mass 4": "with load and without",
     f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
     f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
+    "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "is no term of",
     "import log a.csv -o a.mcap --map m.toml --urdf r.urdf --cell c.toml": (
         "--urdf and --cell: exclude each other"
     ),

@@ -419,3 +419,15 @@ def test_a_folder_stands_for_its_archives(currents: Path, tmp_path: Path) -> Non
     (tmp_path / "empty.mcap").symlink_to(currents / "empty.mcap")
     _, text = gains(currents, str(tmp_path), *BOTH, "--json")
     assert json.loads(text)["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
+
+
+def test_without_any_payload_nothing_is_determined(currents: Path) -> None:
+    with pytest.raises(InputError, match=r"no recording has a known payload.*--loaded ARCHIVE"):
+        gains(currents, "empty.mcap")
+
+
+def test_archives_of_one_name_are_two(currents: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty.mcap").symlink_to(currents / "full.mcap")
+    loaded = ("--loaded", str(tmp_path), *BOTH[2:])
+    _, text = gains(currents, "empty.mcap", *loaded, "--json")
+    assert sorted(json.loads(text)["payload_kg"].values(), key=bool) == [None, 4.0]

@@ -170,6 +170,8 @@ def test_says_what_is_wrong(app, via, arguments, problem):
         ("0 0 -90 0 90 0\na b c d e f\n", "line 2, cell 1: 'a' is no"),
         ("0 0 -90 0 90 0\n0 inf -90 0 90 0\n", "line 2, cell 2: 'inf' is no"),
         ("0 0 -90 0 90 0\n0 0 -9_0 0 90 0\n", "line 2, cell 3: '-9_0' is no"),
+        ("nan nan nan nan nan nan\n0 0 -90 0 90 0\n9 9 -90 0 90 0\n", "line 1, cell 1: 'nan'"),
+        ("0 0 -90 0 90 0\u00a0\n", "1 via points"),
     ],
 )
 def test_says_what_is_wrong_with_via_points(app, tmp_path, text, problem):

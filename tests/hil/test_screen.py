@@ -13,6 +13,7 @@ import termios
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,15 @@ def drawn(width: int, height: int, shown: Shown | None = None) -> list[str]:
 
 
 # --- what is shown ---------------------------------------------------------------------------
+
+
+def test_a_motion_that_says_nothing_of_friction_leaves_the_last_figure() -> None:
+    before = status()
+    assert before.drift is not None
+    change = np.append(before.drift.change, np.nan)
+    after = replace(before, drift=replace(before.drift, change=change))
+    for shown in ("\n".join(drawn(80, 24, Shown("x", NAMES, after))), layout.status_line(after)):
+        assert "friction changed by 1.7 % (warm below 2 %)" in shown
 
 
 def test_eighty_by_twenty_four_hold_everything() -> None:

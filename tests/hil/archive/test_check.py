@@ -20,8 +20,9 @@ from typer.testing import CliRunner
 
 from hil.archive import Samples, container, header, open_archive, schema, write_samples
 from hil.archive.check import ASPECTS, check_archive
+from hil.archive.repair import repair
 from hil.cli import app
-from hil.errors import NotAnArchiveError
+from hil.errors import ArchiveError, NotAnArchiveError
 from tests.hil.mcap_bytes import Content
 
 
@@ -175,6 +176,11 @@ class TestAnotherFile:
         for read in (check_archive, open_archive):
             with pytest.raises(NotAnArchiveError, match=sentence):
                 read(tmp_path / "x")
+
+    def test_a_file_that_is_not_there_comes_with_a_remedy(self, tmp_path):
+        for read in (check_archive, open_archive, repair):
+            with pytest.raises(ArchiveError, match="No such file or directory; see whether"):
+                read(tmp_path / "nowhere.mcap")
 
 
 def run(*arguments: str | Path):
