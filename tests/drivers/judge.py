@@ -265,8 +265,8 @@ class Conduct:
                 self._go_on_from_target(a, r)
                 rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
-            late = self.max_gap + 1
-            nearest = np.abs(np.array(self.motors[-late:]) - r[0]).min(axis=0)
+            near = np.concatenate((self.motors[-self.max_gap - 1 :], self._led_on()))
+            nearest = np.abs(near - r[0]).min(axis=0)
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
             assert ((low <= a[0]) & (a[0] <= high)).all(), "sent and recorded differ"
@@ -300,11 +300,15 @@ class Conduct:
 
         It carried the motion on, as fast as before or a little slower, or brought it to rest. A
         target that is the set-point sent last, but for rounding, does not say which.
+
+        Args:
+            a: (5, n) D1 to D5 of the answer.
+            r: (5, n) the same of the packet.
         """
-        begun, standstill = a[0] - a[1], self.limits.standstill
+        begun = a[0] - a[1]  # where the step begins, by its own account
         off_target, off_before = np.abs(begun - r[0]).max(), np.abs(begun - self.motor).max()
         rounding = np.spacing(np.float32(np.abs(a[0]).max()))
-        step = self.motors[-1] - self.motors[-2] if len(self.motors) > 1 else 0.0 * r[0]
+        step, standstill = self._last_step(), self.limits.standstill
         again = self.answered is not None and np.array_equal(a, self.answered) and a[1].any()
         if again or not step.any() or off_target > off_before + rounding:
             return
@@ -320,6 +324,17 @@ class Conduct:
         self.motors = [r[0] - k * r[1] for k in (3, 2, 1, 0)]
         self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
         self._count("goes on from the target")
+
+    def _led_on(self) -> np.ndarray:
+        """(k, n) where a controller that goes on over packets missed may be, motor revolutions."""
+        ahead = np.arange(1, min(self.missed, self.max_gap) + 1)[:, np.newaxis]
+        return self.motor + ahead * self._last_step()
+
+    def _last_step(self) -> np.ndarray:
+        """(n,) of the set-points sent last, motor revolutions."""
+        if len(self.motors) < 2:
+            return np.zeros_like(self.motor)
+        return self.motors[-1] - self.motors[-2]
 
     def _lag(self, target: np.ndarray) -> int:
         back = np.abs(np.array(self.motors[::-1]) - target)
@@ -343,8 +358,7 @@ class Conduct:
         or on its way to rest.
         """
         lag = self._lag(target)
-        last = np.abs(self.motors[-1] - self.motors[-2]).max() if len(self.motors) > 1 else 0.0
-        slow = last <= 4.0 * self.limits.standstill * (1 + 1e-6)
+        slow = np.abs(self._last_step()).max() <= 4.0 * self.limits.standstill * (1 + 1e-6)
         if self.aged:
             self.lag = lag if slow else min(lag, self.lag)
             return

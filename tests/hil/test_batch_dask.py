@@ -56,15 +56,8 @@ class Cluster:
         self.address: str = json.loads(description.read_text())["address"]
 
     def add_worker(self, *options: str, **environment: str) -> subprocess.Popen[bytes]:
-        arguments = (
-            "--host",
-            "127.0.0.1",
-            "--nthreads",
-            "1",
-            "--no-dashboard",
-            *(options or ("--no-nanny",)),
-        )
-        worker = self._start("worker", *arguments, **environment)
+        here = ("--host", "127.0.0.1", "--nthreads", "1", "--no-dashboard")
+        worker = self._start("worker", *here, *(options or ("--no-nanny",)), **environment)
         self.workers.append(worker)
         return worker
 

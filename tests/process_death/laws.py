@@ -58,12 +58,7 @@ def broken_by(
 ) -> tuple[list[str], dict[str, int]]:
     """What was broken, and figures; `earlier` are archives of before the run that was seen."""
     figures: dict[str, int] = {}
-    problems = [
-        *_told(seen),
-        *_arm(seen),
-        *_link(seen),
-        *_entered(seen.entered, campaign),
-    ]
+    problems = [*_told(seen), *_arm(seen), *_link(seen), *_entered(seen.entered, campaign)]
     if seen.left:
         problems.append(f"processes are left over: {seen.left}")
     if seen.port_taken:

@@ -30,12 +30,12 @@ from tests.simulate.laws.archived import read
 from tests.simulate.laws.conversation import heard, talks_of
 from tests.simulate.laws.estimated import FALSE_ALARM, SEEDS, bound, degrees_of_freedom
 from tests.simulate.laws.judged import judge_whole
-from tests.simulate.laws.open_mode import modes_of, stretches
+from tests.simulate.laws.open_mode import Stretch, modes_of, stretches
 from tests.simulate.laws.wire import Packets, safe_answers
 from tests.simulate.observed import Broken, Observed
 from tests.simulate.script import parse_script
 from tests.simulate.verdicts import LAWS
-from tests.simulate.world import NEIGHBOURS, play, twin_of
+from tests.simulate.world import NEIGHBOURS, Twin, play, twin_of
 
 SEED = 5
 FAULTS = (
@@ -64,10 +64,15 @@ def with_life(observed: Observed, number: int, **changes: Any) -> Observed:
 
 
 @pytest.fixture(scope="module")
-def observed(tmp_path_factory: pytest.TempPathFactory) -> Observed:
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Twin:
+    """The campaign without faults."""
+    return twin_of(SEED // NEIGHBOURS, tmp_path_factory.mktemp("twin"))
+
+
+@pytest.fixture(scope="module")
+def observed(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Observed:
     """The campaign."""
-    root = tmp_path_factory.mktemp("simulated")
-    return play(SEED, twin_of(SEED // NEIGHBOURS, root), root, parse_script(FAULTS))
+    return play(SEED, twin, tmp_path_factory.mktemp("faulty"), parse_script(FAULTS))
 
 
 def test_an_untouched_campaign_keeps_every_law(observed: Observed) -> None:
@@ -108,10 +113,14 @@ def of_kind(observed: Observed, kind: str, number: int = 0) -> int:
     return [index for index, one in enumerate(kinds) if one == kind][number]
 
 
+def longest(observed: Observed) -> Stretch:
+    """The longest motion of the first life."""
+    return max(stretches(heard(observed)[0].talks[0]), key=lambda one: one.leading)
+
+
 def in_motion(observed: Observed, further: int = 0) -> tuple[int, int]:
     """Index of a packet amid a motion of the first life, and byte offset in its first joint."""
-    talk = heard(observed)[0].talks[0]
-    stretch = max(stretches(talk), key=lambda one: one.leading)
+    talk, stretch = heard(observed)[0].talks[0], longest(observed)
     moving = np.flatnonzero((stretch.step[: stretch.leading] != 0.0).any(axis=1))
     offset = 12 + 36 * (talk.init.slots or (0,))[0] + further
     return int(stretch.at[moving[len(moving) // 2]]), offset
@@ -165,12 +174,16 @@ def first_set_point(observed: Observed, further: int = 0) -> tuple[int, int]:
 
 
 def with_set_points(
-    observed: Observed, move: Callable[[np.ndarray], np.ndarray], *, records: bool = True
+    observed: Observed,
+    move: Callable[[np.ndarray], np.ndarray],
+    *,
+    records: bool = True,
+    stretch: Stretch | None = None,
 ) -> Observed:
     """The set-points of a motion of the first life moved by `move(rows)` motor revolutions."""
     life = observed.runs[0]
     talk = heard(observed)[0].talks[0]
-    stretch = max(stretches(talk), key=lambda one: one.leading)
+    stretch = stretch or longest(observed)
     slots = list(talk.init.slots or ())
     drives, k = observed.cell.drive_train, stretch.leading
     moved = np.zeros_like(stretch.sent[:k]) + move(np.arange(k))
@@ -192,7 +205,7 @@ def with_set_points(
 
 def leapt(observed: Observed, height: float = 0.2, *, records: bool = True) -> Observed:
     """One set-point in the middle of a motion is that much further [motor revolutions]."""
-    at = max(one.leading for one in stretches(heard(observed)[0].talks[0])) // 2
+    at = longest(observed).leading // 2
     bump = lambda rows: np.where(rows == at, height, 0.0)[:, np.newaxis]  # noqa: E731
     return with_set_points(observed, bump, records=records)
 
@@ -349,6 +362,53 @@ def test_what_was_altered_is_found(
         assert text in said
 
 
+@pytest.fixture(scope="module")
+def led(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Observed:
+    """Four packets are lost amid a motion, which the controller of this seed carries on."""
+    lost = twin.story.moving[3 * len(twin.story.moving) // 10]
+    return play(SEED + 1, twin, tmp_path_factory.mktemp("led"), parse_script([f"lose@{lost}x4"]))
+
+
+def gap_of(observed: Observed) -> tuple[Stretch, int]:
+    """The first motion with a long gap, and its row behind that."""
+    talk = heard(observed)[0].talks[0]
+    behind = ((one, np.flatnonzero(talk.records["gap"][one.rows] > 2)) for one in stretches(talk))
+    return next((one, int(rows[0])) for one, rows in behind if rows.size)
+
+
+def received_there(observed: Observed, field: int, factor: float, more: float = 0.0) -> Observed:
+    """One of D1..D5 of the first joint behind the gap, times a factor and with something added."""
+    stretch, row = gap_of(observed)
+    at = 16 + 4 * field + 36 * (stretch.talk.init.slots or (0,))[0]
+    value = np.float32(factor * stretch.received[field, row, 0] + more)
+    return with_received(observed, (int(stretch.at[row]), at), value.tobytes())
+
+
+def moved_from_there(observed: Observed, way: float, speed: float) -> Observed:
+    """Set-points behind the gap moved by revolutions, and by revolutions per cycle."""
+    stretch, row = gap_of(observed)
+    move = lambda rows: ((way + speed * (rows - row)) * (rows >= row))[:, np.newaxis]  # noqa: E731
+    return with_set_points(observed, move, stretch=stretch)
+
+
+@pytest.mark.parametrize(
+    ("alter", "text"),
+    [
+        (lambda o: received_there(o, 0, 1.0, 50.0), "from a target that is not on its way"),
+        (lambda o: received_there(o, 1, 1.6), "had not carried it on"),
+        (lambda o: received_there(o, 1, 0.0), "had not carried it on"),
+        (lambda o: received_there(o, 2, 1.0, 50.0), "does not follow"),
+        (lambda o: moved_from_there(o, 0.01, 0.0), "acceleration"),
+        (lambda o: moved_from_there(o, 0.0, 0.02), "acceleration"),
+    ],
+)
+def test_a_long_gap_excuses_nothing_behind_it(led: Observed, alter: Alter, text: str) -> None:
+    """Though what follows is judged as begun anew, where the controller led it."""
+    assert found(led, "guard") == found(led, "judge") == ""
+    assert text in found(alter(led), "guard")
+    assert found(alter(led), "judge")
+
+
 def test_the_safe_answers_on_arrays_are_those_of_the_oracle_one_by_one() -> None:
     chance = random.Random(4)
     arms = (1, 1, 2, 1)
@@ -386,8 +446,7 @@ def test_bounds_of_a_stop_for_losses_that_were_none_are_found(observed: Observed
     wide = leapt(observed, float(np.min(0.6 * revolutions_of_jerk(observed))))
     assert "jerk" in found(wide, "guard")
     talk = heard(observed)[0].talks[0]
-    stretch = max(stretches(talk), key=lambda one: one.leading)
-    lost = AnswersLost(3, int(talk.records["cycle"][stretch.rows][0]))
+    lost = AnswersLost(3, int(talk.records["cycle"][longest(observed).rows][0]))
     events = observed.runs[0].events
     wide = with_life(wide, 0, events=(*events, (events[-1][0], lost)))
     assert found(wide, "guard") == ""

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.exchange.loop import Intake
+from drivers.execution import Execution
 from drivers.guard import Guard
 from drivers.reply_policy import ReplyPolicy
 from drivers.session import Sequence
@@ -144,6 +145,7 @@ believes_the_manifest = replaced(
 )
 lets_set_points_pass = replaced(Guard, "check_set_point", lambda *_: None)
 lets_feedback_pass = replaced(Guard, "check_feedback", lambda *_: None)
+leaves_at_once = replaced(Execution, "settled", property(lambda self: self.finished))
 
 DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",), "replies"),
@@ -154,6 +156,7 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "an arm that does not follow is moved": (
         lets_feedback_pass, ("following-error@{moving}x60:axis=1:slip",), "guard"),
     "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",), "gaps"),
+    "open mode is left before the arm settles": (leaves_at_once, ("lose@{moving}x4",), "rest"),
     "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",), "piles"),
     "records are lost unsaid": (loses_a_record, (), "archives"),
     "a stopped motion counts": (takes_stopped_motions_for_whole, ("stop@{moving}",), "folder"),

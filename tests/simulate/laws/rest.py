@@ -2,8 +2,9 @@
 
 Seen at the arm itself, after the last process of the PC is gone and the controller alone has acted;
 and at the end of each run that ends by itself, but for what it lost or was refused. There the
-set-points rest and the arm stands as the cell means it (`[robot.friction] standstill`): against
-dry friction its servo may still creep to where it was sent.
+set-points rest, for as long as the cell says (`[campaign] settle_s`), and the arm stands as the
+cell means it (`[robot.friction] standstill`): against dry friction its servo may still creep to
+where it was sent.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from drivers.events import MotionEnded
+from drivers.states import State
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerFault, HilError
 from tests.simulate.observed import Broken, Life, Observed
@@ -24,6 +26,8 @@ from .wire import Array, Gears
 LAW: Final = "rest"
 _STANDSTILL: Final = 5e-4
 """Motor revolutions per cycle below which an axis stands (`drivers.guard`)."""
+_SWING: Final = 3.0
+"""Times the cell's standstill that an arm may swing that the controller stopped at once."""
 
 
 def rest(observed: Observed) -> Iterator[Broken]:
@@ -41,11 +45,14 @@ def rest(observed: Observed) -> Iterator[Broken]:
         if _ends_at_rest(life) and life.exchanged:
             at = min(life.last_cycle, len(arm.open_axes) - 1)
             speed = np.abs(arm.velocity[at])
-            swings = disturbed or _held_up(life)
-            if not swings and (speed > observed.cell.model.friction.standstill).any():
+            rests = observed.cell.model.friction.standstill * (_SWING if _held_up(life) else 1.0)
+            if not disturbed and (speed > rests).any():
                 yield Broken(LAW, f"life {number} ends on a moving arm: {speed.max():.2g} rad/s")
             if arm.open_axes[at]:
                 yield Broken(LAW, f"life {number} ends with open axes, phase {arm.phase[at]}")
+        for interval, held, wanted in _held_too_short(life):
+            text = f"interval {interval} is left {held} cycles after it moved, not {wanted}"
+            yield Broken(LAW, f"life {number}: {text}")
 
 
 def _speed(velocity: Array, gears: Gears, period: float) -> float:
@@ -57,6 +64,20 @@ def _held_up(life: Life) -> bool:
     """Whether the controller may have stopped the last motion at once, so that the servo swings."""
     ends = [event.reason for _, event in life.events if isinstance(event, MotionEnded)]
     return any("missed in a row" in reason for reason in ends[-1:])
+
+
+def _held_too_short(life: Life) -> Iterator[tuple[int, int, int]]:
+    """Intervals in which the set-points rested for fewer cycles than the cell says."""
+    wanted = int(life.settings.get("settle_cycles", 200))
+    for _, event in life.events:
+        if not isinstance(event, MotionEnded) or event.outcome not in ("completed", "stopped"):
+            continue
+        rows = life.records[life.records["interval"] == event.interval]
+        left = np.flatnonzero(rows["state"] == State.EXITING)[:1]
+        sent = rows["commanded_position"][: left[0] + 1 if left.size else 0]
+        moved = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > 0.0).any(axis=1)) + 1
+        if moved.size and left[0] - moved[-1] < wanted:
+            yield event.interval, int(left[0] - moved[-1]), wanted
 
 
 def _ends_at_rest(life: Life) -> bool:
