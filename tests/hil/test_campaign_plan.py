@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import subprocess
@@ -233,7 +234,7 @@ def test_the_model_of_a_swinging_arm_predicts_unseen_motion(found: Identificatio
 
 def test_the_report_says_which_method_found_which_motion(found: Identification) -> None:
     words = "8.00 s, 3 sines per joint, designed by the paper's method A"
-    assert words in report_bytes(found.results, found.series).decode()
+    assert words in html.unescape(report_bytes(found.results, found.series).decode())
 
 
 def test_bare_sines_are_refused_before_anything_moves(
