@@ -102,6 +102,8 @@ _ROUNDING = 1e-9
 _CARRIED = 9e-7
 # Steps of Newton towards the nearest point of a path, from a few cycles away.
 _TRIES = 8
+# s; no gap of which a motion goes on is longer, and no nearest point is farther away in time.
+_FARTHEST = 1.0
 
 
 class _SetPoints(NamedTuple):
@@ -181,6 +183,8 @@ class TrajectoryPlayer:
         self._tolerance = start_tolerance
         extrema = trajectory.extrema() if isinstance(trajectory, PiecewiseCubic) else None
         stopping = slowing_bounds(limits, stop_acceleration, stop_jerk, extrema)
+        # At this rate the path's own accelerations are those of a stop.
+        self._fastest = sqrt(stop_acceleration)
         overriding = slowing_bounds(limits, override_acceleration, override_jerk, extrema)
         self._allowed: dict[Literal["override", "stop"], RateBounds] = {
             "override": within(overriding, stopping),
@@ -308,26 +312,39 @@ class TrajectoryPlayer:
             self._offset, self._last = way, position
             return
         s, here = self.motion_time, position - self._offset
+        # Where the path hardly moves its direction says nothing.
+        slowest = float(velocity @ velocity) * _ROUNDING
+        least, most = max(s - _FARTHEST, 0.0), min(s + _FARTHEST, self._duration)
+        point, speed = self._path.read(s)
         for _ in range(_TRIES):
+            square = float(speed @ speed)
+            if square <= slowest:
+                break
+            before, s = s, min(max(s + float((here - point) @ speed) / square, least), most)
             point, speed = self._path.read(s)
-            square = float(speed @ speed) or 1.0
-            before, s = s, min(max(s + float((here - point) @ speed) / square, 0.0), self._duration)
             if abs(s - before) <= _ROUNDING * self._period:
                 break
+        square = float(speed @ speed) or 1.0
         self._near(here, point, self._tolerance)
         # However many gaps there are: once the tolerance for the start, once for all of them.
         self._offset = self._near(position, point, 2.0 * self._tolerance)
         self._last = position
         self._tabled = False
-        rate, stopping = max(0.0, float(velocity @ speed) / square), self._allowed["stop"]
+        rate = min(max(0.0, float(velocity @ speed) / square), self._fastest)
+        stopping = self._allowed["stop"]
         # What slows down goes on so: begun anew after each of many gaps, it would never be at rest.
         slope = max(min(self._law.slope, 0.0), -sqrt(2.0 * stopping.change * rate))
         self._law.restart(s, rate, slope)
         shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
-        self._across = list(shares * (velocity - rate * speed))
+        self._across = list(shares * (velocity - rate * speed)) if velocity.any() else []
         self._law.aim(0.0 if self._held or self._stopping else self._override, stopping)
         self._ramp = self._bounds = "stop"
-        self._finished = self._stopping and self._law.settled
+        self._finished = self._stopping and self._settled
+
+    @property
+    def _settled(self) -> bool:
+        """Whether the rate has come to its target and no velocity across the path is left."""
+        return self._law.settled and not self._across
 
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""
@@ -345,22 +362,22 @@ class TrajectoryPlayer:
 
     def _advance_beside_the_table(self) -> tuple[Array, Array]:
         law = self._law
-        if law.settled:
+        if self._settled:
             self._bounds = "plan"
             if law.rate == 0.0:
                 return self._last, self._rest
         law.advance()
-        if law.motion_time >= self._end:
+        if law.motion_time >= self._end and not self._across:
             self._finished = True
             self._last = self._table.position[-1] + self._offset
             return self._last, self._rest
-        position, velocity = self._path.read(law.motion_time)
+        position, velocity = self._path.read(min(law.motion_time, self._duration))
         velocity = velocity * law.rate
         if self._across:
             across = self._across.pop()
             velocity += across
             self._offset = self._offset + self._period * across
-        self._finished = self._stopping and law.settled
+        self._finished = self._stopping and self._settled
         self._last = position + self._offset
         return self._last, velocity
 
@@ -403,7 +420,7 @@ class TrajectoryPlayer:
         self._held, self._stopping = False, True
         self._aim(0.0, "stop")
         self._bounds = "stop"
-        self._finished = self._law.settled
+        self._finished = self._settled
 
     def cancel(self) -> None:
         """Give the motion up: come to rest on the path, from where it cannot be resumed."""

@@ -294,6 +294,25 @@ class TestCarriedOn:
                 player.go_on_from(last + aside, (last - before) / PERIOD, 2)
                 before, last = last + aside, player.advance()[0]
 
+    @pytest.mark.parametrize("left", [18, 22, 26, 30])
+    def test_near_the_end_it_comes_to_rest_within_bounds(self, left):
+        """There the path slows down, stands still at last, and its direction says nothing."""
+        points = random_points(0, 4)
+        closed = plan([*points, points[0]], SIX_AXES)
+        player = TrajectoryPlayer(closed, PERIOD, SIX_AXES)
+        player.begin(player.start)
+        cycles = round(closed.duration / PERIOD) - left
+        before, last = [player.advance()[0] for _ in range(cycles)][-2:]
+        step = last - before
+        guard = Arm(closed, SIX_AXES).guard
+        for one in (guard, player):
+            one.go_on_from(last + 8 * step, step / PERIOD, 15)
+        assert player.motion_time > 0.5 * closed.duration
+        player.stop()
+        for cycle in range(100):
+            guard.check_set_point(*player.advance(), player.bounds, cycle)
+        assert player.finished
+
     def test_brought_to_rest_it_stays_there(self, carried):
         player, last, step = carried
         player.go_on_from(last + step, 0.0 * step, 2)
