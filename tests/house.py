@@ -29,10 +29,10 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 80_250,
+    "product lines": 79_550,
     "product files": 324,
-    "test lines": 76_800,
-    "test files": 250,
+    "test lines": 73_800,
+    "test files": 242,
     "import circles": 0,
     "imports inside functions": 32,
     "files with one importer": 17,
