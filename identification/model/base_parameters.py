@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 Array = NDArray[np.float64]
 
@@ -107,7 +106,7 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
     scale = np.where(longest > 0.0, longest, 1.0)[of_unit]
     scaled = reduced / scale
     pivots, basis, shares = _first_independent(scaled)
-    relation = solve_triangular(basis.T @ scaled[:, pivots], basis.T @ scaled)
+    relation = np.linalg.solve(basis.T @ scaled[:, pivots], basis.T @ scaled)
     # What is no larger than what stays unexplained is rounding, not grouping.
     unexplained = np.linalg.norm(scaled - scaled[:, pivots] @ relation, axis=0).max(initial=0.0)
     relation[np.abs(relation) < max(_ROUNDING, 10.0 * float(unexplained))] = 0.0
