@@ -2,7 +2,7 @@
 
 Below a folder ``.hil-cache`` beside the archives a file is named by its key, a digest of everything
 the content depends on, so nothing is ever out of date. An entry whose checksum fails, or that was
-written for another key, counts as absent; one that is whole is our own and trusted.
+written for another key, counts as absent; the content of any other is not checked again.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def another(near):
 
 
 @pytest.fixture
-def stranger(near):
+def other_host(near):
     far = Controller(near.address[1], STRANGER)
     yield far
     far.close()
@@ -100,11 +100,11 @@ class TestContract(TransportContract):
 
 
 class TestPeer:
-    def test_another_host_gets_no_answer_and_is_counted(self, near, stranger):
-        stranger.send(bytes(48))
+    def test_another_host_gets_no_answer_and_is_counted(self, near, other_host):
+        other_host.send(bytes(48))
         assert near.receive(0.05) is None
         near.send(bytes(48))
-        assert stranger.heard_nothing()
+        assert other_host.heard_nothing()
         assert near.rejected() == {"foreign": 1, "unsent": 1}
         assert near.rejected() == {}
 
@@ -149,26 +149,26 @@ class TestPeer:
         assert near.receive(0.05) is None
         assert near.rejected() == {"malformed": 1}
 
-    def test_strangers_neither_lengthen_the_wait_nor_hide_a_packet(
-        self, near, controller, stranger
+    def test_other_hosts_neither_lengthen_the_wait_nor_hide_a_packet(
+        self, near, controller, other_host
     ):
         for _ in range(200):
-            stranger.send(bytes(48))
+            other_host.send(bytes(48))
         before = time.monotonic()
         assert near.receive(0.05) is None
         assert 0.05 <= time.monotonic() - before < 5.0
         for _ in range(20):
-            stranger.send(bytes(48))
+            other_host.send(bytes(48))
         controller.send(b"x" * 48)
         assert near.receive(PATIENCE) == b"x" * 48
         assert near.rejected() == {"foreign": 220}
 
-    def test_without_patience_too(self, near, controller, stranger):
+    def test_without_patience_too(self, near, controller, other_host):
         controller.send(b"a" * 48)
         assert near.receive(PATIENCE) == b"a" * 48
         for number in range(10):
             for _ in range(3):
-                stranger.send(bytes(48))
+                other_host.send(bytes(48))
             controller.send(bytes([number]) * 48)
         received = [near.receive(timeout) for timeout in (0.0, -1.0, 1e-9, 0.0, -1e-9)]
         assert received == [bytes([number]) * 48 for number in range(5)]
@@ -177,11 +177,11 @@ class TestPeer:
         assert received == [bytes([number]) * 48 for number in range(10)]
         assert near.rejected() == {"foreign": 30}
 
-    def test_without_patience_a_flood_does_not_keep_it(self, near, stranger):
+    def test_without_patience_a_flood_does_not_keep_it(self, near, other_host):
         kernel = near._receive
 
         def endless(*arguments):
-            stranger.send(bytes(48))
+            other_host.send(bytes(48))
             return kernel(*arguments)
 
         near._receive = endless
@@ -399,16 +399,16 @@ class TestSession:
         assert session.counters.missed == 1
         assert session.state is State.CLOSED
 
-    def test_a_foreign_packet_is_an_event_of_the_session(self, near, controller, stranger, session):
-        stranger.send(self.packet(11))
+    def test_a_foreign_packet_is_an_event(self, near, controller, other_host, session):
+        other_host.send(self.packet(11))
         controller.send(init_packet().encode())
         self.serve(near, session, 1)
         exchange(near, session, until=iter([False, True]).__next__)
         assert session.counters.discarded["foreign"] == 1  # a busy computer may answer late as well
         assert PacketRejected("foreign", 1) in session.events()
-        assert stranger.heard_nothing()
+        assert other_host.heard_nothing()
 
-    def test_a_stranger_does_not_take_over_a_start_that_goes_on(
+    def test_another_host_does_not_take_over_a_start_that_goes_on(
         self, near, controller, another, session
     ):
         controller.send(self.SYNC)

@@ -179,8 +179,8 @@ class TestChunks:
     def test_end_every_100_ms_of_the_controllers_time(self, tmp_path):
         """Lost cycles make one shorter, and none later."""
         assert chunks(write(tmp_path / NAME, records(1001))) == 11
-        kept = np.delete(records(300), slice(150, 250))
-        assert chunks(write(tmp_path / "move_000_a1.mcap", kept)) == 3
+        gapped = np.delete(records(300), slice(150, 250))
+        assert chunks(write(tmp_path / "move_000_a1.mcap", gapped)) == 3
 
     def test_reach_the_file_without_waiting_for_the_end(self, tmp_path):
         archive = writer(tmp_path / NAME)

@@ -340,7 +340,7 @@ def wild(cell: Cell) -> Excitation:
 def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
     tmp_path: Path, wild: Excitation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever an earlier one left: what identification writes for other tools is no stranger."""
+    """Whatever an earlier one left, with the files that identification writes for other tools."""
     earlier = tmp_path / "manifest.json"
     for name in ("manifest.json", "results.json", "report.html", *FILES):
         (tmp_path / name).write_text("{}")

@@ -473,15 +473,15 @@ def test_joint_states_in_another_encoding_are_refused_by_its_name(
         import_log(source, tmp_path / "out.mcap", robot=robot, columns=by_map())
 
 
-@pytest.mark.parametrize("kept", [0, 3, 40, 5000, -1, None])
+@pytest.mark.parametrize("length", [0, 3, 40, 5000, -1, None])
 def test_files_that_are_cut_off_or_damaged_are_refused(
-    tmp_path: Path, robot: Robot, kept: int | None
+    tmp_path: Path, robot: Robot, length: int | None
 ) -> None:
     source = joint_states(tmp_path / "x.mcap", compression=CompressionType.NONE)
     data = bytearray(source.read_bytes())
-    if kept is None:
+    if length is None:
         data[data.index(POSITION[150, ::-1].tobytes())] ^= 1
-    source.write_bytes(data[:kept])
+    source.write_bytes(data[:length])
     with pytest.raises(SourceError, match="no MCAP file, or cut off"):
         import_rosbag2(source, tmp_path / "out.mcap", robot=robot)
 
