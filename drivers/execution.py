@@ -261,9 +261,9 @@ class MotionExecution(Execution):
     def follows(self) -> bool:
         """Whether the source goes on from where a controller carried the motion."""
         going = self.started and not self.finished
-        return going and callable(getattr(self._source, "go_on_from", None))
+        return going and callable(getattr(self._source, "resume_from", None))
 
-    def go_on_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
+    def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
         """The controller carried the motion on by itself: see `CarriedSource`.
 
         Raises:
@@ -272,7 +272,7 @@ class MotionExecution(Execution):
         try:
             # What the guard checks against is not the source's to change.
             source = cast(CarriedSource, self._source)
-            source.go_on_from(position.copy(), velocity.copy(), cycles)
+            source.resume_from(position.copy(), velocity.copy(), cycles)
         except BaseException as error:
             raise _failed("cannot go on", error, cycle) from error
 

@@ -356,7 +356,7 @@ class Guard:
         self._history[:4] = q
         self.check_set_point(q, np.zeros_like(q), "plan", cycle)
 
-    def go_on_from(self, q: Array, qd: Array, cycles: int) -> None:
+    def resume_from(self, q: Array, qd: Array, cycles: int) -> None:
         """The controller moved by itself: its target, (n,) rad, and velocity, rad/s, count as sent.
 
         For so many cycles jerk has no bound.

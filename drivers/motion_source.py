@@ -129,7 +129,7 @@ class HoldableSource(Protocol):
 class CarriedSource(Protocol):
     """A source that can go on from where a controller carried its motion by itself."""
 
-    def go_on_from(self, position: Array, velocity: Array, cycles: int) -> None:
+    def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
         """The controller's target is here, (n,) rad and rad/s: go on along the path, as asked for.
 
         A velocity across the path dies away in so many cycles. Raises if it is not on the path.

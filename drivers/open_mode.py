@@ -77,7 +77,7 @@ class SentSetPoints:
         self.lag = self._repeated = 0
         self._unsure = self.again = False
 
-    def go_on_from(self, target: Array, step: Array) -> None:
+    def resume_from(self, target: Array, step: Array) -> None:
         """The controller carried on to this target (n,) by this step (n,); as late as before."""
         self._sent[(self._newest - self._back) % len(self._sent)] = (
             target - self._back[:, None] * step
@@ -400,9 +400,9 @@ class PositionMode(_OpenMode):
         position = self.held + self._wire.joint_difference(target - self._sent)
         speed = self._wire.joint_difference(step) / self._guard.period
         spread = min(SPREAD * steps, round(RETURN / self._guard.period))
-        execution.go_on_from(position, speed, spread, cycle)
-        self._guard.go_on_from(position, speed, spread)
-        self._history.go_on_from(target, step)
+        execution.resume_from(position, speed, spread, cycle)
+        self._guard.resume_from(position, speed, spread)
+        self._history.resume_from(target, step)
         self.held, self._sent = position, target
 
     def require_no_pause(self, reading: Reading, cycle: int) -> None:

@@ -24,9 +24,9 @@ from sim_fixtures.program import Phase
 _PR_SET_TIMERSLACK: Final = 29
 
 
-def open_far_end(
+def open_controller_link(
     udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
-) -> serve.FarEnd:
+) -> serve.ControllerLink:
     """The controller's end of the link a person names.
 
     `udp` is "HOST:PORT" of the PC program, `can` "INTERFACE:CHANNEL", ":fd" or ":classic" behind
@@ -34,7 +34,7 @@ def open_far_end(
 
     Raises:
         InputError: neither or both, or not of that form.
-        FarEndError: impossible to open, or unfit for the session.
+        ControllerLinkError: impossible to open, or unfit for the session.
     """
     if (udp is None) == (can is None):
         remedy = "give --udp or --can, not both"
@@ -46,10 +46,10 @@ def open_far_end(
     if not host or port is None:
         remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
         raise InputError(None, f"--udp {udp!r} is not an address", remedy=remedy)
-    return serve.UdpFarEnd(host, port)
+    return serve.UdpControllerLink(host, port)
 
 
-def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.FarEnd:
+def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.ControllerLink:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
     if profile not in ("fd", "classic"):
@@ -61,12 +61,12 @@ def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.FarEnd:
     if not (interface and channel):
         remedy = "write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic"
         raise InputError(None, f"--can {text!r} is not a bus", remedy=remedy)
-    from sim_fixtures import can_end  # python-can is slow to load
+    from sim_fixtures import can_link  # python-can is slow to load
 
     moved_by_pc = settings.corrected or not settings.own_motion
     kind: Literal["fd", "classic"] = "classic" if profile == "classic" else "fd"
-    spec = can_end.CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
-    return can_end.open_far_end(spec, settings.open_mode if moved_by_pc else None)
+    spec = can_link.CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
+    return can_link.open_controller_link(spec, settings.open_mode if moved_by_pc else None)
 
 
 class Buttons:
@@ -84,9 +84,9 @@ class Buttons:
     def request(self) -> serve.Request:
         """Go on; or end, by a signal or because the time is over; or give up."""
         if self._at_once:
-            return serve.Request.GIVE_UP
+            return serve.Request.ABORT
         over = self._until is not None and time.monotonic() >= self._until
-        return serve.Request.END if self.interrupted or over else serve.Request.GO_ON
+        return serve.Request.END if self.interrupted or over else serve.Request.CONTINUE
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
         """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
@@ -150,7 +150,7 @@ class Served:
     """How a session on a real link came out: controller and counts are of the last start."""
 
     controller: SimulatedController
-    summary: serve.Tally
+    summary: serve.ServeCounts
     intervals: int  #: how often all axes have been open
     starts: int  #: how often the start was begun
     foreign: int  #: datagrams from elsewhere; 0 where the link cannot tell
@@ -158,13 +158,13 @@ class Served:
 
 def serve_session(
     build: Callable[[], SimulatedController],
-    far_end: serve.FarEnd,
+    far_end: serve.ControllerLink,
     pressed: Buttons,
     *,
     faults: FaultyLink | None = None,
     patience: float = serve.PATIENCE,
     stretch: float = 0.0,
-    watch: Callable[[SimulatedController, serve.Tally], None] = lambda *_: None,
+    watch: Callable[[SimulatedController, serve.ServeCounts], None] = lambda *_: None,
 ) -> Served:
     """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
 
@@ -183,7 +183,7 @@ def serve_session(
         phases = [controller.phase]
 
         def observe(
-            tally: serve.Tally,
+            tally: serve.ServeCounts,
             controller: SimulatedController = controller,
             phases: list[Phase] = phases,
         ) -> None:
@@ -202,9 +202,9 @@ def serve_session(
         except PlantDiverged as error:
             raise ControllerFault(str(error)) from error
         begun = Phase.DRIVE_OFF in phases[1:]
-        if begun or not summary.ended or pressed.request() is not serve.Request.GO_ON:
+        if begun or not summary.ended or pressed.request() is not serve.Request.CONTINUE:
             opened, foreign = phases[1:].count(Phase.OPEN), getattr(far_end, "foreign", 0)
             return Served(controller, summary, opened, starts, foreign)
         until = time.monotonic() + serve.KNOCK_INTERVAL
-        while time.monotonic() < until and pressed.request() is serve.Request.GO_ON:
+        while time.monotonic() < until and pressed.request() is serve.Request.CONTINUE:
             time.sleep(0.05)

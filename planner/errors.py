@@ -15,7 +15,7 @@
      ├─ PlannerCrashed          the process that planned died on this input
      ├─ PlannerNotStarted       it died before it could be asked
      ├─ PlanningTimedOut        it did not end in time
-     ├─ PlannerOutOfStep        its result is not that of what was asked
+     ├─ NoCallPending        its result is not that of what was asked
      ├─ StartMismatch           the arm is not where the motion begins
      └─ NotBegun                a player was asked to advance before it was begun
 
@@ -128,5 +128,5 @@ class PlanningTimedOut(PlannerError, TimeoutError):
         super().__init__(f"no plan within {timeout:g} s; the planning process was ended")
 
 
-class PlannerOutOfStep(PlannerError, RuntimeError):
+class NoCallPending(PlannerError, RuntimeError):
     """The result of the planning process is that of another call, or none was begun here."""

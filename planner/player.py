@@ -293,7 +293,7 @@ class TrajectoryPlayer:
                 joint = int(np.argmax(excess))
                 raise LimitExceeded("position", joint, float(reach[joint]), float(bound[joint]))
 
-    def go_on_from(self, position: Array, velocity: Array, cycles: int) -> None:
+    def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
         """Go on where a controller carried the motion by itself, with what was asked for.
 
         That is at the nearest point of the path, and as fast along it; the velocity across dies

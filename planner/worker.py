@@ -35,10 +35,10 @@ from typing import Any, Final, ParamSpec, Self, TypeAlias, TypeVar
 from numpy.typing import ArrayLike
 
 from planner.errors import (
+    NoCallPending,
     PlannerCrashed,
     PlannerError,
     PlannerNotStarted,
-    PlannerOutOfStep,
     PlanningTimedOut,
 )
 from planner.limits import JointLimits
@@ -160,7 +160,7 @@ class WorkerProcess:
         PlannerCrashed: the process died (in `call`: over it); a new one is on its way.
         PlannerNotStarted: it died before it could be asked anything; why is on stderr.
         PlanningTimedOut: the call took too long; likewise a new one is on its way.
-        PlannerOutOfStep: no call was begun in this process.
+        NoCallPending: no call was begun in this process.
         Exception: whatever the function itself raised.
     """
 
@@ -221,7 +221,7 @@ class WorkerProcess:
         """Return the result of the call that `send` began, or raise what it raised."""
         self._disown()
         if self._process is None:
-            raise PlannerOutOfStep("the planning process was asked nothing from here")
+            raise NoCallPending("the planning process was asked nothing from here")
         try:
             if not self._greeted:
                 self._read()

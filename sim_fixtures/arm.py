@@ -18,13 +18,13 @@ from sim_fixtures.settings import ControllerSettings
 
 Array = NDArray[np.float64]
 
-Mishap = Literal["jam", "load", "slip"]
+DisturbanceKind = Literal["jam", "load", "slip"]
 
 _JAM_FACTOR = 10.0
-_ROWS: dict[Mishap, int] = {"jam": 0, "load": 1, "slip": 2}
+_ROWS: dict[DisturbanceKind, int] = {"jam": 0, "load": 1, "slip": 2}
 
 
-class Mishaps:
+class Disturbances:
     """Which axis is jammed, loaded or misread, and for how long.
 
     Attributes:
@@ -43,8 +43,8 @@ class Mishaps:
         self.changed = False
         self._any = False
 
-    def begin(self, kind: Mishap, axis: int, size: float, cycles: int) -> None:
-        """Let one axis (0-based) suffer for some cycles.
+    def begin(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
+        """Let one axis (0-based) disturb for some cycles.
 
         Args:
             kind: "jam": the axis is stuck; "load": a torque pushes on it; "slip": its encoder is
@@ -211,7 +211,7 @@ class SimulatedArm:
     Attributes:
         plant: the mechanics.
         currents: currents that flowed in the last sub-step, (n,) [A].
-        mishaps: what happens to the mechanics from outside.
+        disturbances: what happens to the mechanics from outside.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class SimulatedArm:
             delay_substeps=round(effects.delay / self._substep),
         )
         self.currents = [0.0] * n
-        self.mishaps = Mishaps(holding)
+        self.disturbances = Disturbances(holding)
         self._ripple: TorqueRipple | None = None
         if effects.torque_ripple > 0.0:
             self._ripple = TorqueRipple(effects.torque_ripple * truth.coulomb, ripple_rng)
@@ -269,10 +269,10 @@ class SimulatedArm:
         """Let one period pass under target currents (n,) [A]; None for a drive that is off."""
         plant = self.plant
         plant.close_brakes(braked)
-        mishaps = self.mishaps
-        if mishaps.changed:
-            plant.jam(mishaps.jam)
-        load = None if braked else mishaps.load
+        disturbances = self.disturbances
+        if disturbances.changed:
+            plant.jam(disturbances.jam)
+        load = None if braked else disturbances.load
         if self._drift is not None:
             plant.scale_friction(self._drift.scale(plant.velocity, self._period))
         noise = self._current_noise.draw()
@@ -288,7 +288,7 @@ class SimulatedArm:
             if load is not None:
                 torque += load
             plant.step(torque, self._substep)
-        mishaps.pass_cycle()
+        disturbances.pass_cycle()
 
     def _motors(self) -> list[float]:
         position: list[float] = self.plant.motor_position.tolist()

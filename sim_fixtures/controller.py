@@ -43,7 +43,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from sim_fixtures.arm import Mishap, SimulatedArm, UnmodelledEffects
+from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.errors import SettingError
 from sim_fixtures.faults import ControllerFault
@@ -642,11 +642,11 @@ class SimulatedController:
         """Report mode 500 or 502 for some cycles, then closed axes."""
         self._program.pause(mode, cycles)
 
-    def suffer(self, kind: Mishap, axis: int, size: float, cycles: int) -> None:
-        """Something befalls the mechanics of one axis (from 1); see `Mishaps.begin`."""
+    def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
+        """Something befalls the mechanics of one axis (from 1); see `Disturbances.begin`."""
         if kind == "slip":
             size *= self._drive.following_error[axis - 1]
-        self._arm.mishaps.begin(kind, axis - 1, size, cycles)
+        self._arm.disturbances.begin(kind, axis - 1, size, cycles)
 
     @property
     def foreign_targets(self) -> list[float]:
@@ -662,7 +662,7 @@ class SimulatedController:
         if self._awaiting:
             self.accept(None)
         for fault in self._faults.get(self._cycle, ()):
-            fault.inflict(self)
+            fault.apply_to(self)
         self._cycle += 1
         phase = self._program.phase
         if phase is Phase.ENDED:
@@ -760,7 +760,7 @@ class SimulatedController:
         known = program.powered or phase is Phase.TRIPPED
         demanded = (self._targets.own, self._targets.own_delta) if known else (zero, zero)
         measured: Sequence[float] = servo.measured
-        slip = self._arm.mishaps.slip
+        slip = self._arm.disturbances.slip
         if slip is not None:
             measured = (slip + measured).tolist()
         d = (*demanded, measured, servo.measured_delta, servo.current)

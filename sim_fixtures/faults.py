@@ -9,11 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from drivers.transports import faults as link
-from sim_fixtures.arm import Mishap
 from sim_fixtures.errors import SimulationError
+
+if TYPE_CHECKING:
+    from sim_fixtures.controller import SimulatedController
 
 GRAMMAR: Final = """\
 KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
@@ -40,25 +42,6 @@ LOAD = 0.9
 """Size of a load, as a share of what the axis's motor can muster."""
 PUSH = 0.15
 """Size of a push, likewise: nothing trips, and the repetition is another one than its fellows."""
-
-
-class Faultable(Protocol):
-    """What faults are inflicted on: `SimulatedController`."""
-
-    def lose_drive(self, reason: str) -> None:
-        """The drive goes off and the brakes close."""
-
-    def restart(self, *, warm: bool) -> None:
-        """The controller begins anew."""
-
-    def axis_leaves(self, axis: int) -> None:
-        """One axis (from 1) leaves open mode by itself."""
-
-    def pause(self, mode: int, cycles: int) -> None:
-        """The controller reports a pause."""
-
-    def suffer(self, kind: Mishap, axis: int, size: float, cycles: int) -> None:
-        """Something befalls the mechanics of one axis (from 1)."""
 
 
 @dataclass(frozen=True)
@@ -101,24 +84,26 @@ class ControllerFault:
     count: int = 1
     word: str = ""
 
-    def inflict(self, on: Faultable) -> None:
-        """Let it happen."""
+    def apply_to(self, controller: SimulatedController) -> None:
+        """Make it happen."""
         match self.kind:
             case "restart":
-                on.restart(warm=self.word == "warm")
+                controller.restart(warm=self.word == "warm")
             case "drive-drop":
-                on.lose_drive("the drive dropped out")
+                controller.lose_drive("the drive dropped out")
             case "e-stop":
-                on.lose_drive("emergency stop")
+                controller.lose_drive("emergency stop")
             case "axis-leaves":
-                on.axis_leaves(self.axis)
+                controller.axis_leaves(self.axis)
             case "following-error":
-                on.suffer("slip" if self.word == "slip" else "jam", self.axis, SLIP, self.count)
+                controller.disturb(
+                    "slip" if self.word == "slip" else "jam", self.axis, SLIP, self.count
+                )
             case "pause":
-                on.pause(int(self.word), self.count)
+                controller.pause(int(self.word), self.count)
             case _:
                 size = LOAD if self.kind == "saturate" else PUSH
-                on.suffer("load", self.axis, size, self.count)
+                controller.disturb("load", self.axis, size, self.count)
 
 
 Fault = link.Fault | ControllerFault

@@ -8,7 +8,7 @@ The server may itself run late. That is never laid at the PC's door: an answer h
 from the moment the packet really left, and before an answer is called missing the server looks
 into the link once more, for it may have slept while the answer lay there. A server that is late by
 a period or more goes on from where it is; it does not send the packets it owes in a burst. What
-happened is a `Tally`: counts and times, in memory that does not grow.
+happened is a `ServeCounts`: counts and times, in memory that does not grow.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _TIMESPEC: Final = struct.Struct("@ll")
 _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
-class FarEnd(Protocol):
+class ControllerLink(Protocol):
     """The controller's end of a real link: moves whole packets; knows no cycle, state or mode."""
 
     def send(self, packet: bytes) -> None:
@@ -58,7 +58,7 @@ class FarEnd(Protocol):
         """Give the link up."""
 
 
-class FarEndError(SimulationError):
+class ControllerLinkError(SimulationError):
     """The controller's end of a link cannot be opened.
 
     Attributes:
@@ -71,11 +71,11 @@ class FarEndError(SimulationError):
         self.problem = problem
         super().__init__(f"{place}: {problem}")
 
-    def __reduce__(self) -> tuple[type[FarEndError], tuple[str, str]]:
+    def __reduce__(self) -> tuple[type[ControllerLinkError], tuple[str, str]]:
         return type(self), (self.place, self.problem)
 
 
-class UdpFarEnd:
+class UdpControllerLink:
     """One datagram, one packet, to a PC program that listens at `host`:`port` (IPv4).
 
     The socket is not connected: a PC that does not listen yet is a PC that does not answer, not a
@@ -89,7 +89,7 @@ class UdpFarEnd:
         trouble: why it refused the last one, in words; "" if it never did.
 
     Raises:
-        FarEndError: no such host, or the local port is in use.
+        ControllerLinkError: no such host, or the local port is in use.
     """
 
     def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:
@@ -101,7 +101,7 @@ class UdpFarEnd:
         try:
             self._pc = (socket.gethostbyname(host), port)
         except (OSError, UnicodeError) as error:
-            raise FarEndError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
+            raise ControllerLinkError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with suppress(OSError):  # not every system has it; nothing needs it
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -110,7 +110,7 @@ class UdpFarEnd:
             self._socket.bind(("", source_port or 0))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            raise FarEndError(
+            raise ControllerLinkError(
                 f"local UDP port {source_port}", f"cannot be used ({error})"
             ) from error
 
@@ -192,7 +192,7 @@ class Histogram:
 
 
 @dataclass(eq=False)
-class Tally:
+class ServeCounts:
     """What a served session came to so far.
 
     Attributes:
@@ -281,7 +281,7 @@ class Wire:
     (`receive` or `sleep_until`), which the server of a controller always does.
     """
 
-    def __init__(self, far_end: FarEnd, faults: FaultyLink | None, clock: Clock) -> None:
+    def __init__(self, far_end: ControllerLink, faults: FaultyLink | None, clock: Clock) -> None:
         self._far_end = far_end
         self._faults: Final = faults
         self._clock = clock
@@ -361,9 +361,9 @@ _LOOKS: Final = 100
 class Request(IntEnum):
     """What the person in front of the cabinet wants."""
 
-    GO_ON = auto()
+    CONTINUE = auto()
     END = auto()
-    GIVE_UP = auto()
+    ABORT = auto()
 
 
 class ServedPeer(Peer, Protocol):
@@ -380,15 +380,15 @@ class ServedPeer(Peer, Protocol):
 
 def serve(
     peer: ServedPeer,
-    far_end: FarEnd,
+    far_end: ControllerLink,
     *,
     faults: FaultyLink | None = None,
-    request: Callable[[], Request] = lambda: Request.GO_ON,
-    watch: Callable[[Tally], None] = lambda _: None,
+    request: Callable[[], Request] = lambda: Request.CONTINUE,
+    watch: Callable[[ServeCounts], None] = lambda _: None,
     clock: Clock = time,
     patience: float = PATIENCE,
     stretch: float = 0.0,
-) -> Tally:
+) -> ServeCounts:
     """Run a controller on a real link until its session has ended.
 
     The first packet is repeated once a second until a PC answers it, so that the order of starting
@@ -399,7 +399,7 @@ def serve(
         far_end: its link, left open.
         faults: what the link does to packets; cycle 0 is that of the first one.
         request: asked every cycle. At `END` the controller ends its session, with the drive
-            switched off under a moving arm if it does not stand within `patience` s; at `GIVE_UP`
+            switched off under a moving arm if it does not stand within `patience` s; at `ABORT`
             it falls silent at once.
         watch: called once a cycle, in the time that is left over, with the counts so far.
         clock: of the machine, if left out.
@@ -422,10 +422,10 @@ class _Server:
         peer: ServedPeer,
         wire: Wire,
         clock: Clock,
-        watch: Callable[[Tally], None],
+        watch: Callable[[ServeCounts], None],
         stretch: float,
     ) -> None:
-        self.tally = Tally()
+        self.tally = ServeCounts()
         self._peer = peer
         self._wire = wire
         self._clock = clock
@@ -443,7 +443,7 @@ class _Server:
         if packet is None:
             self.tally.ended = True
             return False
-        while request() is Request.GO_ON:
+        while request() is Request.CONTINUE:
             sent = self._clock.monotonic()
             self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
             self.tally.knocks += 1
@@ -459,7 +459,7 @@ class _Server:
         self, packet: bytes, until: float, request: Callable[[], Request]
     ) -> bytes | None:
         """An answer to the first packet, in steps short enough to notice a request to end."""
-        while request() is Request.GO_ON and (now := self._clock.monotonic()) < until:
+        while request() is Request.CONTINUE and (now := self._clock.monotonic()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self._watch(self.tally)
             if reply is not None:
@@ -520,7 +520,7 @@ class _Server:
                 self._peer.lose_drive(
                     f"the arm did not stand within {self._patience:g} s of the end"
                 )
-        return request is not Request.GIVE_UP
+        return request is not Request.ABORT
 
     def _note_lateness(self, *, excused: bool) -> None:
         """Count a cycle that begins late; go on from here if a whole period is gone."""

@@ -16,13 +16,13 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.move import joint_index
-from hil.serving import Served, buttons, open_far_end, serve_session, undisturbed
+from hil.serving import Served, buttons, open_controller_link, serve_session, undisturbed
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import PATIENCE, Histogram, Tally
+from sim_fixtures.serve import PATIENCE, Histogram, ServeCounts
 
 REFRESH: Final = 0.25
 WIDTH: Final = 110
@@ -81,7 +81,7 @@ class Status:
             how = f"cycles are made longer by up to {self._stretch:g} s to wait for an answer"
             self.say(f"{how}; no real controller does that")
 
-    def watch(self, controller: SimulatedController, tally: Tally) -> None:
+    def watch(self, controller: SimulatedController, tally: ServeCounts) -> None:
         """Show what has changed since the last cycle."""
         if self._quiet:
             return
@@ -117,7 +117,7 @@ class Status:
             return
         self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
 
-    def _line(self, tally: Tally) -> str:
+    def _line(self, tally: ServeCounts) -> str:
         if not tally.cycles:
             return f"waiting for a PC program at {self._place} (asked {tally.knocks} times)"
         return (
@@ -235,7 +235,7 @@ def simulate(
             loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
         )
 
-    far_end = open_far_end(udp, can, settings, len(loaded.joint_names))
+    far_end = open_controller_link(udp, can, settings, len(loaded.joint_names))
     status = Status(udp or can or "", settings, quiet=json, stretch=patience)
     try:
         with buttons(duration) as pressed, undisturbed(priority):

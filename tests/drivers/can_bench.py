@@ -30,7 +30,7 @@ from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
-from sim_fixtures.can_end import CanFarEnd
+from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.rig import MOVE, limits, smooth_move
 from tests.drivers.transport_contract import TransportContract
 
@@ -111,12 +111,12 @@ class UnstampedBus(VirtualBus):
         super().__init__(channel, preserve_timestamps=True)
 
 
-def virtual_ends(profile: str, clock=None, **options) -> tuple[CanTransport, CanFarEnd]:
+def virtual_ends(profile: str, clock=None, **options) -> tuple[CanTransport, CanControllerLink]:
     """Both ends on a virtual bus of their own."""
     channel = f"bench-{next(_channels)}"
     rates = BusRates(profile)
     clock = clock if clock is not None else Cycles()
-    far = CanFarEnd(UnstampedBus(channel), rates, clock=clock, **options)
+    far = CanControllerLink(UnstampedBus(channel), rates, clock=clock, **options)
     return CanTransport(UnstampedBus(channel), rates, clock=clock), far
 
 
@@ -350,7 +350,7 @@ class SlcanBus:
 class Far:
     """The contract's far end around ours."""
 
-    def __init__(self, end: CanFarEnd) -> None:
+    def __init__(self, end: CanControllerLink) -> None:
         self.end = end
         self.replies: list[bytes] = []
 

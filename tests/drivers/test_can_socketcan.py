@@ -12,7 +12,7 @@ import pytest
 
 from drivers import CyclicPacket, MotionEnded
 from drivers.transports.can.transport import CanSpec
-from sim_fixtures.can_end import open_far_end
+from sim_fixtures.can_link import open_controller_link
 from tests.drivers.can_bench import PERIOD, PROFILES, CanContract, Far, Run, init_packet
 
 CHANNEL = "vcan0"
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(params=PROFILES)
 def ends(request):
     near = CanSpec("socketcan", CHANNEL, request.param, period=PERIOD).open()
-    far = open_far_end(CanSpec("socketcan", CHANNEL, request.param, period=PERIOD))
+    far = open_controller_link(CanSpec("socketcan", CHANNEL, request.param, period=PERIOD))
     yield near, far
     near.close()
     far.close()
@@ -40,7 +40,7 @@ class TestSocketCan(CanContract):
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_whole_motion_completes(profile):
     near = CanSpec("socketcan", CHANNEL, profile, period=PERIOD).open()
-    ends = near, open_far_end(CanSpec("socketcan", CHANNEL, profile, period=PERIOD))
+    ends = near, open_controller_link(CanSpec("socketcan", CHANNEL, profile, period=PERIOD))
     # An emulated machine may stall for longer than a set of frames may take; such a set is torn.
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     (ended,) = run.seen(MotionEnded)

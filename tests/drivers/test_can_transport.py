@@ -35,8 +35,8 @@ from drivers.transports.can.bus_load import (
     CanValueError,
 )
 from drivers.transports.can.transport import BusLock, CanSpec, CanTransport
-from sim_fixtures.can_end import CanFarEnd, open_far_end
-from sim_fixtures.serve import FarEndError
+from sim_fixtures.can_link import CanControllerLink, open_controller_link
+from sim_fixtures.serve import ControllerLinkError
 from tests.drivers.can_bench import (
     HOME,
     MOVE,
@@ -92,7 +92,7 @@ class TestUdpMulticast(CanContract):
     def link(self, profile):
         channel = f"{GROUP}/{next(_ports)}"
         near = CanSpec("udp_multicast", channel, profile, period=0.002).open()
-        far = open_far_end(CanSpec("udp_multicast", channel, profile, period=0.002))
+        far = open_controller_link(CanSpec("udp_multicast", channel, profile, period=0.002))
         yield near, Far(far)
         near.close()
         far.close()
@@ -109,7 +109,7 @@ class TestSlcan(CanContract):
     def link(self, profile):
         bus = SlcanBus()
         near = slcan(bus.ports[0], profile).open()
-        far = open_far_end(slcan(bus.ports[1], profile))
+        far = open_controller_link(slcan(bus.ports[1], profile))
         far.receive(0.0)
         yield near, Far(far)
         near.close()
@@ -180,7 +180,7 @@ def test_a_session_with_more_axes_is_refused_by_both_ends(profile):
     near, far = virtual_ends(profile)
     with pytest.raises(CanAxesError, match="7 axes"):
         far.send(init)
-    segments = CanFarEnd(can.Bus("seven", "virtual"), BusRates("fd"))
+    segments = CanControllerLink(can.Bus("seven", "virtual"), BusRates("fd"))
     near = CanTransport(can.Bus("seven", "virtual"), BusRates("fd"))
     segments._port.send(_as_segments(init))
     with pytest.raises(TransportClosed, match="7 axes"):
@@ -314,8 +314,8 @@ def test_a_bus_that_is_not_there_is_named_with_its_remedy():
         CanSpec("slcan", "/dev/no-such-port", period=0.001).open()
     with pytest.raises(TransportError, match="python-can"):
         CanSpec("no-such-interface", "0", period=0.001).open()
-    with pytest.raises(FarEndError, match="vcan77"):
-        open_far_end(CanSpec("socketcan", "vcan77", period=0.002))
+    with pytest.raises(ControllerLinkError, match="vcan77"):
+        open_controller_link(CanSpec("socketcan", "vcan77", period=0.002))
 
 
 @pytest.mark.parametrize(
@@ -346,14 +346,14 @@ def test_an_adapter_that_refuses_the_bit_rate_is_let_go(monkeypatch, caplog):
 
 
 def test_the_controllers_end_is_checked_before_the_bus_is_opened():
-    with pytest.raises(FarEndError, match=r"135\.0 % of a cycle of 1 ms") as caught:
-        open_far_end(CanSpec("virtual", "0", "classic", period=0.001))
+    with pytest.raises(ControllerLinkError, match=r"135\.0 % of a cycle of 1 ms") as caught:
+        open_controller_link(CanSpec("virtual", "0", "classic", period=0.001))
     assert isinstance(caught.value.__cause__, CanBusLoadError)
-    with pytest.raises(FarEndError, match="mode 8") as caught:
-        open_far_end(CanSpec("virtual", "0", period=0.002), mode=8)
+    with pytest.raises(ControllerLinkError, match="mode 8") as caught:
+        open_controller_link(CanSpec("virtual", "0", period=0.002), mode=8)
     assert isinstance(caught.value.__cause__, CanModeError)
-    with pytest.raises(FarEndError, match="7 axes"):
-        open_far_end(CanSpec("virtual", "0", period=0.002, n_axes=7))
+    with pytest.raises(ControllerLinkError, match="7 axes"):
+        open_controller_link(CanSpec("virtual", "0", period=0.002, n_axes=7))
 
 
 def test_a_description_is_checked_before_the_bus_is_opened():
@@ -477,7 +477,7 @@ def test_a_whole_session_over_two_serial_adapters(profile):
     bus = SlcanBus()
     ends = (
         slcan(bus.ports[0], profile, PERIOD).open(),
-        open_far_end(slcan(bus.ports[1], profile, PERIOD)),
+        open_controller_link(slcan(bus.ports[1], profile, PERIOD)),
     )
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     bus.close()

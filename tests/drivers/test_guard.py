@@ -451,7 +451,7 @@ class TestAfterAPause:
     @names
     def test_the_arm_moves_as_the_set_points_sent_last(self, joint, sign, bounds):
         guard, speed, q = only(acceleration=8.0), at(joint, sign), START
-        guard.go_on_from(q, speed, 0)
+        guard.resume_from(q, speed, 0)
         for cycle in range(3):
             q = q + PERIOD * speed
             guard.check_set_point(q, speed, bounds, cycle)
@@ -474,14 +474,14 @@ class TestCarriedOn:
     @signs
     def test_acceleration_is_bounded_and_jerk_from_the_fifth_cycle_on(self, joint, sign):
         guard, q, step = Guard(limits(), PERIOD), START, at(joint, sign * 1.5 * PERIOD)
-        guard.go_on_from(q, step / PERIOD, 2)
+        guard.resume_from(q, step / PERIOD, 2)
         for way in (1.0, -1.0, 1.0, -1.0):
             step = step + at(joint, way * JUST_BELOW * self.BOUND)
             q = q + step
             guard.check_set_point(q, step / PERIOD, "stop", 1)
         far = q + step + at(joint, JUST_BELOW * self.BOUND)
         refused(JerkLimit, guard.check_set_point, far, step / PERIOD, "stop", 2)
-        guard.go_on_from(q, step / PERIOD, 2)
+        guard.resume_from(q, step / PERIOD, 2)
         far = q + step + at(joint, 1.1 * self.BOUND)
         refused(AccelerationLimit, guard.check_set_point, far, (far - q) / PERIOD, "stop", 3)
 

@@ -461,11 +461,11 @@ class TestLongGaps:
         rig, source = moving_at(0.1)
         spread = []
 
-        def go_on_from(position, velocity, cycles):
+        def resume_from(position, velocity, cycles):
             source._position = position
             spread.append(cycles)
 
-        source.go_on_from = go_on_from
+        source.resume_from = resume_from
         rig.miss(missed)
         rig.axes["d"][:, 0] += missed * rig.axes["d"][:, 1]
         rig.axes["d"][:, 2] = rig.axes["d"][:, 0]

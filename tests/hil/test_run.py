@@ -71,7 +71,7 @@ from hil.simulation import (
     simulated_drive,
     simulated_link,
 )
-from sim_fixtures.faults import Faultable, parse_fault, split_faults
+from sim_fixtures.faults import parse_fault, split_faults
 from tests.hil.batch_work import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
 
@@ -150,8 +150,8 @@ class Push:
     def __init__(self, cycle: int, load: float = 0.15) -> None:
         self.cycle, self._load = cycle, load
 
-    def inflict(self, on: Faultable) -> None:
-        on.suffer("load", 1, self._load, 50)
+    def apply_to(self, on: Any) -> None:
+        on.disturb("load", 1, self._load, 50)
 
 
 def kinds(result: RunResult) -> list[str]:
@@ -970,8 +970,8 @@ def test_a_touched_first_repetition_spoils_no_others(make: Make) -> None:
 class Drag(Push):
     """From a cycle on something drags on the upper arm for good."""
 
-    def inflict(self, on: Faultable) -> None:
-        on.suffer("load", 1, self._load, 10**9)
+    def apply_to(self, on: Any) -> None:
+        on.disturb("load", 1, self._load, 10**9)
 
 
 def test_an_arm_that_is_changed_in_mid_campaign_stops_it(make: Make) -> None:

@@ -28,11 +28,11 @@ from hil.cli.simulate import WORDS, Status, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
-from hil.serving import Buttons, open_far_end
+from hil.serving import Buttons, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import FarEndError, Request
+from sim_fixtures.serve import ControllerLinkError, Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
@@ -50,7 +50,7 @@ def opened(mode: int = 4) -> str:
 
 def far_end_at(udp: str | None = None, can: str | None = None) -> Any:
     settings = replace(controller_settings(Cell.load(CELL_PATH)), period=0.002)
-    return open_far_end(udp, can, settings, 6)
+    return open_controller_link(udp, can, settings, 6)
 
 
 @contextmanager
@@ -408,7 +408,7 @@ def test_a_bus_is_named_as_python_can_names_it():
         far_end = far_end_at(can=text)
         assert far_end.receive(0.001) is None
         far_end.close()
-    with pytest.raises(FarEndError, match="no-such-bus"):
+    with pytest.raises(ControllerLinkError, match="no-such-bus"):
         far_end_at(can="no-such-bus:0")
 
 
@@ -416,11 +416,11 @@ def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
     """A duration that is over asks for the end, but is no interrupt."""
     assert set(WORDS) == set(Phase)
     buttons = Buttons()
-    assert buttons.request() is Request.GO_ON
+    assert buttons.request() is Request.CONTINUE
     buttons.press(signal.SIGINT)
     assert buttons.request() is Request.END
     buttons.press(signal.SIGTERM)
-    assert buttons.request() is Request.GIVE_UP
+    assert buttons.request() is Request.ABORT
     buttons = Buttons(duration=0.0)
     assert buttons.request() is Request.END
     assert not buttons.interrupted

@@ -249,7 +249,7 @@ class TestCarriedOn:
     @pytest.mark.parametrize("k", [0, 1, 3, 5])
     def test_it_stops_on_its_path_within_the_bounds(self, carried, motions, k):
         player, last, step = carried
-        player.go_on_from(last + k * step, step / PERIOD, 2 * k)
+        player.resume_from(last + k * step, step / PERIOD, 2 * k)
         player.stop()
         given = [last + (k - 1) * step, last + k * step]
         while not player.finished:
@@ -275,7 +275,7 @@ class TestCarriedOn:
                 if gaps:
                     step = last - before
                     last = last + k * step
-                    player.go_on_from(last, step / PERIOD, 2 * k)
+                    player.resume_from(last, step / PERIOD, 2 * k)
                 before, last = last, player.advance()[0]
                 count += 1
             return count
@@ -291,7 +291,7 @@ class TestCarriedOn:
         before, last = played[-2:]
         with pytest.raises(StartMismatch, match=r"at most 0\.002 rad"):
             for _ in range(30):
-                player.go_on_from(last + aside, (last - before) / PERIOD, 2)
+                player.resume_from(last + aside, (last - before) / PERIOD, 2)
                 before, last = last + aside, player.advance()[0]
 
     @pytest.mark.parametrize("left", [18, 22, 26, 30])
@@ -306,7 +306,7 @@ class TestCarriedOn:
         step = last - before
         guard = Arm(closed, SIX_AXES).guard
         for one in (guard, player):
-            one.go_on_from(last + 8 * step, step / PERIOD, 15)
+            one.resume_from(last + 8 * step, step / PERIOD, 15)
         assert player.motion_time > 0.5 * closed.duration
         player.stop()
         for cycle in range(100):
@@ -315,7 +315,7 @@ class TestCarriedOn:
 
     def test_brought_to_rest_it_stays_there(self, carried):
         player, last, step = carried
-        player.go_on_from(last + step, 0.0 * step, 2)
+        player.resume_from(last + step, 0.0 * step, 2)
         player.stop()
         position, velocity = player.advance()
         assert player.finished
@@ -325,7 +325,7 @@ class TestCarriedOn:
     def test_away_from_its_path_it_is_refused(self, carried):
         player, last, step = carried
         with pytest.raises(StartMismatch, match="the motion at"):
-            player.go_on_from(last + 3 * step + 2e-3, step / PERIOD, 6)
+            player.resume_from(last + 3 * step + 2e-3, step / PERIOD, 6)
 
 
 class TestPathReader:

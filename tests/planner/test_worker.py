@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from planner import InvalidSetting, JointLimits, plan, plan_chunk
-from planner.errors import PlannerCrashed, PlannerNotStarted, PlannerOutOfStep, PlanningTimedOut
+from planner.errors import NoCallPending, PlannerCrashed, PlannerNotStarted, PlanningTimedOut
 from planner.worker import (
     WorkerProcess,
     chunks_of,
@@ -309,7 +309,7 @@ def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
         def refused() -> bool:
             try:
                 child.receive()
-            except PlannerOutOfStep:
+            except NoCallPending:
                 return True
             return False
 

@@ -29,7 +29,7 @@ from hil.serving import Buttons, serve_session, undisturbed
 from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import Request, Tally, UdpFarEnd
+from sim_fixtures.serve import Request, ServeCounts, UdpControllerLink
 from tests.process_death.rounds import Round
 
 Rows = NDArray[np.void]
@@ -121,7 +121,7 @@ class WaitingEnd:
     def __init__(self, host: str, port: int, page: Page) -> None:
         self.number = 0
         self.deserted = self._began = False
-        self._link, self._port, self._page = UdpFarEnd(host, port), port, page
+        self._link, self._port, self._page = UdpControllerLink(host, port), port, page
         self._exchange = _Life()
 
     def send(self, packet: bytes) -> None:
@@ -158,8 +158,8 @@ class _PageButtons(Buttons):
 
     def request(self) -> Request:
         if self._page.given_up:
-            return Request.GIVE_UP
-        return Request.END if self._page.finished else Request.GO_ON
+            return Request.ABORT
+        return Request.END if self._page.finished else Request.CONTINUE
 
 
 def serve(cell: Cell, played: Round, page: Page) -> None:
@@ -179,7 +179,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
     )
     cycles = replies = 0
 
-    def note(controller: SimulatedController, tally: Tally) -> None:
+    def note(controller: SimulatedController, tally: ServeCounts) -> None:
         nonlocal cycles, replies
         if tally.cycles < 2:  # the first packet is repeated until it is answered
             cycles = replies = 0

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from drivers.packets import CyclicPacket, echo, next_number, packet_number
 from drivers.transports.faults import Corrupt, Delay, Duplicate, FaultyLink, Lose
-from sim_fixtures.serve import Histogram, Request, Tally, UdpFarEnd, serve
+from sim_fixtures.serve import Histogram, Request, ServeCounts, UdpControllerLink, serve
 
 T = 0.001
 
@@ -144,7 +144,7 @@ def test_an_answer_counts_from_when_the_kernel_had_it():
 def test_a_datagram_that_lay_in_the_queue_says_for_how_long():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pc:
         pc.bind(("127.0.0.1", 0))
-        far_end = UdpFarEnd("127.0.0.1", pc.getsockname()[1])
+        far_end = UdpControllerLink("127.0.0.1", pc.getsockname()[1])
         for text in (b"first", b"answer"):  # the kernel begins to stamp soon after it is asked to
             pc.sendto(text, ("127.0.0.1", far_end.source_port))
             time.sleep(0.05)
@@ -277,7 +277,7 @@ def test_patience_ends_and_what_comes_then_is_missing():
 
 
 def test_at_the_end_a_pc_that_has_left_is_waited_for_once():
-    wishes = iter([Request.GO_ON] * 5)
+    wishes = iter([Request.CONTINUE] * 5)
     summary, cabinet, _ = served(
         lambda k, p: prompt(k, p) if k < 10 else [],
         request=lambda: next(wishes, Request.END),
@@ -307,7 +307,7 @@ def test_a_wish_to_end_before_anybody_answered_ends_at_once():
     asked = iter(range(100))
     summary, cabinet, _ = served(
         lambda k, p: [],
-        request=lambda: Request.END if next(asked) > 10 else Request.GO_ON,
+        request=lambda: Request.END if next(asked) > 10 else Request.CONTINUE,
     )
     assert not summary.ended
     assert (summary.cycles, cabinet.accepted) == (0, [])
@@ -320,7 +320,7 @@ def test_a_wish_to_end_lets_the_controller_finish():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        request=lambda: Request.END if clock.time > 100.05 else Request.GO_ON,
+        request=lambda: Request.END if clock.time > 100.05 else Request.CONTINUE,
     )
     assert summary.ended
     assert cabinet.finished and not cabinet.stopped
@@ -332,7 +332,7 @@ def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
     cabinet.stands = False
 
     def request() -> Request:
-        return Request.END if len(cabinet.accepted) > 5 else Request.GO_ON
+        return Request.END if len(cabinet.accepted) > 5 else Request.CONTINUE
 
     summary = serve(cabinet, VirtualLink(clock), clock=clock, request=request, patience=0.5)
     assert summary.ended and cabinet.stopped
@@ -347,7 +347,7 @@ def test_giving_up_stops_in_the_middle():
         cabinet,
         VirtualLink(clock),
         clock=clock,
-        request=lambda: Request.GIVE_UP if len(cabinet.accepted) == 7 else Request.GO_ON,
+        request=lambda: Request.ABORT if len(cabinet.accepted) == 7 else Request.CONTINUE,
     )
     assert (summary.cycles, summary.ended) == (7, False)
 
@@ -429,7 +429,7 @@ def test_a_quantile_is_the_duration_to_the_width_of_a_bin(durations: list[float]
 
 
 def test_the_memory_of_a_tally_does_not_grow():
-    tally = Tally()
+    tally = ServeCounts()
     for number in range(5000):
         tally.take(number, valid=True)
         tally.miss(number)

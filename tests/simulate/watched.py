@@ -50,7 +50,7 @@ class WatchedController:
 
     def next_packet(self) -> bytes | None:
         for line, fault in self._faults.get(self.cycle, ()):
-            fault.inflict(self.controller)
+            fault.apply_to(self.controller)
             self.struck.append(line)
         packet = self.controller.next_packet()
         if packet is None:

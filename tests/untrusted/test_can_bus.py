@@ -18,7 +18,7 @@ from drivers import MotionEnded, PacketRejected, TransportClosed
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.transport import CanTransport
 from sim_fixtures import Phase
-from sim_fixtures.can_end import CanFarEnd
+from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.can_bench import HOME, MOVE, PERIOD, PROFILES, Cycles, Run, UnstampedBus
 
 ANSWERS = {0x100, 0x120, 0x121, 0x122, 0x180}  # Identifiers of what the PC says (`docs/can.md`)
@@ -37,7 +37,7 @@ class Overheard:
         self._clock, channel = Cycles(), f"strangers-{next(_channels)}"
         rates, clock = BusRates(profile), self._clock
         self.near = CanTransport(UnstampedBus(channel), rates, clock=clock)
-        self._far = CanFarEnd(UnstampedBus(channel), rates, clock=clock, start_patience=0.0)
+        self._far = CanControllerLink(UnstampedBus(channel), rates, clock=clock, start_patience=0.0)
         self.third = UnstampedBus(channel)
         self.said: list[Frames] = []
         self._meddle = meddle

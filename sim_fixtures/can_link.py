@@ -17,14 +17,14 @@ from drivers.transports.base import TransportError
 from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
 from drivers.transports.can.transport import CanSpec, Port, open_bus
-from sim_fixtures.serve import FarEndError
+from sim_fixtures.serve import ControllerLinkError
 
 START_PATIENCE: Final = 0.25
 """s that the answer to a packet sent as segments is waited for."""
 
 
-class CanFarEnd:
-    """Carries the controller's packets over a bus; fulfils `sim_fixtures.serve.FarEnd`.
+class CanControllerLink:
+    """Carries the controller's packets over a bus; fulfils `sim_fixtures.serve.ControllerLink`.
 
     Args:
         bus: python-can's; closed with this.
@@ -89,9 +89,9 @@ class CanFarEnd:
         self._port.close()
 
 
-def open_far_end(
+def open_controller_link(
     spec: CanSpec, mode: int | None = None, *, start_patience: float = START_PATIENCE
-) -> CanFarEnd:
+) -> CanControllerLink:
     """Open the controller's end on a bus of python-can.
 
     Args:
@@ -100,15 +100,15 @@ def open_far_end(
         start_patience: s that the answer to a start packet is waited for.
 
     Raises:
-        FarEndError: it cannot be opened, or (`CanError` is its cause) cannot carry the session.
+        ControllerLinkError: it cannot be opened, or cannot carry the session (`CanError` as cause).
     """
     rates = spec.rates
     try:
         spec.check(mode)
         bus = open_bus(spec.interface, spec.channel, rates, spec.options)
     except TransportError as error:
-        raise FarEndError(error.link, f"{error.reason}; {error.remedy}") from error
-    return CanFarEnd(bus, rates, start_patience=start_patience)
+        raise ControllerLinkError(error.link, f"{error.reason}; {error.remedy}") from error
+    return CanControllerLink(bus, rates, start_patience=start_patience)
 
 
-__all__ = ["START_PATIENCE", "CanFarEnd", "CanSpec", "open_far_end"]
+__all__ = ["START_PATIENCE", "CanControllerLink", "CanSpec", "open_controller_link"]
