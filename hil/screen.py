@@ -261,8 +261,8 @@ def status_line(status: RunStatus, left: str = "") -> str:
         if motion.override != 1.0:
             parts.append(f"override {100.0 * motion.override:.0f} %")
         parts += [f"{motion.missed} missed", f"{motion.late} late"]
-        if motion.untaken:
-            parts.append(f"{motion.untaken} not accepted")
+        if motion.not_accepted:
+            parts.append(f"{motion.not_accepted} not accepted")
         if motion.latency is not None:
             parts.append(f"latency {duration(motion.latency.p99)} (99 %)")
         shares = {"following error": motion.following_share, "current": motion.current_share}
@@ -328,7 +328,7 @@ def _health(motion: MotionProgress | None, width: int) -> Text:
         return Text.assemble(("cycles ", "bold"), ("-", "dim"))
     text = Text.assemble(("cycles ", "bold"), f"{motion.cycles}")
     for count, what in (
-        (motion.missed, "missed"), (motion.late, "late"), (motion.untaken, "not accepted")
+        (motion.missed, "missed"), (motion.late, "late"), (motion.not_accepted, "not accepted")
     ):  # fmt: skip
         if count or width >= WIDE:
             text.append(f"  {count} {what}", style="bold yellow" if count else "green")

@@ -382,7 +382,7 @@ class ArchiveProcess:
                 events_lost=recorder.events_lost,
                 missed=recorder.missed,
                 late=recorder.late,
-                untaken=recorder.untaken,
+                not_accepted=recorder.not_accepted,
                 disk_waited=recorder.writer.slowest_flush,
             )
         )

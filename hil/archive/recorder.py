@@ -171,7 +171,7 @@ class Recorder:
         packets_lost: likewise of the raw packets, where they are stored.
         missed: packets that never arrived.
         late: packets whose answer was late or left out for a newer one.
-        untaken: answers that the controller did not take.
+        not_accepted: answers that the controller did not take.
         newest: cycle of the newest record archived, -1 before the first.
     """
 
@@ -187,7 +187,7 @@ class Recorder:
         self.packets_lost = 0
         self.missed = 0
         self.late = 0
-        self.untaken = 0
+        self.not_accepted = 0
         self.newest = -1
         self._drive_train = drive_train
         self._newest_packet = -1
@@ -227,7 +227,7 @@ class Recorder:
             if isinstance(event, EventsLost):
                 self.events_lost += event.count
             elif isinstance(event, AnswersLost):
-                self.untaken += event.count
+                self.not_accepted += event.count
             elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
                 self.late += event.count
             self._archive(event)
@@ -266,7 +266,7 @@ class Recorder:
             "records_lost": self.records_lost,
             "events_lost": self.events_lost,
             "late_answers": self.late,
-            "answers_not_taken": self.untaken,
+            "answers_not_taken": self.not_accepted,
         }
         if self.writer.with_packets:
             counts["packets_lost"] = self.packets_lost

@@ -83,7 +83,7 @@ class Closed:
         events_lost: likewise of events.
         missed: packets that never arrived.
         late: answers that were late or left out.
-        untaken: answers that the controller did not take.
+        not_accepted: answers that the controller did not take.
         disk_waited: longest time that the disk took at once [s].
     """
 
@@ -96,7 +96,7 @@ class Closed:
     events_lost: int
     missed: int
     late: int
-    untaken: int
+    not_accepted: int
     disk_waited: float
 
 

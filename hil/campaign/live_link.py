@@ -310,7 +310,7 @@ class LiveLink:
         inits: init packets until the controller was connected.
         cycles: records archived so far.
         late: answers so far that were late or left out for a newer one's.
-        untaken: answers so far that the controller did not take.
+        not_accepted: answers so far that the controller did not take.
         job: number of the archive opened last.
         open_path: of the archive that is open; "" if none is.
         live: where viewers may look, None if nowhere.
@@ -326,7 +326,7 @@ class LiveLink:
     inits: int = 0
     cycles: int = 0
     late: int = 0
-    untaken: int = 0
+    not_accepted: int = 0
     live: LiveView | None = None
     only_simulated: bool = False
     view: ExchangeView = field(init=False)
@@ -548,7 +548,7 @@ class LiveLink:
         self.open_path = ""
         self.cycles += closed.records
         self.late += closed.late
-        self.untaken += closed.untaken
+        self.not_accepted += closed.not_accepted
 
     def _asked(self, command: Command, wanted: type[T], otherwise: str) -> T | None:
         """The answer to a command to the archive process; None if none came in `OPEN_TIMEOUT` s.
@@ -975,7 +975,7 @@ class _LiveRecording:
                 State(status.state),
                 self._position,
                 late=status.late,
-                untaken=status.unanswered,
+                not_accepted=status.unanswered,
                 foreign=status.foreign,
                 heard=status.answered > 0,
                 not_understood=self._view.not_understood,

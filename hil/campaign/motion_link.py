@@ -72,7 +72,7 @@ class Recorded:
         events_lost: events overwritten likewise.
         missed: packets that never arrived.
         late: packets whose answer was late, or left out for a newer one.
-        untaken: answers that the controller did not take.
+        not_accepted: answers that the controller did not take.
     """
 
     outcome: str
@@ -83,7 +83,7 @@ class Recorded:
     events_lost: int
     missed: int
     late: int
-    untaken: int
+    not_accepted: int
 
     @classmethod
     def of(cls, outcome: str, reason: str, seconds: float, counts: Recorder | Closed) -> Recorded:
@@ -97,7 +97,7 @@ class Recorded:
             events_lost=counts.events_lost,
             missed=counts.missed,
             late=counts.late,
-            untaken=counts.untaken,
+            not_accepted=counts.not_accepted,
         )
 
 
@@ -111,7 +111,7 @@ class Progress:
         state: of the session.
         position: (n,) rad, measured last; None before the first record.
         late: packets whose answer was late, or left out for a newer one.
-        untaken: answers that the controller did not take.
+        not_accepted: answers that the controller did not take.
         foreign: packets from elsewhere; they got no answer.
         heard: whether any packet of the controller was answered yet.
         not_understood: of packets that got no answer, how many came and why; "" without any.
@@ -123,7 +123,7 @@ class Progress:
     state: State
     position: Array | None = None
     late: int = 0
-    untaken: int = 0
+    not_accepted: int = 0
     foreign: int = 0
     heard: bool = True
     not_understood: str = ""

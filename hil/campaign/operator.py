@@ -104,8 +104,8 @@ class MotionProgress:
     Attributes:
         motion_time, duration: s of the planned motion, done and in all, at full speed; None if
             the source does not tell.
-        cycles, missed, late, untaken: packets answered since this motion was asked for, and those
-            that never arrived, were answered late or left out, or whose answer was not accepted.
+        cycles, missed, late, not_accepted: packets of this motion that were answered, never
+            arrived, were answered late or left out, and whose reply was not accepted.
         state: of the session.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
@@ -124,7 +124,7 @@ class MotionProgress:
     cycles: int
     missed: int
     late: int
-    untaken: int
+    not_accepted: int
     state: State
     position: Array | None = None
     following_error: Array | None = None

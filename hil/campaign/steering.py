@@ -44,7 +44,7 @@ class PacketCounts:
     answered: int
     missed: int
     late: int
-    untaken: int
+    not_accepted: int
     latencies: tuple[int, ...] = ()
     worst: float = math.inf
 
@@ -182,7 +182,7 @@ class Steering:
                 cycles=counts.answered - before.answered,
                 missed=counts.missed - before.missed,
                 late=counts.late - before.late,
-                untaken=counts.untaken - before.untaken,
+                not_accepted=counts.not_accepted - before.not_accepted,
                 state=state,
                 override=self.fraction,
                 rate=None if math.isnan(rate) else rate,

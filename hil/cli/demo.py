@@ -133,7 +133,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
         finally:
             if isinstance(link, LiveLink):
                 reporter.say(
-                    f"{link.late} answers were late, {link.untaken} were not accepted by the "
+                    f"{link.late} answers were late, {link.not_accepted} were not accepted by the "
                     "simulated controller"
                 )
     took = time.perf_counter() - started

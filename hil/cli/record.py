@@ -116,7 +116,7 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
         "duration": done.records * cell.period,
         "missed": done.missed,
         "late": done.late,
-        "not_accepted": done.untaken,
+        "not_accepted": done.not_accepted,
         "records_lost": done.records_lost,
         "events_lost": done.events_lost,
     }
@@ -127,7 +127,7 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     lost = "".join(f", {count} {what} LOST" for what, count in losses.items() if count)
     say(
         f"{path}: {done.records * cell.period:.1f} s in {done.records} cycles, {done.missed} "
-        f"packets missed, {done.late} answers late, {done.untaken} not accepted{lost}; "
+        f"packets missed, {done.late} answers late, {done.not_accepted} not accepted{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 
@@ -191,8 +191,8 @@ class View:
             f"{progress.missed} missed",
             f"{progress.late} late",
         ]
-        if progress.untaken:
-            parts.append(f"{progress.untaken} replies not accepted")
+        if progress.not_accepted:
+            parts.append(f"{progress.not_accepted} replies not accepted")
         if progress.position is not None and np.isfinite(progress.position).all():
             angles = np.degrees(self._cell.controller_angles(progress.position))
             parts.append(" ".join(f"{angle:.2f}°" for angle in angles))

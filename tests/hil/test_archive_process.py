@@ -182,7 +182,7 @@ def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
     memory.events.write(PacketRejected("late", 4))
     memory.events.write(PacketRejected("foreign", 5))
     done = rig.end()
-    assert (done.late, done.untaken) == (7, 2)
+    assert (done.late, done.not_accepted) == (7, 2)
     assert (outcome(path).late_replies, outcome(path).replies_not_accepted) == (7, 2)
 
 

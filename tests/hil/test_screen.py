@@ -58,7 +58,7 @@ def status(**changes: Any) -> RunStatus:
     """A repetition in the middle, with something of everything."""
     motion = {
         "motion_time": 6.2, "duration": 18.6, "cycles": 123456, "missed": 2, "late": 1,
-        "untaken": 0, "state": State.OPEN, "position": np.zeros(6),
+        "not_accepted": 0, "state": State.OPEN, "position": np.zeros(6),
         "following_error": np.radians([0.0, 0.15, -0.2, 0.01, -0.02, 1.01]),
         "following_share": np.array([0.0, 0.31, 0.85, 0.02, 0.04, 1.3]),
         "current": np.array([2.3, -7.1, 5.0, 0.2, -0.3, 1.1]),
