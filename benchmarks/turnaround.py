@@ -94,17 +94,17 @@ def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
         reader.start()
         floor.start()
         while not ours.poll(0.1):
-            exchange.beat()
+            exchange.send_heartbeat()
         settings = Settings(port, ours.recv(), cycles, blocks, asking, str(ends))
         controller = _spawn.Process(target=control, args=(settings,))
         exchange.submit(Sweep(cycles + 2 * WARM_UP))
         controller.start()
         while controller.is_alive():
-            exchange.beat()
+            exchange.send_heartbeat()
             controller.join(0.1)
         arrivals.with_suffix(".end").touch()
         while reader.is_alive():
-            exchange.beat()
+            exchange.send_heartbeat()
             reader.join(0.1)
         status = exchange.status()
         ended = exchange.wait(2.0)

@@ -133,8 +133,8 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
     skipped = np.diff(archive.columns["cycle"], prepend=archive.columns["cycle"][0] - 1) > 1
     gaps = np.asarray(skipped | (archive.columns["gap"] > 0))
     if archive.period is not None:
-        untaken = [event.time for event in archive.events if event.name == AnswersLost.__name__]
-        cycles = np.rint(np.array(untaken) / archive.period)
+        unaccepted = [event.time for event in archive.events if event.name == AnswersLost.__name__]
+        cycles = np.rint(np.array(unaccepted) / archive.period)
         gaps |= np.isin(archive.columns["cycle"], cycles)
     return gaps
 

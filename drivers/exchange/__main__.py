@@ -22,7 +22,7 @@ from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFailed, ExchangeStarted
 from drivers.exchange.loop import exchange
 from drivers.exchange.process import ExchangeSettings
-from drivers.exchange.serving import Serving, portable
+from drivers.exchange.serving import ControlServer, portable
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
 from drivers.packets import DRIVE_ON, INIT_NUMBER, CyclicPacket, InitPacket, Mode, next_number
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str]) -> int:
         for fd in packets_fd:
             transport = TappedTransport(transport, PacketRing(fd=fd), lambda: session.cycle)
         control = ControlBlock(control_fd)
-        serving = Serving(
+        serving = ControlServer(
             session,
             transport,
             ring,
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str]) -> int:
     return status
 
 
-def _serve(transport: Transport, session: Session, serving: Serving, max_late: int) -> int:
+def _serve(transport: Transport, session: Session, serving: ControlServer, max_late: int) -> int:
     try:
         exchange(transport, session, until=serving, max_late=max_late)
         serving.conclude()

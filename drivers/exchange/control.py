@@ -3,7 +3,7 @@
 Fields of eight bytes, each with one writer, read without locks: a store of eight aligned bytes
 is seen whole or not at all. Times are those of CLOCK_MONOTONIC, the same in every process.
 
-With it what is read from it: percentiles of latencies, and whether another process lives (`Pulse`).
+Percentiles of the latencies counted in it, and `HeartbeatMonitor`, which finds dead processes.
 """
 
 from __future__ import annotations
@@ -213,26 +213,26 @@ def create() -> int:
     return create_memory("hil-control", ctypes.sizeof(ControlBlock))
 
 
-LONGEST_LOOK: Final = 0.5
+MAX_INTERVAL: Final = 0.5
 """s between two looks that count at most; in a longer time this process was held up itself."""
 
 
-class Pulse:
+class HeartbeatMonitor:
     """How long a heartbeat has stood still while somebody was awake to see it.
 
     Its age would not do: a machine that was suspended wakes with every heartbeat old.
 
     Args:
         beat: the heartbeat, any number; 0 before the first.
-        longest_look: s; `LONGEST_LOOK` for somebody who looks more often.
+        max_interval: s; `MAX_INTERVAL` for somebody who looks more often.
     """
 
-    def __init__(self, beat: Callable[[], float], *, longest_look: float = LONGEST_LOOK) -> None:
-        self._beat, self._longest = beat, longest_look
+    def __init__(self, beat: Callable[[], float], *, max_interval: float = MAX_INTERVAL) -> None:
+        self._beat, self._longest = beat, max_interval
         self._last, self._seen = beat(), time.monotonic()
         self._quiet = 0.0
 
-    def quiet(self) -> float:
+    def silence(self) -> float:
         """Seconds since the last beat; 0 before the first. To be called often."""
         now, beat = time.monotonic(), self._beat()
         if beat != self._last or beat == 0.0:

@@ -110,7 +110,7 @@ class Arrival(NamedTuple):
     stamped: bool
 
 
-class Intake:
+class ReceiveQueue:
     """Takes packets from a link that may have queued some while this process was held up.
 
     The answer to any but the newest comes too late, and a motion would run ahead of the arm by a
@@ -342,14 +342,14 @@ def exchange(
     `until` is asked once per packet, after its answer was sent, and at least each 0.1 s. What
     can wait until then is done there.
 
-    Where packets have piled up, only the newest are answered, see `Intake`. Answers that leave
-    later than the controller's next packet are counted, and end a motion, see `Punctuality`. Before
-    the init packet and after a loss, anybody at the controller's address may begin, see
-    `Listening`.
+    Where packets have piled up, only the newest are answered, see `ReceiveQueue`. Answers that
+    leave later than the controller's next packet are counted, and end a motion, see
+    `Punctuality`. Before the init packet and after a loss, any port of the controller's host may
+    begin, see `Listening`.
 
     A closed link is silence for good: the session is informed, and ends what was going on.
     """
-    intake = Intake(transport, session)
+    intake = ReceiveQueue(transport, session)
     listening = Listening(transport, session)
     punctuality = Punctuality(session, max_late)
     handled = 0

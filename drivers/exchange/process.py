@@ -96,7 +96,7 @@ class ExchangeProcess:
     """An exchange that runs in a process, and a process session, of its own.
 
     It outlives this process for as long as it takes to stop the arm on its path and to leave
-    open mode; it does so when `beat` was not called for half a second while a motion is
+    open mode; it does so when `send_heartbeat` was not called for half a second while a motion is
     requested, five seconds otherwise. Use `start`.
 
     Attributes:
@@ -120,7 +120,7 @@ class ExchangeProcess:
         self._events = EventReader(self.event_fd)
         self._offers = 0
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.beat()
+        self.send_heartbeat()
         settings_fd = create_memory("hil-settings", 0)
         try:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
@@ -159,7 +159,7 @@ class ExchangeProcess:
         exchange.realtime, exchange.notes = ready
         return exchange
 
-    def beat(self) -> None:
+    def send_heartbeat(self) -> None:
         """Sign of life; to be given at least every 0.2 s, from any thread."""
         self._control.supervisor_heartbeat = time.monotonic()
 
@@ -208,7 +208,7 @@ class ExchangeProcess:
     def _permit(self, identity: int, wanted: Callable[[], bool]) -> None:
         """Let the program that was read begin, or withdraw it for good."""
         if self._control.program_id != -identity and wanted():
-            self.beat()  # the next cycle may take it, and wants a sign of life no older than that
+            self.send_heartbeat()  # the next cycle may start it
             self._control.program_id = identity
         else:
             self._control.program_id = -identity
@@ -268,7 +268,7 @@ class ExchangeProcess:
         """Its exit status, or None if it still runs after `timeout` s; gives signs of life."""
         end = time.monotonic() + timeout
         while True:
-            self.beat()
+            self.send_heartbeat()
             left = end - time.monotonic()
             try:
                 return self._process.wait(max(0.0, min(left, _BEAT)))
@@ -307,7 +307,7 @@ class ExchangeProcess:
         end = time.monotonic() + timeout
         self._channel.settimeout(_BEAT)
         while True:
-            self.beat()
+            self.send_heartbeat()
             try:
                 message = self._channel.recv(LONGEST_MESSAGE)
             except TimeoutError:

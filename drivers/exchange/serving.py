@@ -20,7 +20,7 @@ from drivers.exchange.control import (
     ArchiveState,
     ControlBlock,
     Ended,
-    Pulse,
+    HeartbeatMonitor,
     bin_of,
 )
 from drivers.exchange.event_log import (
@@ -122,7 +122,7 @@ _MAY_BE_OPEN: Final = frozenset(
 )
 
 
-class Serving:
+class ControlServer:
     """The `until` of `exchange` in a process of its own; called after each answer.
 
     Args:
@@ -163,8 +163,10 @@ class Serving:
         self._answered = 0
         self._heard = began = time.monotonic()
         # Of time in which the whole machine stood still nothing is to be concluded.
-        self._supervisor = Pulse(lambda: control.supervisor_heartbeat or began, longest_look=POLL)
-        self._archive = Pulse(lambda: control.archive_heartbeat, longest_look=POLL)
+        self._supervisor = HeartbeatMonitor(
+            lambda: control.supervisor_heartbeat or began, max_interval=POLL
+        )
+        self._archive = HeartbeatMonitor(lambda: control.archive_heartbeat, max_interval=POLL)
         self._archive_silent = 0.0
         self._closed_since = math.inf
         self._closed_first = math.inf
@@ -203,9 +205,9 @@ class Serving:
     def _orders(self, now: float) -> None:
         control, session = self._control, self._session
         self._calls += 1
-        self._archive_silent = self._archive.quiet()
+        self._archive_silent = self._archive.silence()
         if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
-            self._orphan("the supervisor closed its end")
+            self._detach("the supervisor closed its end")
         if control.stop_count != self._stops:
             self._stops = control.stop_count
             session.stop(STOPPED)
@@ -232,15 +234,15 @@ class Serving:
 
     def _reasons_to_leave(self) -> None:
         # Read after `program_id`, which the supervisor writes after a beat: this is never older.
-        silent = self._supervisor.quiet()
+        silent = self._supervisor.silence()
         if self._terminated():
             self._leave("the exchange process was asked to terminate", ORPHAN_LINGER)
         elif silent > (STALE if self._session.requested else PATIENCE):
-            self._orphan(NO_SUPERVISOR)
+            self._detach(NO_SUPERVISOR)
         elif self._control.finish:
             self._leave("the supervisor wants to end", FINISH_LINGER)
 
-    def _orphan(self, reason: str) -> None:
+    def _detach(self, reason: str) -> None:
         self._orphaned = True
         self._leave(reason, ORPHAN_LINGER)
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import InitReceived, Outcome
-from drivers.exchange.control import ArchiveState, ControlBlock, Ended, Pulse
+from drivers.exchange.control import ArchiveState, ControlBlock, Ended, HeartbeatMonitor
 from drivers.exchange.event_log import EventReader, ExchangeEvent
 from drivers.record import PACKET_DTYPE, PacketReader, RingReader
 from hil.archive.live import LivePublisher, Serve
@@ -173,7 +173,7 @@ class ArchiveProcess:
         self._leaving = False
         self._progress = time.monotonic()
         self._exchange = exchange
-        self._pulse = Pulse(lambda: control.exchange_heartbeat)
+        self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
         self._packets = packets
         self._live: LivePublisher | None = None
         self._recent = Recent()
@@ -255,8 +255,8 @@ class ArchiveProcess:
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
-                recorder.take_packets(packets)
-                recorder.take(records, events)
+                recorder.record_packets(packets)
+                recorder.record(records, events)
         except Exception as error:
             self._fail(command.job, error)
             return
@@ -290,11 +290,11 @@ class ArchiveProcess:
         now = time.monotonic()
         try:
             self._take_packets(job)
-            job.recorder.take(records, events, lost)
+            job.recorder.record(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
                 # The motion has ended, and the event that says so was overwritten.
                 outcome = _OUTCOMES[Ended(self._control.ended_outcome)]
-                job.recorder.witness(outcome, self._control.ended_interval)
+                job.recorder.motion_ended(outcome, self._control.ended_interval)
             if len(records):
                 job.heard, job.flushed = now, False
             elif not job.flushed and now - job.heard > SILENCE:
@@ -311,7 +311,7 @@ class ArchiveProcess:
             return
         packets, before = self._packets.drain(), job.packets_overflow
         job.packets_overflow = self._packets.overflow
-        job.recorder.take_packets(packets, job.packets_overflow - before)
+        job.recorder.record_packets(packets, job.packets_overflow - before)
 
     def _complete(self, job: Job, now: float, *, gone: bool) -> None:
         """Close the archive if the interval is over."""
@@ -319,7 +319,7 @@ class ArchiveProcess:
         if ended is not None and job.ended is None:
             job.ended = now
         waited = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
-        if job.until_ended and ended is not None and (job.recorder.over or waited or gone):
+        if job.until_ended and ended is not None and (job.recorder.complete or waited or gone):
             self._close(ended.outcome, ended.reason)
         elif gone and job.until_ended:
             who = "exchange process" if self._commands is not None else "supervising program"
@@ -332,7 +332,7 @@ class ArchiveProcess:
 
     def _look_after_exchange(self) -> None:
         """Note in the archive that the exchange stands still, and that it goes on again."""
-        quiet, job = self._pulse.quiet(), self._job
+        quiet, job = self._monitor.silence(), self._job
         if job is None:
             return
         if (quiet > EXCHANGE_QUIET) is not job.quiet:
@@ -340,7 +340,7 @@ class ArchiveProcess:
             name = "ExchangeSilent" if job.quiet else "ExchangeBack"
             text = "no sign of life from the exchange process" if job.quiet else "it goes on again"
             try:
-                job.recorder.remark(name, text)
+                job.recorder.warn(name, text)
             except Exception as error:
                 self._fail(job.number, error)
                 return

@@ -194,10 +194,10 @@ class Recorder:
         self._cut = False
         self._packets_cut = False
 
-    def take_packets(self, packets: Records, lost: int = 0) -> None:
+    def record_packets(self, packets: Records, lost: int = 0) -> None:
         """Archive raw packets; `lost` of them before these were overwritten unread.
 
-        To be called before `take` of what came with them. Where the archive is one without
+        To be called before `record` of what came with them. Where the archive is one without
         packets, they are dropped.
         """
         if not self.writer.with_packets:
@@ -210,7 +210,7 @@ class Recorder:
             self.writer.add_packets(packets)
             self._newest_packet = int(packets["cycle"][-1])
 
-    def take(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
+    def record(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
         """Archive what has come; `lost` records before these were overwritten unread.
 
         The records must be those up to the newest of the events, or more. Of events only those up
@@ -221,7 +221,7 @@ class Recorder:
         """
         restarts = [k for k, event in enumerate(events) if isinstance(event, InitReceived)]
         ours = () if self.restarted else events[: restarts[0] + 1] if restarts else events
-        self.note(events)
+        self.update(events)
         self._write(records)
         for event in ours:
             if isinstance(event, EventsLost):
@@ -235,13 +235,13 @@ class Recorder:
             self.records_lost += lost
             self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
 
-    def witness(self, outcome: Outcome, interval: int) -> None:
+    def motion_ended(self, outcome: Outcome, interval: int) -> None:
         """Take it from elsewhere that the motion has ended: the event that says so was lost."""
         ended = MotionEnded(outcome, "the event that said why was lost", interval, self.newest)
-        self.note([ended])
+        self.update([ended])
         self._archive(ended)
 
-    def remark(self, name: str, text: str) -> None:
+    def warn(self, name: str, text: str) -> None:
         """Archive a warning of our own."""
         self.writer.event(None, name, text, level=Level.WARN)
 
@@ -252,7 +252,7 @@ class Recorder:
         return packets_wanted and self._newest_packet < self.newest
 
     @property
-    def over(self) -> bool:
+    def complete(self) -> bool:
         """Whether the interval is over and all of it archived, aftermath included."""
         if self.ended is None:
             return False
@@ -273,7 +273,7 @@ class Recorder:
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
 
-    def note(self, events: Sequence[ExchangeEvent]) -> None:
+    def update(self, events: Sequence[ExchangeEvent]) -> None:
         """Take in what events say of the interval, without archiving them."""
         for event in events:
             if isinstance(event, MotionEnded):

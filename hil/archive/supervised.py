@@ -17,7 +17,7 @@ from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 from typing import IO, Any, Protocol
 
 from drivers.drive_train import DriveTrain
-from drivers.exchange.control import ControlBlock, Pulse
+from drivers.exchange.control import ControlBlock, HeartbeatMonitor
 from hil.archive.live import Serve
 from hil.archive.recorder import ArchiveSpec
 
@@ -210,7 +210,7 @@ class ArchiveProcessHandle:
 
     process: subprocess.Popen[bytes]
     channel: Channel
-    pulse: Pulse
+    monitor: HeartbeatMonitor
     _words: IO[bytes]
     _gone: bool = False
     _ended_for: str = field(default="")
@@ -225,7 +225,7 @@ class ArchiveProcessHandle:
             OSError: the system refuses a process, a socket or memory.
         """
         control = ControlBlock(memory.control_fd)
-        pulse = Pulse(lambda: control.archive_heartbeat)
+        pulse = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
             words: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())
             exchange = os.pidfd_open(memory.pid)
@@ -258,8 +258,8 @@ class ArchiveProcessHandle:
 
     def failure(self) -> str | None:
         """What is wrong with the process, in words; one that hangs is ended. None if it works."""
-        if self.alive and self.pulse.quiet() > HUNG:
-            self.kill(f"gave no sign of life for {HUNG:g} s and was ended")
+        if self.alive and self.monitor.silence() > HUNG:
+            self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
         if self.alive:
             return None
         return f"the archive process {self._ended_for or 'ended' + self.last_words()}"
@@ -316,8 +316,8 @@ class ArchiveProcessHandle:
             self.send(End())
         deadline = time.monotonic() + END_TIMEOUT
         while self.process.poll() is None and not self._gone:
-            if self.pulse.quiet() > HUNG:
-                self.kill(f"gave no sign of life for {HUNG:g} s and was ended")
+            if self.monitor.silence() > HUNG:
+                self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
             elif time.monotonic() > deadline:
                 self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
             else:

@@ -174,7 +174,7 @@ class Link:
                         hopeless = beginning.hopeless(self.session.state, self.transport.now)
                 patience -= recorder.ended is not None
                 # One that was stopped while its axes opened has not begun; they have to close.
-                over = recorder.over and self.session.state not in HAS_SET_POINTS
+                over = recorder.complete and self.session.state not in HAS_SET_POINTS
                 return over or patience < 0 or hopeless is not None
 
             exchange(self.transport, self.session, until=over)
@@ -335,12 +335,12 @@ class _Taking:
             self._steering.note(events)
             self._steering.take(records)
         if self._failure is not None:
-            recorder.note(events)
+            recorder.update(events)
             return
         try:
             if packets is not None:
-                recorder.take_packets(packets, self._packets_overflow - earlier[1])
-            recorder.take(records, events, self._overflow - earlier[0])
+                recorder.record_packets(packets, self._packets_overflow - earlier[1])
+            recorder.record(records, events, self._overflow - earlier[0])
         except Exception as error:  # whatever it is, the arm comes to rest first
             self._failure = error
             link.session.stop("the archive cannot be written")

@@ -31,7 +31,7 @@ from drivers.events import (
     PacketRejected,
     Refused,
 )
-from drivers.exchange.control import ControlBlock, Pulse
+from drivers.exchange.control import ControlBlock, HeartbeatMonitor
 from drivers.exchange.event_log import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
@@ -219,11 +219,11 @@ class ExchangeView:
     _rejected: int = 0
     _said: str = ""
     _ended_before: int = 0
-    _pulse: Pulse = field(init=False)
+    _monitor: HeartbeatMonitor = field(init=False)
 
     def __post_init__(self) -> None:
         control = ControlBlock(self.exchange.control_fd)
-        self._pulse = Pulse(lambda: control.exchange_heartbeat)
+        self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
 
     def look(self) -> list[ExchangeEvent]:
         """Take in what the exchange says, and return it."""
@@ -283,9 +283,9 @@ class ExchangeView:
 
         A process that hangs is ended.
         """
-        if self.exchange.alive and self._pulse.quiet() > HUNG:
+        if self.exchange.alive and self._monitor.silence() > HUNG:
             self.exchange.kill()
-            self.ended_for = f"gave no sign of life for {HUNG:g} s and was ended"
+            self.ended_for = f"sent no heartbeat for {HUNG:g} s and was ended"
         if self.exchange.alive:
             return None
         self.look()
@@ -388,7 +388,7 @@ class LiveLink:
         except OSError as error:
             raise ControllerFault(f"the exchange process cannot be started: {error}") from error
         # At once: the archive process may take longer to start than the exchange waits for a sign.
-        heart = Heartbeat(exchange.beat)
+        heart = Heartbeat(exchange.send_heartbeat)
         heart.start()
         try:
             archive = ArchiveProcessHandle.start(
@@ -608,7 +608,7 @@ class LiveLink:
             self.exchange.finish()
             deadline = time.monotonic() + END_TIMEOUT
             while self.view.failure() is None and time.monotonic() < deadline:
-                self.exchange.beat()
+                self.exchange.send_heartbeat()
                 time.sleep(POLL)
             if self.view.ended_for:
                 trouble = f"the exchange process {self.view.ended_for}"
@@ -942,7 +942,7 @@ class _LiveRecording:
         """Do nothing, for as long as the exchange should go on answering."""
         stopped, still = self._stop.requested, Standstill(self._link.cell.period)
         driven, heard = time.monotonic(), 1
-        pulse = Pulse(lambda: heard, longest_look=5 * POLL)
+        pulse = HeartbeatMonitor(lambda: heard, max_interval=5 * POLL)
         self._reader = self._link.reader()
         self._reader.drain()
         while not (self._stop.insisted or (self._stop.requested and not stopped)):
@@ -954,7 +954,7 @@ class _LiveRecording:
             self._view.look()
             records = self._records()
             heard += len(records) > 0
-            if still.take(records) or pulse.quiet() > SILENCE:
+            if still.take(records) or pulse.silence() > SILENCE:
                 return
             self._show(over=why)
             time.sleep(POLL)

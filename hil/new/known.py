@@ -253,7 +253,7 @@ def read_init(
 def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
     deadline = time.monotonic() + wait
     while view.connection.init is None:
-        view.exchange.beat()
+        view.exchange.send_heartbeat()
         view.look()
         if (failure := view.failure()) is not None:
             raise ControllerFault(failure)

@@ -204,7 +204,7 @@ def settings(port: int, **changes) -> ExchangeSettings:
 def running(**changes):
     port = free_port()
     exchange = ExchangeProcess.start(settings(port, **changes))
-    controller = UdpController(port, exchange.beat)
+    controller = UdpController(port, exchange.send_heartbeat)
     try:
         controller.start()
         yield exchange, controller
@@ -538,7 +538,7 @@ class TestStops:
             control = ControlBlock(exchange.control_fd)
 
             def beat():
-                exchange.beat()
+                exchange.send_heartbeat()
                 control.archive_heartbeat = time.monotonic()
 
             controller.beat = beat
@@ -547,7 +547,7 @@ class TestStops:
             set_going(exchange, controller)
             controller.cycle_time = PERIOD
             if end == "silent":
-                controller.beat = exchange.beat
+                controller.beat = exchange.send_heartbeat
                 reason = "the archive process gives no sign of life"
             else:
                 control.archive_state = ArchiveState.FAILED

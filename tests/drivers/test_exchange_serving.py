@@ -25,13 +25,13 @@ from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.__main__ import Rehearsal, rehearse
 from drivers.exchange.control import (
     BINS,
-    LONGEST_LOOK,
+    MAX_INTERVAL,
     PATIENCE,
     SHORTEST,
     STALE,
     ControlBlock,
     Ended,
-    Pulse,
+    HeartbeatMonitor,
     bin_of,
     quantile,
     upper_edge,
@@ -45,7 +45,7 @@ from drivers.exchange.event_log import (
     Leaving,
 )
 from drivers.exchange.loop import POLL
-from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, Digest, Serving
+from drivers.exchange.serving import LONGEST_LINGER, ORPHAN_LINGER, ControlServer, Digest
 from drivers.record import CycleRing, RingReader
 from tests.drivers.rig import PERIOD, Cruise, N, drive_train, limits, still
 
@@ -350,13 +350,13 @@ class Machine:
 
     now, beat = 100.0, 1.0
 
-    def watch(self, pulse: Pulse, seconds: float, *, beating: bool = False) -> float:
+    def watch(self, pulse: HeartbeatMonitor, seconds: float, *, beating: bool = False) -> float:
         """Look each 0.1 s; the last quiet time seen."""
         quiet = 0.0
         for _ in range(round(seconds / 0.1)):
             self.now += 0.1
             self.beat += beating
-            quiet = pulse.quiet()
+            quiet = pulse.silence()
         return quiet
 
 
@@ -368,24 +368,24 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def test_silence_is_counted_and_ends_with_the_next_beat(machine: Machine) -> None:
-    pulse = Pulse(lambda: machine.beat)
+    pulse = HeartbeatMonitor(lambda: machine.beat)
     assert machine.watch(pulse, 10.0, beating=True) == 0.0
     assert machine.watch(pulse, 6.0) == pytest.approx(6.0)
     assert machine.watch(pulse, 0.1, beating=True) == 0.0
 
 
-@pytest.mark.parametrize("longest", [LONGEST_LOOK, 0.1])
+@pytest.mark.parametrize("longest", [MAX_INTERVAL, 0.1])
 def test_a_machine_that_was_suspended_takes_nobody_for_dead(
     machine: Machine, longest: float
 ) -> None:
-    pulse = Pulse(lambda: machine.beat, longest_look=longest)
+    pulse = HeartbeatMonitor(lambda: machine.beat, max_interval=longest)
     machine.now += 3600.0
-    assert pulse.quiet() == longest
+    assert pulse.silence() == longest
 
 
 def test_a_process_that_has_not_begun_is_not_quiet_yet(machine: Machine) -> None:
     machine.beat = 0.0
-    assert machine.watch(Pulse(lambda: machine.beat), 10.0) == 0.0
+    assert machine.watch(HeartbeatMonitor(lambda: machine.beat), 10.0) == 0.0
 
 
 STEP = 0.01
@@ -438,7 +438,7 @@ class Bench:
         self.ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.theirs = theirs
         self.terminated = []
-        self.serving = Serving(
+        self.serving = ControlServer(
             self.session,
             self,
             self.ring,
@@ -559,7 +559,7 @@ class TestASilentSupervisor:
 
     def test_ends_with_the_beat_that_comes_with_its_consent(self, bench, monkeypatch):
         """Which may come between any two looks of one call."""
-        offered, consent = object(), bench.serving._archive.quiet
+        offered, consent = object(), bench.serving._archive.silence
         bench.step()
         bench.serving._offered = offered
         bench.serving._inbox.identity = bench.control.program_offered = 1
@@ -573,7 +573,7 @@ class TestASilentSupervisor:
             bench.control.program_id = 1
             return consent()
 
-        monkeypatch.setattr(bench.serving._archive, "quiet", consents)
+        monkeypatch.setattr(bench.serving._archive, "silence", consents)
         bench.clock.time += STEP
         bench.serving()
         assert bench.session.asked == [offered]

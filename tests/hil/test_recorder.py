@@ -97,10 +97,10 @@ def bytes_of_an_init() -> bytes:
 
 
 def test_an_interval_is_over_when_its_motion_came_to_rest(recorder: Recorder) -> None:
-    recorder.take(cycles(0, 100), [MotionStarted(0, 10)])
-    assert not recorder.over
-    recorder.take(cycles(100, 50), [ended("completed", 140)])
-    assert recorder.over
+    recorder.record(cycles(0, 100), [MotionStarted(0, 10)])
+    assert not recorder.complete
+    recorder.record(cycles(100, 50), [ended("completed", 140)])
+    assert recorder.complete
     archive = read(recorder)
     assert archive.n_samples == 150
     assert [event.name for event in archive.events] == ["MotionStarted", "MotionEnded"]
@@ -110,29 +110,29 @@ def test_an_interval_is_over_when_its_motion_came_to_rest(recorder: Recorder) ->
 def test_half_a_second_more_is_recorded_of_a_motion_that_failed(
     recorder: Recorder, outcome: str
 ) -> None:
-    recorder.take(cycles(0, 100), [ended(outcome, 80)])
-    assert not recorder.over
-    recorder.take(cycles(100, 1000), [])
-    assert recorder.over
+    recorder.record(cycles(0, 100), [ended(outcome, 80)])
+    assert not recorder.complete
+    recorder.record(cycles(100, 1000), [])
+    assert recorder.complete
     assert read(recorder).columns["cycle"][-1] == 80 + 500
 
 
 def test_a_controller_that_starts_anew_has_no_place_in_the_same_file(recorder: Recorder) -> None:
     new = [StateChanged(State.INIT, State.DRIVE_OFF, 3)]
     both = np.concatenate([cycles(1000, 50), cycles(0, 30)])
-    recorder.take(both, [ended("lost", 1049), a_new_session(), *new])
+    recorder.record(both, [ended("lost", 1049), a_new_session(), *new])
     assert recorder.restarted
-    assert recorder.over
-    recorder.take(cycles(30, 5000), new)
+    assert recorder.complete
+    recorder.record(cycles(30, 5000), new)
     archive = read(recorder)
     assert np.array_equal(archive.columns["cycle"], 1000 + np.arange(50))
     assert [event.name for event in archive.events] == ["MotionEnded", "InitReceived"]
 
 
 def test_a_silent_link_and_lost_records_are_noticed(recorder: Recorder) -> None:
-    recorder.take(cycles(0, 10), [LinkLost(1.2, State.CLOSED)])
+    recorder.record(cycles(0, 10), [LinkLost(1.2, State.CLOSED)])
     assert recorder.link_lost
-    recorder.take(cycles(17, 10), [], lost=7)
+    recorder.record(cycles(17, 10), [], lost=7)
     archive = read(recorder)
     assert archive.outcome.entries["records_lost"] == "7"
     silent, lost = (event.text for event in archive.events)

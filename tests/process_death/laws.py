@@ -34,7 +34,7 @@ GONE: Final = ("ended", "is gone", "cannot be started")
 NAMED: Final = {
     "exchange": tuple(f"the exchange process {what}" for what in GONE),
     "archive": (
-        *(f"the archive process {what}" for what in (*GONE, "gave no sign of life")),
+        *(f"the archive process {what}" for what in (*GONE, "sent no heartbeat")),
         "cannot be written further",
     ),
     "controller": ("controller", "link", "silent", "nothing heard", "packet"),

@@ -52,8 +52,8 @@ DEFECTS: Final = {
     ),
     "exchange-leaves-the-arm": Defect(
         EXCHANGE,
-        "import os; from drivers.exchange.serving import Serving; "
-        "Serving._orphan = lambda *_: os._exit(0)",
+        "import os; from drivers.exchange.serving import ControlServer; "
+        "ControlServer._detach = lambda *_: os._exit(0)",
         "while the arm moved",
     ),
 }

@@ -167,7 +167,7 @@ def round_in_which(victim: Victim) -> int:
             "archive",
             "SIGSTOP",
             4,
-            "gave no sign of life for 5 s and was ended; the arm was brought to rest",
+            "sent no heartbeat for 5 s and was ended; the arm was brought to rest",
         ),
         ("archive", "full disk", 2, "cannot be written further"),
     ],

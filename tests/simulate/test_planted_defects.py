@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.exchange.loop import Intake
+from drivers.exchange.loop import ReceiveQueue
 from drivers.execution import Execution
 from drivers.guard import Guard
 from drivers.reply_policy import ReplyPolicy
@@ -76,16 +76,16 @@ def goes_on_after_a_gap(patch: pytest.MonkeyPatch) -> None:
 
 def answers_what_piled_up(patch: pytest.MonkeyPatch) -> None:
     """Every packet of a pile is answered, so that the motion runs ahead of the arm."""
-    newest = Intake._newest
+    newest = ReceiveQueue._newest
 
-    def all_of_them(self: Intake, first: Any, period: float) -> Any:
+    def all_of_them(self: ReceiveQueue, first: Any, period: float) -> Any:
         arrivals = [first]
         while (packet := self._transport.receive(0.0)) is not None:
             arrivals.append(first._replace(packet=packet))
         return tuple(arrivals)
 
     assert newest is not all_of_them
-    patch.setattr(Intake, "_newest", all_of_them)
+    patch.setattr(ReceiveQueue, "_newest", all_of_them)
 
 
 def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
