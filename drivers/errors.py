@@ -98,7 +98,7 @@ class SourceFailed(RefusalError):
     """The motion source raised, or gave arrays of the wrong shape; the cause is chained."""
 
 
-class AxisLeft(RefusalError):
+class AxisNotInMode(RefusalError):
     """An axis is not in the open mode that the motion needs.
 
     Attributes:
@@ -156,7 +156,7 @@ def in_words(error: BaseException) -> str:
         return f"{kind}, whose message could not be made"
 
 
-class ExitNotGranted(RefusalError):
+class ExitTimeout(RefusalError):
     """The controller keeps axes in open mode although their end of open mode was asked for.
 
     Attributes:
@@ -309,7 +309,7 @@ class FirstSetPointUnknown(
     """Target, position or velocity received with it were sent in an earlier cycle."""
 
 
-class MotionNotCarriedOn(
+class SetPointNotAccepted(
     GuardError,
     check="distance between received target and the set-points sent last",
     unit="motor revolutions",
@@ -318,27 +318,27 @@ class MotionNotCarriedOn(
     """The controller's target is none of the set-points sent last: it does not take them."""
 
 
-class MotionHeld(
-    MotionNotCarriedOn,
+class VelocityAfterGap(
+    SetPointNotAccepted,
     check="difference, after a gap, between received velocity and the one sent last",
     unit="motor revolutions per cycle",
 ):
     """After a long gap the axis rests, or moves otherwise than the set-point sent last."""
 
 
-class MotionPaused(
-    MotionNotCarriedOn,
+class VelocityAfterPause(
+    SetPointNotAccepted,
     check="difference, after a pause, between the velocity received and the one sent last",
     unit="rad/s",
 ):
     """After a pause by the clock the arm moves otherwise than the set-points sent last."""
 
 
-class MotionUnknown(
-    MotionHeld, check="age, after a gap, of received target or velocity", unit="cycles"
+class AgeAfterGap(
+    VelocityAfterGap, check="age, after a gap, of received target or velocity", unit="cycles"
 ):
     """After a long gap, target or velocity received were sent in an earlier cycle."""
 
 
-class CorrectionNotCarriedOn(MotionNotCarriedOn, check="correction sent last before a gap"):
+class CorrectionUnconfirmed(SetPointNotAccepted, check="correction sent last before a gap"):
     """After a long gap nothing tells whether the controller applied the correction sent last."""

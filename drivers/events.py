@@ -132,12 +132,12 @@ class PacketRejected:
     Attributes:
         kind: "malformed", "stale" or "ended", or what the link discarded them for.
         count: how many.
-        why: of the last one, in words: its length, and what was not understood; "" if unknown.
+        reason: of the last one; "" if unknown.
     """
 
     kind: str
     count: int
-    why: str = field(default="", compare=False)
+    reason: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ from drivers.events import Outcome
 from drivers.guard import RANK
 from drivers.motion_source import (
     BoundsName,
-    CarriedSource,
     CorrectionSource,
     FeedForwardSource,
     MotionSource,
+    ResumableSource,
     is_correction,
     is_holdable,
     is_motion,
@@ -264,14 +264,14 @@ class MotionExecution(Execution):
         return going and callable(getattr(self._source, "resume_from", None))
 
     def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
-        """The controller carried the motion on by itself: see `CarriedSource`.
+        """The controller carried the motion on by itself: see `ResumableSource`.
 
         Raises:
             SourceFailed: the source cannot go on from there.
         """
         try:
             # What the guard checks against is not the source's to change.
-            source = cast(CarriedSource, self._source)
+            source = cast(ResumableSource, self._source)
             source.resume_from(position.copy(), velocity.copy(), cycles)
         except BaseException as error:
             raise _failed("cannot go on", error, cycle) from error

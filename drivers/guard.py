@@ -25,19 +25,19 @@ from drivers.errors import (
     AccelerationLimit,
     CommandedCurrentLimit,
     CommandedCurrentStep,
-    CorrectionNotCarriedOn,
     CorrectionNotEnded,
+    CorrectionUnconfirmed,
     CurrentLimit,
     FirstSetPoint,
     FollowingError,
     GuardError,
     JerkLimit,
-    MotionHeld,
-    MotionNotCarriedOn,
-    MotionPaused,
     NotAtStandstill,
     NotFinite,
     PositionLimit,
+    SetPointNotAccepted,
+    VelocityAfterGap,
+    VelocityAfterPause,
     VelocityLimit,
     VelocityMismatch,
 )
@@ -442,15 +442,15 @@ class Guard:
             where: (n,) which joints.
 
         Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld: going on would be a jump.
+            NotFinite, SetPointNotAccepted, VelocityAfterGap: going on would be a jump.
         """
         bound = FIRST_FRACTION * self._threshold
-        require(where, np.abs(target - commanded), bound, MotionNotCarriedOn, cycle)
+        require(where, np.abs(target - commanded), bound, SetPointNotAccepted, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
         moving = np.abs(velocity[1]) > standstill
         for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
-            require(joints, np.abs(found - step), bound, MotionHeld, cycle)
+            require(joints, np.abs(found - step), bound, VelocityAfterGap, cycle)
 
     def check_after_pause(self, velocity: Array, cycle: int, where: NDArray[np.bool_]) -> None:
         """A packet came late by the clock: the arm moves as the set-points sent last.
@@ -463,12 +463,12 @@ class Guard:
             where: (n,) which joints.
 
         Raises:
-            NotFinite, MotionPaused: it does not, so that the next set-point would be a jump.
+            NotFinite, VelocityAfterPause: it does not, so that the next set-point would be a jump.
         """
         sent = (self._history[3] - self._history[2]) / self.period
         factor, _ = self.limits.factors(self._in_force.rank)
         bound = LAG * factor * self.limits.acceleration
-        require(where, np.abs(velocity - sent), bound, MotionPaused, cycle)
+        require(where, np.abs(velocity - sent), bound, VelocityAfterPause, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """The next set-point; if it passes, it counts as sent.
@@ -657,9 +657,9 @@ class CorrectionGuard:
         """After a long gap, whether the controller applied a correction cannot be seen.
 
         Raises:
-            CorrectionNotCarriedOn: the one sent last is not zero.
+            CorrectionUnconfirmed: the one sent last is not zero.
         """
-        self._require_zero(CorrectionNotCarriedOn, cycle)
+        self._require_zero(CorrectionUnconfirmed, cycle)
 
     def _require_zero(self, kind: type[GuardError], cycle: int) -> None:
         no_current = RELATIVE_TOLERANCE * self._guard.current

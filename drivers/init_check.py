@@ -45,7 +45,7 @@ class InitCheck:
 
 
 @dataclass(frozen=True, eq=False)
-class AnnouncedLimits:
+class ControllerLimits:
     """Limits of an arm's motors in an init packet, (n,) each; NaN where it has none.
 
     Attributes:
@@ -57,7 +57,7 @@ class AnnouncedLimits:
     following_error: Array
 
     @classmethod
-    def of(cls, init: InitPacket, arm: int, n_joints: int) -> AnnouncedLimits:
+    def of(cls, init: InitPacket, arm: int, n_joints: int) -> ControllerLimits:
         """Those of the first axes of an arm, which counts from 1."""
         row, axes = arm - 1, slice(0, n_joints)
         return cls(
@@ -66,12 +66,12 @@ class AnnouncedLimits:
         )
 
 
-def narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
+def is_narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
     """Where a limit (n,) of the controller is below the cell's by more than six digits round."""
     return np.asarray(theirs < ours * (1.0 - _WRITTEN))
 
 
-def shown(value: float) -> str:
+def float32_text(value: float) -> str:
     """A figure of the wire in the fewest digits that are that float32 again."""
     return str(np.float32(value)).removesuffix(".0")
 

@@ -126,7 +126,7 @@ class HoldableSource(Protocol):
         """Go on, within the bounds of a stop until the speed is what it was."""
 
 
-class CarriedSource(Protocol):
+class ResumableSource(Protocol):
     """A source that can go on from where a controller carried its motion by itself."""
 
     def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:

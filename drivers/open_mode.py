@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import ArmWire
 from drivers.errors import (
-    AxisLeft,
+    AgeAfterGap,
+    AxisNotInMode,
     FirstSetPointUnknown,
     GuardError,
-    MotionNotCarriedOn,
-    MotionUnknown,
+    SetPointNotAccepted,
     SourceFailed,
 )
 from drivers.execution import CorrectionExecution, Execution, MotionExecution
@@ -118,7 +118,7 @@ class SentSetPoints:
             standstill moves in a cycle hides one.
 
         Raises:
-            NotFinite, MotionNotCarriedOn: a target further than `FIRST_FRACTION` of the
+            NotFinite, SetPointNotAccepted: a target further than `FIRST_FRACTION` of the
                 following-error threshold from all of them, or than `LEAP_FRACTION` from the last,
                 or that is not the last one though this was sent `REPETITIONS` times.
         """
@@ -138,8 +138,8 @@ class SentSetPoints:
         where = self._every if where is None else where
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
-        require(where, nearest, FIRST_FRACTION * threshold, MotionNotCarriedOn, cycle)
-        require(where, late[0], LEAP_FRACTION * threshold, MotionNotCarriedOn, cycle)
+        require(where, nearest, FIRST_FRACTION * threshold, SetPointNotAccepted, cycle)
+        require(where, late[0], LEAP_FRACTION * threshold, SetPointNotAccepted, cycle)
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
@@ -150,7 +150,7 @@ class SentSetPoints:
             return 0 if known_late else more
         self.again = True
         if self._repeated >= REPETITIONS:
-            require(where, late[0], np.full_like(newest, standstill), MotionNotCarriedOn, cycle)
+            require(where, late[0], np.full_like(newest, standstill), SetPointNotAccepted, cycle)
         return 1 if self._repeated else more
 
 
@@ -341,7 +341,7 @@ class PositionMode(_OpenMode):
             return
         off = np.abs(motor - self._wire.raw[TARGET]) > self._guard.limits.standstill
         if (off & ~opened).any():
-            raise AxisLeft(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
+            raise AxisNotInMode(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
 
     def _check_accepted(
         self, cycle: int, where: Joints | None = None, *, stopping: bool = False
@@ -379,10 +379,10 @@ class PositionMode(_OpenMode):
         closed, or did so since the first set-point, do not matter.
 
         Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld, SourceFailed: going on would be a jump.
+            NotFinite, SetPointNotAccepted, VelocityAfterGap, SourceFailed: resuming would jump.
         """
         where = self._continuing & reading.ready
-        self._require_fresh(_NEEDED_AFTER_GAP, MotionUnknown, cycle, where)
+        self._require_fresh(_NEEDED_AFTER_GAP, AgeAfterGap, cycle, where)
         raw, step = self._wire.raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
         if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
@@ -409,10 +409,10 @@ class PositionMode(_OpenMode):
         """A packet came late by the clock: the arm moves as the set-points sent last.
 
         Raises:
-            NotFinite, MotionPaused: going on would be a jump.
+            NotFinite, VelocityAfterPause: going on would be a jump.
         """
         where = self._continuing & reading.ready
-        self._require_fresh((ACTUAL_VELOCITY,), MotionUnknown, cycle, where)
+        self._require_fresh((ACTUAL_VELOCITY,), AgeAfterGap, cycle, where)
         velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import Ages, ArmWire, DriveTrain
 from drivers.errors import (
-    ExitNotGranted,
+    ExitTimeout,
     FollowingError,
     GuardError,
     PacketError,
@@ -53,7 +53,7 @@ from drivers.open_mode import CorrectionMode, OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket
 from drivers.record import CycleRing
 from drivers.replies import D1, Reader, Reading, ReplyFrame, Words
-from drivers.state_machine import Machine
+from drivers.state_machine import StateMachine
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
 
 Array = NDArray[np.float64]
@@ -128,7 +128,12 @@ class ReplyPolicy:
         )
 
     def answer(
-        self, machine: Machine, reading: Reading, words: Words, measured: Array, commanded: Array
+        self,
+        machine: StateMachine,
+        reading: Reading,
+        words: Words,
+        measured: Array,
+        commanded: Array,
     ) -> bytes:
         """Fill the frame for the machine's state.
 
@@ -175,7 +180,9 @@ class ReplyPolicy:
         self._asked_at = machine.cycle
         return self._asking_for_exit(status)
 
-    def _hold_where_nothing_moves(self, machine: Machine, reading: Reading, words: Words) -> None:
+    def _hold_where_nothing_moves(
+        self, machine: StateMachine, reading: Reading, words: Words
+    ) -> None:
         """Axes that are open are answered their target if that can be, else drive-off is asked for.
 
         Raises:
@@ -203,7 +210,7 @@ class ReplyPolicy:
             arm, axis = self._axis_of.get(slots[bad[0]], (self._arm, slots[bad[0]]))
             raise TargetNotFinite(arm, axis, float(values[bad[0]]), cycle)
 
-    def _given_up(self, machine: Machine, reading: Reading) -> bool:
+    def _given_up(self, machine: StateMachine, reading: Reading) -> bool:
         """Whether nobody waits any longer for the last axis to open."""
         if machine.execution is not None:
             if machine.cycle - machine.entered_at < self._exit_cycles:
@@ -215,22 +222,22 @@ class ReplyPolicy:
             machine.stop(f"some axes did not open within {EXIT_TIMEOUT:g} s{alone}")
         return machine.stop_reason is not None
 
-    def _exit_due(self, machine: Machine) -> bool:
+    def _exit_due(self, machine: StateMachine) -> bool:
         """Whether the end of open mode is to be asked for once more.
 
         Raises:
-            ExitNotGranted: it was asked for, or the controller began it, too long ago.
+            ExitTimeout: it was asked for, or the controller began it, too long ago.
         """
         leaving = machine.cycle - machine.entered_at
         if leaving >= self._exit_cycles:
-            raise ExitNotGranted(leaving, machine.cycle)
+            raise ExitTimeout(leaving, machine.cycle)
         due = machine.cycle - max(self._asked_at, machine.entered_at) >= EXIT_RETRY_CYCLES
         if due:
             self._asked_at = machine.cycle
         return due
 
     def _open(
-        self, open_mode: OpenMode, machine: Machine, measured: Array, commanded: Array
+        self, open_mode: OpenMode, machine: StateMachine, measured: Array, commanded: Array
     ) -> bool:
         """The next set-point; says whether it was the last one."""
         execution, cycle = machine.execution, machine.cycle
@@ -275,7 +282,9 @@ class ReplyPolicy:
         ring.age[row] = 0 if ages is None else ages[self.wire.joint_slots].max(axis=0)
         self.wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def note_gap(self, unanswered: int, paused: bool, machine: Machine, reading: Reading) -> None:
+    def check_gap(
+        self, unanswered: int, paused: bool, machine: StateMachine, reading: Reading
+    ) -> None:
         """So many packets before this one were not answered, or it came late by the clock.
 
         After a long gap open mode goes on only where the controller carried it on, moving, at
@@ -283,7 +292,7 @@ class ReplyPolicy:
         the arm has to move as it was commanded to.
 
         Raises:
-            NotFinite, MotionNotCarriedOn, MotionHeld, MotionPaused: it did not.
+            NotFinite, SetPointNotAccepted, VelocityAfterGap, VelocityAfterPause: it did not.
         """
         open_mode = self._open_mode
         if open_mode is None:
@@ -312,7 +321,7 @@ class ReplyPolicy:
         return reading.answer.status
 
     def refuse(
-        self, machine: Machine, error: RefusalError, reading: Reading, words: Words
+        self, machine: StateMachine, error: RefusalError, reading: Reading, words: Words
     ) -> bytes:
         """Go to the faulted state and fill the frame accordingly; returns the status bytes."""
         machine.take(Input.REFUSAL)

@@ -70,11 +70,11 @@ from drivers.packets import (
 from drivers.record import CycleRing
 from drivers.replies import MODE, words_of
 from drivers.reply_policy import ReplyPolicy
-from drivers.state_machine import Machine
+from drivers.state_machine import StateMachine
 from drivers.states import CORRECTION_MODES, POSITION_MODES, Input, State
 
 
-class Tally:
+class PacketCounts:
     """Counts fates of packets.
 
     Attributes:
@@ -107,7 +107,7 @@ class Tally:
         return events
 
 
-class Sequence:
+class PacketSequence:
     """Follows the controller's numbers (1..0x7FFF, then 1 again) from the last one answered.
 
     A number at most `window` ahead is new; the window is what can be missed before silence ends
@@ -235,7 +235,7 @@ class Session:
                 "moved in modes 1, 4 and 5"
             )
         self.deadline = math.inf
-        self._tally = Tally()
+        self._tally = PacketCounts()
         self.counters: Counters = self._tally.counters
         self._drive_train = drive_train
         self._guard = guard
@@ -249,8 +249,8 @@ class Session:
         self._accept_init = accept_init
         self._other_axes = frozenset(other_axes)
         self._only_axis = only_axis
-        self._machine = Machine(self.counters)
-        self._sequence = Sequence()
+        self._machine = StateMachine(self.counters)
+        self._sequence = PacketSequence()
         self._policy: ReplyPolicy | None = None
         self._cold_start = False
         self._heard_at: float | None = None
@@ -462,14 +462,14 @@ class Session:
         policy.record(ring, row, reading, words, ages)
         refusal: RefusalError | None = None
         try:
-            machine.note_gap(missed, unanswered, self._max_gap)
+            machine.record_gap(missed, unanswered, self._max_gap)
             machine.require_axes(reading, self._mode)
             before = machine.state
             machine.take(reading.input)
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
             measured, commanded = ring.measured[row], ring.commanded[row]
-            policy.note_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
+            policy.check_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
             status = policy.answer(machine, reading, words, measured, commanded)
         except BaseException as error:
             # Whatever it was, the controller is asked to stop, by the answer that is due now.

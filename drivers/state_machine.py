@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.errors import AxisLeft, RequestError
+from drivers.errors import AxisNotInMode, RequestError
 from drivers.events import (
     AnswersLost,
     Counters,
@@ -47,7 +47,7 @@ LOSS_WINDOW: Final = 100
 """Cycles over which lost answers are added up."""
 
 
-class Machine:
+class StateMachine:
     """Walks the state table and says what that does to the motion.
 
     Args:
@@ -175,7 +175,7 @@ class Machine:
         if count > max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
 
-    def note_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
+    def record_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
         """`missed` packets never arrived; `unanswered` above `max_gap` end a motion on its path."""
         if missed:
             self.counters.missed += missed
@@ -187,7 +187,7 @@ class Machine:
         """A motion needs every wanted axis in its mode, from its beginning to its end.
 
         Raises:
-            AxisLeft: one is not.
+            AxisNotInMode: one is not.
         """
         execution = self.execution
         if execution is None or not reading.powered:
@@ -197,7 +197,7 @@ class Machine:
             joint = int(np.argmin(reading.ready))
         if joint is not None:
             found = int(reading.modes[joint])
-            raise AxisLeft(joint, found, Mode.CLOSED if found == mode else mode, self.cycle)
+            raise AxisNotInMode(joint, found, Mode.CLOSED if found == mode else mode, self.cycle)
 
     def begin_motion(self, position: Array) -> None:
         """The first set-point of the motion is `position`, (n,) rad.

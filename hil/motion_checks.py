@@ -9,7 +9,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.init_check import narrower, shown
+from drivers.init_check import float32_text, is_narrower
 from hil.cell import AngleFrame, Cell, CellError
 from identification.excitation import (
     CollisionChecker,
@@ -118,7 +118,7 @@ class MotionChecks:
         The narrower of the two count for each motor; these very checks where that is the cell's
         for all of them.
         """
-        below = narrower(controller_limits, self.currents.current_limit)
+        below = is_narrower(controller_limits, self.currents.current_limit)
         if not below.any():
             return self
         ours = self.currents.current_limit
@@ -170,8 +170,8 @@ class MotionChecks:
         if theirs == ours:
             return ""
         return (
-            f"; the controller announces {shown(theirs)} A as the limit of that motor, the cell "
-            f"file says {ours:.9g} A: write the controller's into [drive_train] current_limit"
+            f"; the controller announces {float32_text(theirs)} A as the limit of that motor, the "
+            f"cell file says {ours:.9g} A: write the controller's into [drive_train] current_limit"
         )
 
 

@@ -95,7 +95,7 @@ def _sort(event: _Mergeable) -> str:
 def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
     """Of two of the same sort."""
     if isinstance(earlier, PacketRejected) and isinstance(later, PacketRejected):
-        return PacketRejected(later.kind, earlier.count + later.count, later.why)
+        return PacketRejected(later.kind, earlier.count + later.count, later.reason)
     if isinstance(earlier, GapSeen) and isinstance(later, GapSeen):
         return GapSeen(earlier.missed + later.missed, later.cycle)
     assert isinstance(earlier, AnswersLost) and isinstance(later, AnswersLost)

@@ -73,7 +73,7 @@ def describe(event: ExchangeEvent) -> str:
         case PacketRejected(kind="answered late"):
             return f"{plural(event.count, 'answer')} left more than a cycle after their packet"
         case PacketRejected():
-            why = f" ({event.why})" if event.why else ""
+            why = f" ({event.reason})" if event.reason else ""
             return f"{plural(event.count, f'{event.kind} packet')} got no answer{why}"
         case LinkLost(stale=stale):
             packets = f"only {plural(stale, 'packet')} that cannot follow the last one"

@@ -239,10 +239,10 @@ class ExchangeView:
                     self.ended = event
                 case Refused():
                     self.refused = event
-                case PacketRejected() if event.why:
+                case PacketRejected() if event.reason:
                     self._rejected += event.count
                     packets = plural(self._rejected, "packet")
-                    self.not_understood = f"{packets} came and got no answer: {event.why}"
+                    self.not_understood = f"{packets} came and got no answer: {event.reason}"
                 case MotionStarted() | EventsLost():
                     self.began = True
                 case ExchangeFailed():

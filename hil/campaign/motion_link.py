@@ -14,7 +14,7 @@ from drivers.drive_train import DriveTrain
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange.event_log import ExchangeEvent
 from drivers.guard import Guard
-from drivers.init_check import InitCheck, compare, narrower, shown
+from drivers.init_check import InitCheck, compare, float32_text, is_narrower
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
@@ -356,9 +356,9 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
     theirs, ours = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
     unit = "A" if limit == "current_limit" else "motor revolutions"
     return tuple(
-        f"{cell.joint_names[joint]}: {shown(theirs[joint])} {unit} in the controller, "
+        f"{cell.joint_names[joint]}: {float32_text(theirs[joint])} {unit} in the controller, "
         f"{ours[joint]:.9g} in the cell file"
-        for joint in np.flatnonzero(narrower(theirs, np.array(ours)))
+        for joint in np.flatnonzero(is_narrower(theirs, np.array(ours)))
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import drivers.state_machine
 from drivers import Guard, State
-from drivers.state_machine import Machine
+from drivers.state_machine import StateMachine
 from drivers.states import TRANSITIONS, Input
 from tests.drivers.sources import Breaks, ScriptedMotion, smooth
 from tests.fuzz.draw import Draw
@@ -72,7 +72,7 @@ def disturb(talk: Conversation, column: int, value: float) -> None:
 def test_an_axis_that_closes_in_mid_motion_is_one_of_the_checks(monkeypatch):
     """Nothing is found with the check; without it, the axes that are left are held by a jump."""
     close_an_axis(in_motion(40, Breaks()))
-    monkeypatch.setattr(Machine, "require_axes", skip)
+    monkeypatch.setattr(StateMachine, "require_axes", skip)
     talk = in_motion(40, Breaks())
     with pytest.raises(AssertionError, match=r"velocity|acceleration|jerk"):
         close_an_axis(talk)

@@ -12,18 +12,18 @@ from drivers.errors import (
     AccelerationLimit,
     CommandedCurrentLimit,
     CommandedCurrentStep,
-    CorrectionNotCarriedOn,
     CorrectionNotEnded,
+    CorrectionUnconfirmed,
     CurrentLimit,
     FirstSetPoint,
     FollowingError,
     JerkLimit,
-    MotionHeld,
-    MotionNotCarriedOn,
-    MotionPaused,
     NotAtStandstill,
     NotFinite,
     PositionLimit,
+    SetPointNotAccepted,
+    VelocityAfterGap,
+    VelocityAfterPause,
     VelocityLimit,
     VelocityMismatch,
 )
@@ -341,7 +341,7 @@ EDGES_OF_FEEDBACK = {
     "arm at the start": (FirstSetPoint, 0.2, EXACT, start(1)),
     "velocity of the target at the start": (NotAtStandstill, 5e-4, 1.0, start(2)),
     "velocity of the arm at the start": (NotAtStandstill, 5e-4, 1.0, start(3)),
-    "target after a gap": (MotionNotCarriedOn, 0.2, EXACT, after_gap),
+    "target after a gap": (SetPointNotAccepted, 0.2, EXACT, after_gap),
 }
 """Thresholds of 2 revolutions and 20 A; a tenth of 2 revolutions and 5e-4 per cycle to begin."""
 
@@ -423,7 +423,9 @@ class TestAfterAGap:
             found[1] = step  # the arm does as commanded
             guard.check_after_gap(REST, found, REST, step, 1, EVERY)
             found[0] = step + at(joint, way * off * 1.001)
-            error = refused(MotionHeld, guard.check_after_gap, REST, found, REST, step, 3, EVERY)
+            error = refused(
+                VelocityAfterGap, guard.check_after_gap, REST, found, REST, step, 3, EVERY
+            )
             assert (error.joint, error.cycle) == (joint, 3)
             assert error.value == pytest.approx(1.001 * off)
             assert error.bound == pytest.approx(off)
@@ -436,7 +438,7 @@ class TestAfterAGap:
     ):
         guard, step = Guard(limits(), PERIOD), at(joint, sign * 4e-3)
         stands = np.array([step, at(joint, sign * 5e-4)])
-        error = refused(MotionHeld, guard.check_after_gap, REST, stands, REST, step, 3, EVERY)
+        error = refused(VelocityAfterGap, guard.check_after_gap, REST, stands, REST, step, 3, EVERY)
         assert error.joint == joint
         guard.check_after_gap(REST, stands, REST, step, 3, np.arange(N) != joint)
         lags = np.array([step, at(joint, sign * 5e-4 * 1.001)])
@@ -459,7 +461,7 @@ class TestAfterAPause:
         for way in (-1.0, 1.0):
             guard.check_after_pause(speed + at(joint, way * 0.999 * gain), 4, EVERY)
             other = speed + at(joint, way * 1.001 * gain)
-            error = refused(MotionPaused, guard.check_after_pause, other, 5, EVERY)
+            error = refused(VelocityAfterPause, guard.check_after_pause, other, 5, EVERY)
             assert (error.joint, error.cycle) == (joint, 5)
             assert error.bound == pytest.approx(gain)
             guard.check_after_pause(other, 5, np.arange(N) != joint)
@@ -694,7 +696,7 @@ class TestRest:
 
 @pytest.mark.parametrize(
     ("check", "error"),
-    [("check_end", CorrectionNotEnded), ("check_after_gap", CorrectionNotCarriedOn)],
+    [("check_end", CorrectionNotEnded), ("check_after_gap", CorrectionUnconfirmed)],
 )
 class TestZero:
     """A millionth of the limit: what rounding leaves. The limits are 2 rad/s and 20 A."""

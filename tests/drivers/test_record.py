@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from drivers import cycle_dtype, errors, events
 from drivers.errors import (
-    AxisLeft,
+    AxisNotInMode,
     CorrectionNotEnded,
     DriverError,
     DriveTrainError,
-    ExitNotGranted,
+    ExitTimeout,
     GuardError,
     ModeRefused,
     PacketError,
@@ -260,9 +260,9 @@ EXAMPLES = {
     TransportClosed: TransportClosed("gone"),
     RefusalError: RefusalError("why", 17),
     SourceFailed: SourceFailed("row 3", 4),
-    AxisLeft: AxisLeft(2, 0, 4, 99),
+    AxisNotInMode: AxisNotInMode(2, 0, 4, 99),
     ModeRefused: ModeRefused(2, 3, False, 99),
-    ExitNotGranted: ExitNotGranted(5000, 6000),
+    ExitTimeout: ExitTimeout(5000, 6000),
     errors.SessionFailed: errors.SessionFailed(ValueError("why"), 7),
     errors.TargetNotFinite: errors.TargetNotFinite(2, 6, float("inf"), 8),
 }

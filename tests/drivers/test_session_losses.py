@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 
 from drivers import (
-    AxisLeft,
+    AxisNotInMode,
     GapSeen,
     Guard,
     InitReceived,
     Mode,
     MotionEnded,
-    MotionHeld,
-    MotionNotCarriedOn,
-    MotionPaused,
     MotionStarted,
     NotFinite,
     RefusalError,
+    SetPointNotAccepted,
     State,
+    VelocityAfterGap,
+    VelocityAfterPause,
 )
 from drivers.events import AnswersLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS, SentSetPoints
 from drivers.packets import LAST_NUMBER
-from drivers.session import Sequence
+from drivers.session import PacketSequence
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests.drivers.rig import (
     MOVE,
@@ -98,7 +98,7 @@ class TestLostMotion:
     def test_one_axis_leaving_open_mode_while_moving_asks_for_drive_off(self):
         rig, _ = moving()
         rig.axes["mode"][2] = Mode.CLOSED
-        error = assert_refused(rig, rig.cycle(), AxisLeft)
+        error = assert_refused(rig, rig.cycle(), AxisNotInMode)
         assert (error.joint, error.mode, error.wanted) == (2, 0, 4)
 
     def test_one_axis_leaving_open_mode_while_held_lets_the_others_be_held(self):
@@ -245,7 +245,7 @@ class TestNextStep:
     def test_a_controller_that_takes_none_any_more_is_refused(self):
         rig = at_speed()
         answer = lose(rig, REPETITIONS + 2)
-        assert assert_refused(rig, answer, MotionNotCarriedOn).joint == 0
+        assert assert_refused(rig, answer, SetPointNotAccepted).joint == 0
 
 
 @pytest.mark.parametrize("lost", [1, 2])
@@ -316,7 +316,7 @@ class TestCarriedOn:
     @pytest.mark.parametrize("missed", [3, 4, 5])
     def test_more_than_a_quarter_of_the_threshold_is_not(self, missed):
         rig = self.carried_on(missed, max_gap=5)
-        error = assert_refused(rig, rig.cycle(), MotionNotCarriedOn)
+        error = assert_refused(rig, rig.cycle(), SetPointNotAccepted)
         assert (error.value, error.bound) == (pytest.approx(0.1 * missed, rel=1e-3), 0.25)
 
 
@@ -334,7 +334,7 @@ class TestAfterAGapWithoutAMotion:
     @pytest.mark.parametrize("leaving", [False, True])
     @pytest.mark.parametrize(
         ("columns", "off", "kind"),
-        [([0, 2], 1.9, MotionNotCarriedOn), ([1], 0.001, MotionHeld), ([], 0.0, None)],
+        [([0, 2], 1.9, SetPointNotAccepted), ([1], 0.001, VelocityAfterGap), ([], 0.0, None)],
     )
     def test_an_arm_is_held_on_only_where_it_was_and_at_rest(self, leaving, columns, off, kind):
         rig = opened(20)
@@ -434,7 +434,7 @@ class TestLongGaps:
     def test_a_controller_that_held_the_last_target_is_not_run_away_from(self):
         rig, source, answer = self.after_gap(3, self.held)
         step = 0.3 * 120.0 / (2.0 * np.pi) * PERIOD
-        error = assert_refused(rig, answer, MotionHeld)
+        error = assert_refused(rig, answer, VelocityAfterGap)
         assert isinstance(error, RefusalError)
         assert error.joint == 0
         assert error.value == pytest.approx(step, rel=1e-3)
@@ -444,7 +444,7 @@ class TestLongGaps:
     @pytest.mark.parametrize("factor", [0.0, 0.49, 1.51, -1.0, np.nan])
     def test_one_whose_target_velocity_is_another_is_not_run_away_from(self, factor):
         rig, _, answer = self.after_gap(3, lambda d: np.multiply.at(d, (0, 1), factor))
-        kind = MotionHeld if np.isfinite(factor) else NotFinite
+        kind = VelocityAfterGap if np.isfinite(factor) else NotFinite
         assert assert_refused(rig, answer, kind).joint == 0
 
     def test_a_target_carried_on_a_little_further_is_stopped_on_the_path(self):
@@ -530,7 +530,7 @@ class TestPauses:
         rig, _ = moving_at(share)
         rig.now += pause
         rig.axes["d"][:, 3] = 0.0
-        error = assert_refused(rig, rig.cycle(), MotionPaused)
+        error = assert_refused(rig, rig.cycle(), VelocityAfterPause)
         assert error.bound == pytest.approx(LAG * limits().acceleration[0])
 
     def test_an_arm_that_lags_behind_by_a_servo_is_driven_on(self):
@@ -556,7 +556,7 @@ class TestNumbers:
         [(0.0, 1), (0.9, 1), (1.9, 1), (500.0, 500), (HALF, HALF), (HALF + 1, HALF), (1e9, HALF)],
     )
     def test_those_within_a_window_ahead_are_new(self, window, ahead):
-        sequence = Sequence()
+        sequence = PacketSequence()
         sequence.restart(10, window)
         assert sequence.is_duplicate(10)
         for number in (9, 10, 11 + ahead, LAST_NUMBER):
@@ -565,7 +565,7 @@ class TestNumbers:
             assert not sequence.is_stale(number)
 
     def test_after_a_silence_the_same_number_is_new(self):
-        sequence = Sequence()
+        sequence = PacketSequence()
         sequence.restart(10, 500.0)
         sequence.broken = True
         assert not sequence.is_duplicate(10)
@@ -574,8 +574,8 @@ class TestNumbers:
         assert sequence.is_duplicate(10)
 
     def test_before_the_init_packet_half_of_them_count_as_missed(self):
-        assert Sequence().accept(self.HALF) == self.HALF - 1
-        assert Sequence().accept(self.HALF + 1) == 0
+        assert PacketSequence().accept(self.HALF) == self.HALF - 1
+        assert PacketSequence().accept(self.HALF + 1) == 0
 
 
 class TestCorruptedNumbers:
@@ -661,8 +661,8 @@ class Sent:
     def refuses(self, ahead: float, missed: int = 0) -> bool:
         try:
             self.check(ahead, missed)
-        except MotionNotCarriedOn as error:
-            assert (type(error), error.joint, error.cycle) == (MotionNotCarriedOn, 1, 7)
+        except SetPointNotAccepted as error:
+            assert (type(error), error.joint, error.cycle) == (SetPointNotAccepted, 1, 7)
             return True
         return False
 
@@ -714,7 +714,7 @@ class TestWhere:
         sent, others = Sent(0.24), np.arange(N) != 1
         assert sent.check(9.0, where=others) == 0
         assert sent.check(-1.0, where=others) == 0
-        with pytest.raises(MotionNotCarriedOn):
+        with pytest.raises(SetPointNotAccepted):
             sent.check(9.0, where=~others)
 
 

@@ -23,8 +23,8 @@ from drivers import (
 from drivers.errors import (
     CommandedCurrentLimit,
     CommandedCurrentStep,
-    CorrectionNotCarriedOn,
     CorrectionNotEnded,
+    CorrectionUnconfirmed,
 )
 from drivers.packets import DRIVE_ON, MODE_FIELDS
 from drivers.states import CORRECTION_MODES, HOLDABLE, INCREMENTAL, POSITION_MODES
@@ -393,7 +393,7 @@ class TestCorrections:
         rig.cycle()
         assert rig.state is State.OPEN
         rig.miss(3)
-        assert_refused(rig, rig.cycle(), CorrectionNotCarriedOn)
+        assert_refused(rig, rig.cycle(), CorrectionUnconfirmed)
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
     def test_after_a_long_gap_one_that_was_zero_is_ended(self, mode):

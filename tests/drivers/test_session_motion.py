@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from drivers import (
-    AxisLeft,
+    AxisNotInMode,
     Mode,
     MotionEnded,
-    MotionHeld,
     MotionStarted,
     State,
+    VelocityAfterGap,
 )
-from drivers.errors import FirstSetPointUnknown, MotionUnknown
+from drivers.errors import AgeAfterGap, FirstSetPointUnknown
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
     MOVE,
@@ -230,14 +230,14 @@ class TestOnlyAxis:
     @pytest.mark.parametrize("joint", range(1, N))
     def test_a_motion_of_another_joint_is_refused(self, joint):
         rig, _ = self.moving(0, joint, cycles=300)
-        assert type(rig.refusal) is AxisLeft
+        assert type(rig.refusal) is AxisNotInMode
         assert (rig.refusal.joint, rig.refusal.mode) == (joint, Mode.CLOSED)
 
     def test_another_axis_that_opens_ends_the_motion(self):
         rig, _ = self.moving(0, cycles=1)
         rig.modes[2] = Mode.POSITION
         rig.cycle()
-        assert type(rig.refusal) is AxisLeft
+        assert type(rig.refusal) is AxisNotInMode
         assert rig.refusal.joint == 2
 
 
@@ -369,8 +369,8 @@ class TestAgesAfterGaps:
     @pytest.mark.parametrize("column", [D1, D2, D4])
     def test_a_velocity_from_before_the_gap_says_nothing_about_it(self, column):
         rig, source, answer = self.after(3, column, 1)
-        error = assert_refused(rig, answer, MotionUnknown)
-        assert isinstance(error, MotionHeld)
+        error = assert_refused(rig, answer, AgeAfterGap)
+        assert isinstance(error, VelocityAfterGap)
         assert (error.joint, error.value, error.unit) == (2, 1.0, "cycles")
         assert source.advances == 305
 
@@ -394,7 +394,7 @@ class TestAgesAfterGaps:
         rig.cycle()
         rig.miss(10)
         assert all_drive_off(rig.cycle())
-        assert type(rig.refusal) is MotionUnknown
+        assert type(rig.refusal) is AgeAfterGap
 
 
 class TestTargetsGivenBack:

@@ -14,21 +14,21 @@ from drivers import (
     LinkLost,
     Mode,
     ModeRefused,
-    MotionNotCarriedOn,
     MotionStarted,
     NotAtStandstill,
     NotFinite,
     RefusalError,
     Refused,
     RequestError,
+    SetPointNotAccepted,
     SourceFailed,
     State,
     reply_policy,
 )
 from drivers.errors import (
-    ExitNotGranted,
+    AgeAfterGap,
+    ExitTimeout,
     FirstSetPointUnknown,
-    MotionUnknown,
     TargetNotFinite,
 )
 from drivers.events import AnswersLost
@@ -202,8 +202,8 @@ class TestFeedback:
             *((of, [2], 1.99, 2.01, FollowingError) for of in FOLLOWING),
             # The controller may have missed our answers; the arm counts, not its target.
             *((of, [0, 2], 0.19, 2.01, FollowingError) for of in ("moving", "leaving")),
-            *((of, [0, 2], 0.19, 0.21, MotionNotCarriedOn) for of in FOLLOWING),
-            *((of, [0], 0.19, 0.21, MotionNotCarriedOn) for of in FOLLOWING),
+            *((of, [0, 2], 0.19, 0.21, SetPointNotAccepted) for of in FOLLOWING),
+            *((of, [0], 0.19, 0.21, SetPointNotAccepted) for of in FOLLOWING),
             *((of, [4], 19.9, 20.1, CurrentLimit) for of in FOLLOWING),
             *((of, [column], 0.0, np.nan, NotFinite) for of in FOLLOWING for column in (0, 2, 4)),
         ],
@@ -521,7 +521,7 @@ class TestLeaving:
             asked += [cycle] if rig.exits_asked > len(asked) else []
             assert rig.state is (State.EXITING if cycle < self.TIMEOUT else State.FAULTED)
         assert asked == [0, self.RETRY, 2 * self.RETRY]
-        assert type(rig.refusal) is ExitNotGranted
+        assert type(rig.refusal) is ExitTimeout
         assert rig.refusal.cycles == self.TIMEOUT
 
     def test_where_the_controller_began_to_leave_it_is_asked_after_as_long(self):
@@ -694,7 +694,7 @@ class TestAges:
         rig.cycle()
         assert bool(rig.seen(Refused)) == refused
         if refused:
-            assert type(rig.refusal) is MotionUnknown
+            assert type(rig.refusal) is AgeAfterGap
 
     def test_a_target_not_sent_in_each_cycle_may_have_moved_for_all_of_them(self):
         """Mode 7 holds target and offset together to the velocity of the joint, here 2 rad/s."""
@@ -757,7 +757,7 @@ class TestExitNotGranted:
             assert rig.state is State.EXITING
             rig.miss(399)
             answer = rig.cycle()
-        assert_refused(rig, answer, ExitNotGranted)
+        assert_refused(rig, answer, ExitTimeout)
 
     def test_exit_is_asked_for_again_however_the_gaps_fall(self):
         rig = exiting()

@@ -20,7 +20,7 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import AnnouncedLimits, InitCheck, compare, narrower, shown
+from drivers.init_check import ControllerLimits, InitCheck, compare, float32_text, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_answer
 from drivers.session import MAX_GAP
@@ -348,14 +348,14 @@ class TestReasons:
         rig = Rig()
         for _ in range(40):
             rig.send(bytes(12))
-        whys = {event.why for event in rig.seen(PacketRejected)}
+        whys = {event.reason for event in rig.seen(PacketRejected)}
         assert whys == {"12 bytes: packet number is 0; expected 1..32767"}
 
     def test_a_packet_of_a_session_that_began_before(self):
         rig = Rig()
         rig.number = 500
         rig.cycle()
-        assert "no drive on before init" in rig.seen(PacketRejected)[-1].why
+        assert "no drive on before init" in rig.seen(PacketRejected)[-1].reason
 
     def test_packets_that_do_not_follow_are_not_silence(self):
         rig = Rig()
@@ -368,7 +368,7 @@ class TestReasons:
         rig.events += rig.session.events()
         assert [event.stale for event in rig.seen(LinkLost)] == [30]
         assert rig.ended.reason == "only packets that do not follow the last one came (30)"
-        assert rig.seen(PacketRejected)[-1].why.endswith("does not follow 11")
+        assert rig.seen(PacketRejected)[-1].reason.endswith("does not follow 11")
 
 
 def test_the_same_packet_after_a_silence_is_answered_anew():
@@ -630,7 +630,7 @@ class TestAcceptedInit:
     ],
 )
 def test_a_limit_is_narrower_only_by_more_than_six_digits_round(theirs, ours, below):
-    assert narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
+    assert is_narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
 
 
 COUPLING = (0.02, 0.003, 0.04)
@@ -711,16 +711,16 @@ def test_what_is_too_far_off_cannot_be_accepted(changes, words):
 def test_limits_are_those_of_the_arm_and_of_its_joints():
     tell = {"current_limit": np.arange(1.0, 7.0), "following_error": np.arange(11.0, 17.0)}
     init = InitPacket.build(6, 2, tell)
-    found = AnnouncedLimits.of(init, 1, 4)
+    found = ControllerLimits.of(init, 1, 4)
     np.testing.assert_array_equal(found.current, [1.0, 2.0, 3.0, 4.0])
     np.testing.assert_array_equal(found.following_error, [11.0, 12.0, 13.0, 14.0])
     assert found.current.dtype == found.following_error.dtype == np.float64
-    other = AnnouncedLimits.of(init, 2, 4)
+    other = ControllerLimits.of(init, 2, 4)
     assert not np.array_equal(other.current, found.current)
 
 
 def test_a_figure_of_the_wire_is_shown_in_as_few_digits_as_are_that_figure():
-    shortest = [shown(np.float32(value)) for value in (5.0, -120.0, 0.1, 2.5)]
+    shortest = [float32_text(np.float32(value)) for value in (5.0, -120.0, 0.1, 2.5)]
     assert shortest == ["5", "-120", "0.1", "2.5"]
     for value in np.random.default_rng(1).uniform(0.1, 50.0, 200).astype(np.float32):
-        assert np.float32(shown(value)) == value
+        assert np.float32(float32_text(value)) == value

@@ -17,8 +17,8 @@ from drivers.exchange.loop import ReceiveQueue
 from drivers.execution import Execution
 from drivers.guard import Guard
 from drivers.reply_policy import ReplyPolicy
-from drivers.session import Sequence
-from drivers.state_machine import Machine
+from drivers.session import PacketSequence
+from drivers.state_machine import StateMachine
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.run import Runner
@@ -39,16 +39,16 @@ def stage() -> Iterator[Stage]:
 
 
 def answers_duplicates_anew(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Sequence, "is_duplicate", lambda self, number: False)
-    patch.setattr(Sequence, "is_stale", lambda self, number: False)
+    patch.setattr(PacketSequence, "is_duplicate", lambda self, number: False)
+    patch.setattr(PacketSequence, "is_stale", lambda self, number: False)
 
 
 def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
     """After a gap the motion makes up for it, and the guard does not look at speeds."""
     advance, gap = TrajectoryPlayer.advance, [0]
-    note_gap = Machine.note_gap
+    note_gap = StateMachine.record_gap
 
-    def noted(self: Machine, missed: int, unanswered: int, max_gap: int) -> None:
+    def noted(self: StateMachine, missed: int, unanswered: int, max_gap: int) -> None:
         gap[0] = missed
         note_gap(self, missed, unanswered, max_gap)
 
@@ -58,19 +58,21 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
         gap[0] = 0
         return advance(self)
 
-    patch.setattr(Machine, "note_gap", noted)
+    patch.setattr(StateMachine, "record_gap", noted)
     patch.setattr(TrajectoryPlayer, "advance", advanced)
     patch.setattr(Guard, "check_set_point", lambda *arguments: None)
 
 
 def goes_on_after_a_gap(patch: pytest.MonkeyPatch) -> None:
     """The motion is neither stopped nor compared, however many packets were missed."""
-    note_gap, compare = Machine.note_gap, ReplyPolicy.note_gap
+    note_gap, compare = StateMachine.record_gap, ReplyPolicy.check_gap
     patch.setattr(
-        Machine, "note_gap", lambda self, missed, unanswered, most: note_gap(self, missed, 0, most)
+        StateMachine,
+        "record_gap",
+        lambda self, missed, unanswered, most: note_gap(self, missed, 0, most),
     )
     patch.setattr(
-        ReplyPolicy, "note_gap", lambda self, unanswered, *others: compare(self, 0, *others)
+        ReplyPolicy, "check_gap", lambda self, unanswered, *others: compare(self, 0, *others)
     )
 
 
