@@ -29,9 +29,9 @@ from typing import Any, TypeVar
 
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.run import reidentify
-from hil.batch.types import BatchResult, Broken
+from hil.batch.types import BatchResult, Unused
 from hil.batch.workers import ArchiveTask, Done, LocalWorkers, Workers, run_task
 from hil.identify.options import FIXED
 from hil.progress import Silent
@@ -44,12 +44,12 @@ _CAMPAIGN = 25  # repetitions
 class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
-    near = True
+    local = True
     count = 1
 
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Broken]:
+    ) -> Iterator[T | Unused]:
         """See `hil.batch.workers.Workers`."""
         del done
         return map(run_task, tasks)
@@ -149,8 +149,8 @@ def _measured(campaigns: Sequence[Path], workers: int | None) -> dict[str, Any]:
 
 
 def _run(places: Sequence[str], cache: Path, estimator: Any, workers: Workers) -> BatchResult:
-    options, where = replace(FIXED, estimator=estimator), Where(str(cache))
-    return reidentify(places, options, workers, Silent(), where=where)
+    options, location = replace(FIXED, estimator=estimator), CacheLocation(str(cache))
+    return reidentify(places, options, workers, Silent(), cache=location)
 
 
 def _timed(

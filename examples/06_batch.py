@@ -10,9 +10,10 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 from hil import Campaign, Cell
-from hil.batch.run import Plan, reidentify
+from hil.batch.run import reidentify
 from hil.batch.workers import LocalWorkers
 from hil.campaign import design
+from hil.identify.options import Options
 from hil.progress import Silent
 
 HERE = Path(__file__).parent
@@ -34,7 +35,7 @@ def main() -> None:
     """Record, re-identify, draw."""
     with TemporaryDirectory() as folder, LocalWorkers(2) as workers:
         record(Path(folder))
-        result = reidentify([folder], Plan(), workers, Silent())
+        result = reidentify([folder], Options(), workers, Silent())
     figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
     for level in result.campaigns:
         month = Path(level.campaign).name

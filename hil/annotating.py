@@ -15,7 +15,7 @@ from hil.archive import Archive, open_archive, schema
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.writer import register
 from hil.errors import InputError
-from hil.files import make_folder, write_together
+from hil.files import make_folder, write_files
 from hil.identify import Identification
 from hil.identify.sources import Source
 from hil.progress import Reporter
@@ -50,7 +50,7 @@ def annotate(found: Identification, output: Path, reporter: Reporter) -> list[Pa
     make_folder(folder)
     with reporter.task("annotating archives", len(predictions)) as task:
         for path, prediction in predictions.items():
-            write_together(folder, {path.name: annotated(open_archive(path), prediction)})
+            write_files(folder, {path.name: annotated(open_archive(path), prediction)})
             task.advance(1, path.name)
     reporter.say(f"copies with predicted torque: {folder}")
     return [folder / name for name in names]

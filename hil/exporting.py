@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from hil.errors import InputError
-from hil.files import make_folder, write_together
+from hil.files import make_folder, write_files
 from hil.identify import Identification
 from hil.identify.surroundings import torque_limits
 from hil.outcome import provenance_of
@@ -153,7 +153,7 @@ def export_model(
         comparison: Comparison | str = compare(text, form, arm, motion)
     except MissingMujocoError as error:
         comparison = str(error)
-    write_together(output.parent, {output.name: text})
+    write_files(output.parent, {output.name: text})
     spread = None
     if ensemble:
         variants = sample_ensemble(arm.model, pooled, ensemble, seed)
@@ -202,7 +202,7 @@ def _write_variants(
         variant = Arm(arm.urdf, arm.model, standard, values, arm.ranges)
         name = f"{k:0{width}d}"
         files[name + form.suffix] = form.write(variant, f"{output.stem}_{name}", remarks)
-    write_together(folder, files)
+    write_files(folder, files)
 
 
 def _motion(found: Identification) -> Motion:

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from hil.errors import InputError, OutputError
-from hil.reading import opened
+from hil.reading import open_file
 
 
 def make_folder(path: Path) -> None:
@@ -36,7 +36,7 @@ def make_folder(path: Path) -> None:
 
 
 @contextmanager
-def exclusive_folder(root: Path, work: str, option: str) -> Iterator[None]:
+def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
     """Make a folder, and keep every other process with the same work out of it until this is left.
 
     The lock is on the folder itself, which nobody removes, and goes with this process. `work` is a
@@ -56,19 +56,19 @@ def exclusive_folder(root: Path, work: str, option: str) -> Iterator[None]:
             remedy = f"name a folder on a disk of this PC ({option})"
         return InputError(root, problem, remedy=remedy)
 
-    with locked(root, refusal):
+    with file_lock(root, refusal):
         yield
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
-    with replacing(path, path.with_suffix(path.suffix + ".tmp")) as temporary:
+    with replace_file(path, path.with_suffix(path.suffix + ".tmp")) as temporary:
         _write_through(temporary, content)
     _sync(path.parent)
 
 
 @contextmanager
-def replacing(path: Path, temporary: Path | None = None) -> Iterator[Path]:
+def replace_file(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """Replace `path` by what is written to the yielded name beside it; keep it if that fails."""
     temporary = temporary or path.with_name(f".{path.name[:200]}.{token_hex(4)}.tmp")
     try:
@@ -80,7 +80,7 @@ def replacing(path: Path, temporary: Path | None = None) -> Iterator[Path]:
         raise
 
 
-def write_or_tell(path: Path, content: str | bytes) -> None:
+def write_output(path: Path, content: str | bytes) -> None:
     """As `write_atomically`, with an error of ours.
 
     Raises:
@@ -94,7 +94,7 @@ def write_or_tell(path: Path, content: str | bytes) -> None:
 
 
 @contextmanager
-def writing_to(folder: Path) -> Iterator[None]:
+def convert_write_errors(folder: Path) -> Iterator[None]:
     """Tell in words what a disk refuses meanwhile.
 
     Raises:
@@ -108,7 +108,7 @@ def writing_to(folder: Path) -> Iterator[None]:
         raise InputError(folder, problem, remedy=remedy) from error
 
 
-def write_together(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
+def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
     """Replace several files of a folder, or none of them.
 
     All are written beside the old ones first. These are held until the last is in its place, and
@@ -222,12 +222,12 @@ def file_digest(path: Path) -> str:
     Raises:
         OSError: there is none, it is no regular file, or it cannot be read.
     """
-    with opened(path) as stream:
+    with open_file(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager
-def locked(
+def file_lock(
     path: Path, refusal: Callable[[OSError], Exception], *, patience: float = 0.0
 ) -> Iterator[None]:
     """Hold an exclusive lock until this is left.

@@ -13,10 +13,10 @@ import numpy as np
 
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.files import file_digest, write_together
+from hil.files import file_digest, write_files
 from hil.identify import Identification
 from hil.progress import Reporter
-from hil.reading import opened
+from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
@@ -52,7 +52,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         SERIES: _series_bytes(found.series),
         REPORT: report_bytes(results, found.series),
     }
-    write_together(folder, files)
+    write_files(folder, files)
     for name, why in exports.withheld.items():
         reporter.say(f"{name} was not written: {why}")
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
@@ -76,7 +76,7 @@ def rewrite_report(folder: Path) -> Results:
         problem = f"holds what no page can be drawn from ({error})"
         remedy = "identify again from the archives (`hil identify`)"
         raise InputError(folder / RESULTS, problem, remedy=remedy) from error
-    write_together(folder, {REPORT: page})
+    write_files(folder, {REPORT: page})
     return results
 
 
@@ -98,7 +98,7 @@ def report_replay(
         return
     series = replay(_load_series(folder / SERIES, len(there.joint_names)))
     pages = {SERIES: _series_bytes(series), REPORT: report_bytes(there, series)}
-    write_together(folder, pages)
+    write_files(folder, pages)
     reporter.say(f"report: {folder / REPORT}")
 
 
@@ -111,7 +111,7 @@ def _series_bytes(series: ReportSeries) -> bytes:
 
 def _load_series(path: Path, n_joints: int) -> ReportSeries:
     try:
-        with opened(path) as stream:
+        with open_file(path) as stream:
             with zipfile.ZipFile(stream) as members:
                 size = sum(member.file_size for member in members.infolist())
             if size > _LARGEST:

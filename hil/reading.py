@@ -23,7 +23,7 @@ _LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
 """Of the years that calendars, time zones and figures agree on."""
 
 
-def instant(when: str) -> datetime | None:
+def parse_time(when: str) -> datetime | None:
     """The moment of an ISO 8601 text, in UTC; None where it is none, or no robot's."""
     try:
         at = datetime.fromisoformat(when)
@@ -33,22 +33,22 @@ def instant(when: str) -> datetime | None:
     return at if _FIRST <= at < _LAST else None
 
 
-LAST_PORT: Final = 65535
+LARGEST_PORT: Final = 65535
 _MOST_DIGITS: Final = 18
 """So that 64 bits hold it, and Python reads it at all."""
 
 
-def whole_number(text: str | None) -> int | None:
+def parse_count(text: str | None) -> int | None:
     """A number of 0 or more; None where the text is none, or longer than anything is counted."""
     if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MOST_DIGITS:
         return None
     return int(text)
 
 
-def port_number(text: str) -> int | None:
+def parse_port(text: str) -> int | None:
     """The number of a UDP or TCP port, 1 to 65535; None where the text is none."""
-    port = whole_number(text)
-    return port if port is not None and 0 < port <= LAST_PORT else None
+    port = parse_count(text)
+    return port if port is not None and 0 < port <= LARGEST_PORT else None
 
 
 LONGEST_TEXT: Final = 1 << 28
@@ -64,7 +64,7 @@ _ABSENT: Final = frozenset(
 )
 
 
-def opened(path: Path) -> BufferedReader:
+def open_file(path: Path) -> BufferedReader:
     """A file of bytes, to be read.
 
     Raises:
@@ -86,53 +86,53 @@ def opened(path: Path) -> BufferedReader:
         raise
 
 
-def text_of(path: Path, longest: int = LONGEST_TEXT) -> str:
+def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
     """A text file as a whole, any line ends as one.
 
     Raises:
-        OSError: as `opened`; or it has more bytes than `longest`.
+        OSError: as `open_file`; or it has more bytes than `longest`.
         UnicodeDecodeError: it is no UTF-8.
     """
-    with opened(path) as stream:
+    with open_file(path) as stream:
         if os.fstat(stream.fileno()).st_size > longest:
             raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
         text = stream.read().decode("utf-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def is_no_file(trouble: OSError) -> bool:
-    """Whether what `opened` refuses is no file at all; any other trouble may be gone next time."""
+def is_not_a_file(trouble: OSError) -> bool:
+    """Return whether the error says that there is no regular file, not that reading failed."""
     return trouble.errno in _ABSENT
 
 
-def lies_there(path: Path) -> bool:
+def path_exists(path: Path) -> bool:
     """Whether anything lies there: a link that leads nowhere does, and is no absent file."""
     return path.is_symlink() or path.exists()
 
 
-def remedy_of(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
-    """What a person can do who named what `text_of` refuses."""
+def _remedy(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
+    """What a person can do who named what `read_text` refuses."""
     if isinstance(trouble, UnicodeDecodeError):
         return "save it as UTF-8"
     return "write it to a file first, and name that" if trouble.strerror == _NO_FILE else otherwise
 
 
-def named_text(path: Path, otherwise: str = "name another file") -> str:
+def read_input(path: Path, otherwise: str = "name another file") -> str:
     """The text of a file that a person named.
 
     Raises:
         InputError: it cannot be read; the remedy is `otherwise` unless the reason suggests one.
     """
     try:
-        return text_of(path)
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise InputError(
-            path, f"cannot be read ({why})", remedy=remedy_of(error, otherwise)
+            path, f"cannot be read ({why})", remedy=_remedy(error, otherwise)
         ) from error
 
 
-def json_of(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """What a JSON text holds.
 
     Raises:
@@ -144,7 +144,7 @@ def json_of(text: str | bytes) -> Any:
         raise ValueError("it is nested too deep") from error
 
 
-def toml_of(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> dict[str, Any]:
     """What a TOML text holds.
 
     Raises:

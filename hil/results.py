@@ -25,7 +25,7 @@ from pydantic import (
 )
 
 from hil.errors import InputError
-from hil.reading import json_of, text_of
+from hil.reading import parse_json, read_text
 
 
 class Frozen(BaseModel):
@@ -576,8 +576,8 @@ class Results(Frozen):
             return InputError(path, problem, field=field, remedy=again)
 
         try:
-            text = text_of(path)
-            found = json_of(text)
+            text = read_text(path)
+            found = parse_json(text)
         except (OSError, ValueError) as error:
             raise refusal(f"cannot be read as a result ({error})") from error
         version = found.get("schema_version") if isinstance(found, dict) else None

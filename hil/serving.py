@@ -16,7 +16,7 @@ from typing import Final, Literal
 from drivers.errors import DriverError
 from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
-from hil.reading import port_number
+from hil.reading import parse_port
 from sim_fixtures import ControllerSettings, SimulatedController, serve
 from sim_fixtures.errors import PlantDiverged
 from sim_fixtures.program import Phase
@@ -42,7 +42,7 @@ def open_controller_link(
     if can is not None:
         return _bus(can, settings, n_axes)
     host, _, port_text = (udp or "").rpartition(":")
-    port = port_number(port_text)
+    port = parse_port(port_text)
     if not host or port is None:
         remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
         raise InputError(None, f"--udp {udp!r} is not an address", remedy=remedy)

@@ -83,7 +83,7 @@ class Check:
     repaired: bool
 
     @property
-    def keeps(self) -> bool:
+    def conforms(self) -> bool:
         """Whether all aspects of the profile are sound."""
         return not self.faults
 

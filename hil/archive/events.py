@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from hil.archive.cdr import ENCAPSULATION, LayoutError
-from hil.reading import json_of
+from hil.reading import parse_json
 
 _HEAD = struct.Struct("<iIB")  # seconds, nanoseconds, level
 
@@ -97,7 +97,7 @@ class ArchivedEvent:
         text, _, second = whole.partition("\n")
         data: Any = None
         with suppress(ValueError):
-            data = json_of(second)
+            data = parse_json(second)
         if not isinstance(data, dict):
             text, data = whole, {}
         known = max((one for one in Level if one <= level), default=Level.DEBUG)

@@ -31,7 +31,7 @@ from pydantic import (
     field_validator,
 )
 
-from hil.reading import whole_number
+from hil.reading import parse_count
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"
@@ -164,7 +164,7 @@ _UNREADABLE: Final[Mapping[str, Any]] = {
 _Name = Annotated[str, AfterValidator(_printable)]
 _Names = Json[tuple[_Name, ...]]
 _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Count = Annotated[int | None, BeforeValidator(whole_number)]
+_Count = Annotated[int | None, BeforeValidator(parse_count)]
 
 
 class ArchiveHeader(BaseModel):

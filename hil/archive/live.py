@@ -41,7 +41,7 @@ import re
 from typing import Self
 
 from hil.errors import InputError
-from hil.reading import LAST_PORT
+from hil.reading import LARGEST_PORT
 
 LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8765
@@ -77,7 +77,7 @@ class LiveView:
             LiveViewError: it is neither.
         """
         match = _ADDRESS.fullmatch(text.strip())
-        if match is None or int(match["port"]) > LAST_PORT:
+        if match is None or int(match["port"]) > LARGEST_PORT:
             remedy = f"e.g. {LOOPBACK}:{PORT}"
             raise LiveViewError(None, f"--live {text} is no HOST:PORT", remedy=remedy)
         return cls((match["host"] or LOOPBACK).strip("[]"), int(match["port"]))

@@ -22,7 +22,7 @@ from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveO
 from hil.archive.scan import ALWAYS, NUMBERS, Scan
 from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
-from hil.reading import json_of, opened
+from hil.reading import open_file, parse_json
 
 _COLUMN_OF: Final = {"effort": "torque"}  # where a message has another word for it than we
 _REMEDIES: Final = {
@@ -147,7 +147,7 @@ class Archive:
             ArchiveError: it is no JSON object.
         """
         try:
-            found = json_of(self.attachments.get(name, b"{}"))
+            found = parse_json(self.attachments.get(name, b"{}"))
         except ValueError:
             found = None
         if not isinstance(found, dict):
@@ -318,7 +318,7 @@ def open_archive(
     )
     content = _Content(fields, topics, times)
     try:
-        with opened(path) as stream:
+        with open_file(path) as stream:
             scan = Scan(stream, content.visit, topics=topics, times=times)
     except OSError as error:
         raise refusal(path, error) from error

@@ -24,8 +24,8 @@ from hil.archive.mcap_writer import McapWriter, entries_of, span
 from hil.archive.reader import open_archive, refusal
 from hil.archive.scan import Scan
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
-from hil.files import replacing, sync_folder
-from hil.reading import opened
+from hil.files import replace_file, sync_folder
+from hil.reading import open_file
 
 Visit = Callable[[Scan, Mapping[str, Messages], int], None]
 
@@ -41,7 +41,7 @@ def survey(path: Path, visit: Visit = lambda *_: None) -> Scan:
         ArchiveError: it cannot be read.
     """
     try:
-        with opened(path) as stream:
+        with open_file(path) as stream:
             return Scan(stream, visit, past_damage=True)
     except OSError as error:
         raise refusal(path, error) from error
@@ -143,7 +143,7 @@ def is_indexed(path: Path, found: Scan) -> bool:
         path: the file.
         found: what is in it, without a fault.
     """
-    with opened(path) as stream, opened(path) as other:
+    with open_file(path) as stream, open_file(path) as other:
         same = True
 
         def compare(data: bytes) -> None:
@@ -172,7 +172,7 @@ def _rewrite(
         ArchiveError: what was written cannot be read back; it is thrown away.
     """
     try:
-        with path.open("rb") as stream, replacing(target) as temporary:
+        with path.open("rb") as stream, replace_file(target) as temporary:
             with temporary.open("xb") as output:
                 os.fchmod(output.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode))
                 _copy(found, stream, output.write, outcome)

@@ -28,10 +28,10 @@ import drivers
 import hil
 import identification
 from hil.cell import Cell
-from hil.files import digest, json_digest, replacing
+from hil.files import digest, json_digest, replace_file
 from hil.identify.options import Options
 from hil.identify.settings import Settings
-from hil.reading import opened
+from hil.reading import open_file
 from identification.estimators.consistent import Shrinkage
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
@@ -63,7 +63,7 @@ LIBRARIES: Final = ("numpy", "scipy", "pin")
 
 
 @dataclass(frozen=True)
-class Where:
+class CacheLocation:
     """Which folder caches what belongs to an archive."""
 
     #: of the whole cache; None: beside each archive, and below the user's own cache folder (XDG)
@@ -99,7 +99,7 @@ class Store:
         if self.folder is None:
             return None
         try:
-            with opened(self._path(key)) as file:
+            with open_file(self._path(key)) as file:
                 found = decoded(file.read(), key)
         except OSError:
             return None
@@ -121,7 +121,7 @@ class Store:
         # No fsync: what a power cut damages fails its checksum and is made anew.
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as temporary, temporary.open("xb") as file:
+            with replace_file(path) as temporary, temporary.open("xb") as file:
                 file.write(encoded(key, content))
         except OSError as error:
             raise CacheError(

@@ -23,7 +23,7 @@ from hil.errors import HilError, InputError
 from hil.version import install_command
 
 from .cache import LIBRARIES, code_digest
-from .types import Broken
+from .types import Unused
 from .workers import (
     TIMEOUT,
     ArchiveTask,
@@ -43,7 +43,7 @@ _RETRIES: Final = 3
 _AHEAD: Final = 8
 """Tasks given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
 
-_LOST: Final = Broken("", "ended every worker that read it")
+_LOST: Final = Unused("", "ended every worker that read it")
 
 
 class ClusterError(HilError):
@@ -61,17 +61,17 @@ class DaskWorkers(Workers):
         ClusterError: no worker joins in time, or one has other software.
     """
 
-    near = False
+    local = False
 
     def __init__(self, address: str, *, timeout: float = TIMEOUT, patience: float = 30.0) -> None:
         self._patience = patience
         self._client = _connected(address, patience)
-        expected = software()
-        self._work = partial(perform, timeout=timeout, expected=expected)
+        expected = software_versions()
+        self._work = partial(perform_task, timeout=timeout, expected=expected)
         try:
             self._client.wait_for_workers(1, timeout=patience)
-            for worker, found in self._on_all(software).items():
-                if apart := differences(expected, found):
+            for worker, found in self._on_all(software_versions).items():
+                if apart := version_differences(expected, found):
                     raise ClusterError(
                         f"the worker {worker} has other software than this machine ({apart}); "
                         "install the same hil and constraints.txt on both, and start it again"
@@ -114,7 +114,7 @@ class DaskWorkers(Workers):
 
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Broken]:
+    ) -> Iterator[T | Unused]:
         """See :class:`Workers`.
 
         Raises:
@@ -139,7 +139,7 @@ class DaskWorkers(Workers):
                     result = self._result(self._begin(task))
                 if done is not None:
                     done(1)
-                yield Broken(task.path, _LOST.reason) if result is _LOST else result
+                yield Unused(task.path, _LOST.reason) if result is _LOST else result
         finally:
             if self._connected:
                 self._client.cancel([future for _, future in begun])
@@ -215,13 +215,13 @@ def _connected(address: str, patience: float) -> Any:
 # On a worker
 
 
-def software() -> dict[str, str]:
+def software_versions() -> dict[str, str]:
     """What decides about the bits of a result here: this code, and what it computes with."""
     python = ".".join(str(part) for part in sys.version_info[:3])
     return {"hil": code_digest(), "python": python} | {name: version(name) for name in LIBRARIES}
 
 
-def differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -> str:
+def version_differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -> str:
     """What is other there, in words; empty if nothing."""
     if isinstance(there, Exception):
         return str(there)
@@ -232,24 +232,26 @@ def differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -
     )
 
 
-def perform(task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]) -> T | Broken:
+def perform_task(
+    task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]
+) -> T | Unused:
     """Do a task in a child process.
 
-    It may last for `timeout` [s]; `expected` is the `software` of whoever asks.
+    It may last for `timeout` [s]; `expected` is the `software_versions` of whoever asks.
 
     Raises:
         WorkerSoftwareError: other software runs here.
         PlannerNotStarted: no child process can be started here.
     """
-    checked = ArchiveTask[T | Broken](task.path, _checked, (task, expected))
+    checked = ArchiveTask[T | Unused](task.path, _checked, (task, expected))
     with _borrowed(timeout) as child:
         (found,) = child.results([checked])
         return found
 
 
-def _checked(task: ArchiveTask[T], expected: Mapping[str, str]) -> T | Broken:
+def _checked(task: ArchiveTask[T], expected: Mapping[str, str]) -> T | Unused:
     """In the child: what comes of a task, by the same code as the caller's."""
-    if other := differences(expected, software()):
+    if other := version_differences(expected, software_versions()):
         raise WorkerSoftwareError(f"a worker runs other software: {other}")
     return run_task(task)
 

@@ -25,10 +25,10 @@ from hil.files import digest, json_digest
 from hil.identify.settings import stated_delay
 from hil.progress import Reporter, Silent
 
-from .cache import BESIDE, Where, arm_digest, code_digest
-from .factors import cell_in, digest_of, require_whole, stamp_of
+from .cache import BESIDE, CacheLocation, arm_digest, code_digest
+from .factors import cell_in, digest_of, require_complete, stamp_of
 from .remote import archives_below, is_url, local_file
-from .types import ArchiveRef, Broken, ChangedError, Stamp
+from .types import ArchiveRef, ChangedError, Stamp, Unused
 from .workers import ArchiveTask, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
@@ -51,13 +51,13 @@ class Discovery(NamedTuple):
 
     refs: tuple[ArchiveRef, ...]  #: archives to use, in canonical order
     #: files that cannot be used and folders that cannot be looked into, by path
-    broken: tuple[Broken, ...]
-    skipped: tuple[Broken, ...]  #: archives that are not meant to be fitted, and why, by path
+    broken: tuple[Unused, ...]
+    skipped: tuple[Unused, ...]  #: archives that are not meant to be fitted, and why, by path
 
 
 def discover(
     roots: Sequence[str],
-    where: Where,
+    cache: CacheLocation,
     workers: Workers,
     reporter: Reporter = Silent(),  # noqa: B008 - without state
 ) -> Discovery:
@@ -69,24 +69,24 @@ def discover(
         InputError: a place does not exist, an address cannot be read, or there is no archive.
         CacheError: the cache cannot be written.
     """
-    places, refused, left = places_below(roots)
+    places, refused, left = find_archives(roots)
     if not places:
         problem = "there is no archive (*.mcap) in it"
         if refused:
             problem += f", and {refused[0].path} {refused[0].reason}"
         raise InputError(roots[0] if roots else None, problem, remedy="name others")
-    known: dict[Place, ArchiveRef | Broken] = {}
+    known: dict[Location, ArchiveRef | Unused] = {}
     with reporter.task("looking into archives", len(places)) as task:
-        if workers.near:  # else the cache is where the archives are
+        if workers.local:  # else the cache is where the archives are
             for place in places:
                 try:
-                    if (ref := _known(place, where)) is not None:
+                    if (ref := _known(place, cache)) is not None:
                         known[place] = ref
                 except ArchiveError as error:
-                    known[place] = Broken(place.location, str(error))
+                    known[place] = Unused(place.location, str(error))
             task.advance(len(known))
         unknown = [place for place in places if place not in known]
-        tasks = [ArchiveTask(place.location, examined, (place, where)) for place in unknown]
+        tasks = [ArchiveTask(place.location, inspect_archive, (place, cache)) for place in unknown]
         known.update(zip(unknown, workers.results(tasks, task.advance), strict=True))
     found = _sorted_out([(place, known[place]) for place in places])
     return Discovery(found.refs, (*refused, *found.broken), (*left, *found.skipped))
@@ -95,7 +95,7 @@ def discover(
 # Where archives lie
 
 
-class Place(NamedTuple):
+class Location(NamedTuple):
     """Where an archive lies, and what is known of its file without opening it."""
 
     location: str  #: path or URL
@@ -127,7 +127,7 @@ class Place(NamedTuple):
         return None if is_url(self.location) else stamp_of(Path(self.location))
 
 
-def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[Broken]]:
+def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], list[Unused]]:
     """Find every archive at or below some folders, archives, or URLs of either.
 
     Links are followed, and a folder that several lead to is looked into once, under its own name.
@@ -139,14 +139,14 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
     Raises:
         InputError: a place does not exist, or an address cannot be read.
     """
-    found: set[Place] = set()
-    refused: list[Broken] = []
-    left: list[Broken] = []
+    found: set[Location] = set()
+    refused: list[Unused] = []
+    left: list[Unused] = []
     visited: set[Path] = set()
 
     def refuse(error: OSError) -> None:
-        where = Path(os.fsdecode(error.filename)).as_posix()
-        refused.append(Broken(where, f"cannot be looked into: {error.strerror}"))
+        cache = Path(os.fsdecode(error.filename)).as_posix()
+        refused.append(Unused(cache, f"cannot be looked into: {error.strerror}"))
 
     def look_at(path: Path) -> None:
         try:
@@ -155,12 +155,12 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
             if path.suffix == _SUFFIX:
                 refuse(error)
             elif path.is_symlink():
-                left.append(Broken(path.as_posix(), "is a link that leads nowhere"))
+                left.append(Unused(path.as_posix(), "is a link that leads nowhere"))
             return
         if path.suffix == _SUFFIX and regular:
-            found.add(Place(path.as_posix()))
+            found.add(Location(path.as_posix()))
         elif path.suffix == _SUFFIX:
-            refused.append(Broken(path.as_posix(), "is no file"))
+            refused.append(Unused(path.as_posix(), "is no file"))
 
     def walk(root: Path) -> None:
         for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
@@ -176,9 +176,9 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
     for root in roots:
         path = Path(root)
         if is_url(root):
-            found.update(Place(url, version) for url, version in archives_below(root))
+            found.update(Location(url, version) for url, version in archives_below(root))
         elif path.is_file():
-            found.add(Place(path.resolve().as_posix()))
+            found.add(Location(path.resolve().as_posix()))
         elif path.is_dir():
             walk(path.resolve())
         else:
@@ -189,7 +189,7 @@ def places_below(roots: Sequence[str]) -> tuple[list[Place], list[Broken], list[
 # What an archive is
 
 
-def setup_of(cell: Cell) -> str:
+def describe_setup(cell: Cell) -> str:
     """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
 
     def row(figures: Iterable[float]) -> str:
@@ -204,53 +204,53 @@ def setup_of(cell: Cell) -> str:
     return ", ".join(words)
 
 
-def examined(place: Place, where: Where) -> ArchiveRef:
+def inspect_archive(place: Location, cache: CacheLocation) -> ArchiveRef:
     """Find out what an archive is, and cache it.
 
     Raises:
         HilError: it cannot be read, is torn, or was changed meanwhile.
         CacheError: the cache cannot be written.
     """
-    if (known := _known(place, where)) is not None:
+    if (known := _known(place, cache)) is not None:
         return known
     begun, stamp = time.time_ns(), place.stamp
     with local_file(place.location) as path:
-        ref = _inspected(place, path, where)
+        ref = _inspected(place, path, cache)
         if stamp is not None and stamp_of(path) != stamp:
             raise ChangedError(place.location)
     ref = replace(ref, stamp=stamp)
     untouched = stamp is None or begun - max(stamp[1:3]) > _UNTOUCHED
     if (stamp is not None or place.version) and untouched:
-        where.store(place.location).put(_key(place), {"token": _token(place, stamp), "ref": ref})
+        cache.store(place.location).put(_key(place), {"token": _token(place, stamp), "ref": ref})
     return ref
 
 
-def _known(place: Place, where: Where) -> ArchiveRef | None:
+def _known(place: Location, cache: CacheLocation) -> ArchiveRef | None:
     """What is known of an archive without opening it, if its file is there; None if nothing."""
     stamp = place.stamp
     if stamp is None and not place.version:  # only its bytes show a change
         return None
-    note = where.store(place.location).get(_key(place), dict)
+    note = cache.store(place.location).get(_key(place), dict)
     if note is None or note.get("token") != _token(place, stamp):
         return None
     ref: ArchiveRef = note["ref"]
     return replace(ref, location=place.location, campaign=place.campaign, stamp=stamp)
 
 
-def _key(place: Place) -> str:
+def _key(place: Location) -> str:
     return digest(f"archive {place.name}".encode("utf-8", "surrogateescape"))
 
 
-def _token(place: Place, stamp: Stamp | None) -> list[Any]:
+def _token(place: Location, stamp: Stamp | None) -> list[Any]:
     return [code_digest(), place.version, *(stamp or ())]
 
 
-def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
+def _inspected(place: Location, path: Path, cache: CacheLocation) -> ArchiveRef:
     """Hash a file, look into it, and cache the texts of its cell."""
     sha256 = digest_of(path)
     # Of a whole file this reads its summary and what stands outside of chunks, and one chunk.
     archive = open_archive(path, fields=(), stop=-1.0)
-    require_whole(archive, place.location)
+    require_complete(archive, place.location)
     header, plan = archive.header, archive.attachments.get("plan.json")
     index, attempt = header.index, header.attempt
     if index is None or attempt is None:  # else as the archive says, whatever its name is now
@@ -274,7 +274,7 @@ def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
     )
     if ref.use not in USES:
         return ref
-    cell, store = cell_in(archive), where.store(place.location)
+    cell, store = cell_in(archive), cache.store(place.location)
     key = json_digest([cell.text, cell.urdf])
     if not store.has(key):
         store.put(key, [cell.text, cell.urdf])
@@ -283,7 +283,7 @@ def _inspected(place: Place, path: Path, where: Where) -> ArchiveRef:
         ref,
         arm=arm_digest(cell, drives, simulated=ref.simulated),
         cell=key,
-        setup=setup_of(cell),
+        setup=describe_setup(cell),
     )
 
 
@@ -293,16 +293,16 @@ _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
 
-def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery:
+def _sorted_out(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
     """Tell archives that are meant to be fitted from copies, failures and earlier attempts."""
     manifests, broken = _manifests([place for place, _ in found])
     read: list[ArchiveRef] = []
-    harmed: list[tuple[Place, str]] = []
-    skipped: list[Broken] = []
+    harmed: list[tuple[Location, str]] = []
+    skipped: list[Unused] = []
     for place, one in found:
         entries = None if place.campaign == place.folder else manifests.get(place.campaign)
         entry = None if entries is None else entries.get(place.name)
-        if isinstance(one, Broken):
+        if isinstance(one, Unused):
             harmed.append((place, one.reason))
         elif entry is not None and entry.sha256 != one.sha256:
             harmed.append((place, "is not what its campaign's manifest.json says"))
@@ -319,29 +319,29 @@ def _sorted_out(found: Sequence[tuple[Place, ArchiveRef | Broken]]) -> Discovery
                 "is not named in its campaign's manifest.json: nobody has judged it (a run was "
                 "killed; the next one takes it in)"
             )
-            skipped.append(Broken(place.location, reason))
+            skipped.append(Unused(place.location, reason))
         else:
             read.append(one)
     latest: _Attempts = {}
     for ref in read:
         if ref.attempt and ref.outcome == _COMPLETED:
-            key = (Place(ref.location).folder, ref.kind, ref.index)
+            key = (Location(ref.location).folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
     for place, reason in harmed:
         replaced = _replaced(place, latest)
-        (skipped if replaced else broken).append(Broken(place.location, replaced or reason))
+        (skipped if replaced else broken).append(Unused(place.location, replaced or reason))
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
         if reason := _objection(ref, latest, seen):
-            skipped.append(Broken(ref.location, reason))
+            skipped.append(Unused(ref.location, reason))
         else:
             refs.append(ref)
     refs.sort(key=lambda ref: ref.order)
     return Discovery(tuple(refs), tuple(broken), tuple(skipped))
 
 
-def _manifests(places: Iterable[Place]) -> tuple[dict[str, dict[str, Entry]], list[Broken]]:
+def _manifests(places: Iterable[Location]) -> tuple[dict[str, dict[str, Entry]], list[Unused]]:
     """Entries by name of each campaign that has a manifest; and those that cannot be read."""
     found: dict[str, dict[str, Entry]] = {}
     broken = []
@@ -352,11 +352,11 @@ def _manifests(places: Iterable[Place]) -> tuple[dict[str, dict[str, Entry]], li
                 found[campaign] = {entry.name: entry for entry in folder.manifest()}
         except CampaignFolderError as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
-            broken.append(Broken(f"{campaign}/manifest.json", reason))
+            broken.append(Unused(f"{campaign}/manifest.json", reason))
     return found, broken
 
 
-def _replaced(place: Place, latest: _Attempts) -> str:
+def _replaced(place: Location, latest: _Attempts) -> str:
     """Why nothing is missing with an archive that cannot be used; "" if something is.
 
     A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
@@ -383,7 +383,7 @@ def _objection(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
         return "carries a payload that its cell does not state"
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
-    folder = Place(ref.location).folder
+    folder = Location(ref.location).folder
     last = latest.get((folder, ref.kind, ref.index), ref.attempt)
     if ref.attempt and ref.attempt < last:
         return f"attempt {last} took its place"

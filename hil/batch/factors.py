@@ -41,9 +41,9 @@ from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-from .cache import Where, decision_digest, settings_digest, sum_key
+from .cache import CacheLocation, decision_digest, settings_digest, sum_key
 from .remote import local_file
-from .types import ArchiveRef, Broken, Bundle, ChangedError, Stamp, Summary
+from .types import ArchiveRef, Bundle, ChangedError, Stamp, Summary, Unused
 
 BUNDLE: Final = 16
 """Archives of a campaign that are reduced together: a summary of each and one sum of all, which is
@@ -64,7 +64,7 @@ _FIELDS: Final = (
 
 
 @contextmanager
-def opened(ref: ArchiveRef) -> Iterator[Archive]:
+def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
     """The archive with what identification reads, as long as its file is there.
 
     Raises:
@@ -80,11 +80,11 @@ def opened(ref: ArchiveRef) -> Iterator[Archive]:
         finally:
             if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
                 _require_same(path, ref)
-        require_whole(archive, ref.location)
+        require_complete(archive, ref.location)
         yield archive
 
 
-def require_whole(archive: Archive, location: str) -> None:
+def require_complete(archive: Archive, location: str) -> None:
     """Refuse an archive with damage; a batch uses none in part.
 
     Raises:
@@ -144,13 +144,13 @@ def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
     return cell.with_friction(**dict(friction)) if friction else cell
 
 
-def source_in(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
+def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
     """An archive, and what of it is of use.
 
     Raises:
         HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
     """
-    with opened(ref) as archive:
+    with open_ref(ref) as archive:
         source = source_of(archive, cell_in(archive), to_fit=to_fit)
     if to_fit and source.recording.torque is None:
         raise ArchiveError(
@@ -168,10 +168,12 @@ class Decision(NamedTuple):
     """Settings of a campaign."""
 
     settings: Settings | None  #: None where there is not one archive to decide them from
-    broken: tuple[Broken, ...] = ()  #: archives that could not be read for it
+    broken: tuple[Unused, ...] = ()  #: archives that could not be read for it
 
 
-def consulted(refs: Sequence[ArchiveRef], arms: Settings | None) -> tuple[ArchiveRef, ...]:
+def archives_for_settings(
+    refs: Sequence[ArchiveRef], arms: Settings | None
+) -> tuple[ArchiveRef, ...]:
     """The archives of a campaign that its settings depend on, those at standstill first."""
     ordered = sorted(refs, key=lambda ref: ref.order)
     rest = [ref for ref in ordered if ref.use == "standstill"]
@@ -179,19 +181,19 @@ def consulted(refs: Sequence[ArchiveRef], arms: Settings | None) -> tuple[Archiv
     return (*rest, *fitted[: 1 if arms is not None and rest else MOST_READ])
 
 
-def known_settings(
-    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+def cached_settings(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
 ) -> Settings | None:
     """Settings that were decided from these archives before."""
     if not refs:
         return None
-    return where.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
+    return cache.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
 
 
-def decided(
-    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, where: Where
+def decide_settings(
+    refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
 ) -> Decision:
-    """Decide a campaign's settings from some of its archives, see `consulted`, and cache them.
+    """Decide a campaign's settings from `archives_for_settings` and cache them.
 
     They are those of the arm with the campaign's own noise; None where it decides on them.
 
@@ -199,17 +201,17 @@ def decided(
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was asked for and there is not one usable row.
     """
-    broken: list[Broken] = []
+    broken: list[Unused] = []
     rest: Source | None = None
     fitted: list[tuple[Archive, Source]] = []
     for ref in refs:
         try:
             if ref.use != "standstill":
-                fitted.append(source_in(ref))
+                fitted.append(load_source(ref))
             elif rest is None:
-                rest = source_in(ref, to_fit=False)[1]
+                rest = load_source(ref, to_fit=False)[1]
         except (HilError, IdentificationError) as error:
-            broken.append(Broken(ref.location, str(error)))
+            broken.append(Unused(ref.location, str(error)))
     if not fitted:
         return Decision(None, tuple(broken))
     sources, _ = with_noise(
@@ -220,7 +222,7 @@ def decided(
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
-        where.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
+        cache.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
     return Decision(settings, tuple(broken))
 
 
@@ -234,7 +236,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
         HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
         IdentificationError: there is not one usable row in it.
     """
-    archive, source = source_in(ref)
+    archive, source = load_source(ref)
     source = signals_of(source, settings)
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
     samples = (samples_of if fitted else judged_samples)(source, cell, settings)
@@ -267,13 +269,13 @@ def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor) -> tuple[Estim
     return found, float(trace) / phase.n_parameters
 
 
-def bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
+def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
     """Archives of one campaign in canonical order, in runs that are reduced together."""
     ordered = sorted(refs, key=lambda ref: ref.order)
     return [tuple(ordered[k : k + BUNDLE]) for k in range(0, len(ordered), BUNDLE)]
 
 
-def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle:
+def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> Bundle:
     """Reduce archives of one campaign, or those that are not in the cache, and cache the result.
 
     The sum goes from first to last in canonical order, so that one that is known of the first ones
@@ -282,9 +284,11 @@ def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bun
     Raises:
         CacheError: the disk refuses.
     """
-    store, used = where.store(refs[0].location), settings_digest(settings)
+    store, used = cache.store(refs[0].location), settings_digest(settings)
     counts = range(len(refs), 0, -1)
-    begun = next(filter(None, (cached(refs[:count], settings, where) for count in counts)), None)
+    begun = next(
+        filter(None, (cached_bundle(refs[:count], settings, cache) for count in counts)), None
+    )
     found = begun or Bundle(())
     known = len(found.refs)
     if known == len(refs):
@@ -306,7 +310,7 @@ def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bun
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
-    reasons = tuple(Broken(*one) for one in broken.items())
+    reasons = tuple(Unused(*one) for one in broken.items())
     bundle = Bundle(tuple(refs), tuple(summaries), phase, reasons, len(refs) - known)
     if lasting:
         store.put(sum_key(refs, used), bundle)
@@ -315,9 +319,11 @@ def reduced(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bun
     return bundle
 
 
-def cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bundle | None:
+def cached_bundle(
+    refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
+) -> Bundle | None:
     """Archives reduced earlier; None unless all of them are in the cache."""
-    store = where.store(refs[0].location)
+    store = cache.store(refs[0].location)
     found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
     if found is None:
         return None
@@ -326,10 +332,10 @@ def cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> Bund
         tuple(refs),
         tuple(replace(one, ref=now[one.ref.location]) for one in found.summaries),
         found.phase,
-        tuple(Broken(now[path].location, reason) for path, reason in found.broken),
+        tuple(Unused(now[path].location, reason) for path, reason in found.broken),
     )
 
 
-def is_cached(refs: Sequence[ArchiveRef], settings: Settings, where: Where) -> bool:
+def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:
     """Whether there is an entry of the sum of these archives; it may turn out to be damaged."""
-    return where.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))
+    return cache.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))

@@ -19,7 +19,7 @@ from hil.terminal_text import plural
 from identification import IdentificationError
 
 from . import factors
-from .cache import Where, code_digest, settings_digest
+from .cache import CacheLocation, code_digest, settings_digest
 from .discovery import discover
 from .estimates import Estimator, Group, repetition_level, sum_level
 from .types import (
@@ -27,11 +27,11 @@ from .types import (
     Arm,
     BatchEstimator,
     BatchResult,
-    Broken,
     Bundle,
     GroupKey,
     LevelEstimate,
     Summary,
+    Unused,
 )
 from .workers import ArchiveTask, Workers
 
@@ -46,7 +46,7 @@ def reidentify(
     workers: Workers,
     reporter: Reporter,
     *,
-    where: Where = Where(),  # noqa: B008 - frozen
+    cache: CacheLocation = CacheLocation(),  # noqa: B008 - frozen
     check: Callable[[Sequence[ArchiveRef]], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: repetition by repetition, campaign, and pooled.
@@ -66,18 +66,18 @@ def reidentify(
     if options.estimator not in (known := get_args(BatchEstimator)):
         problem, remedy = f"{options.estimator!r} reads samples", f"use {', '.join(known)}"
         raise InputError(None, problem, field="estimator", remedy=remedy)
-    found = discover(roots, where, workers, reporter)
+    found = discover(roots, cache, workers, reporter)
     check(found.refs)
-    batch = _Batch(options, workers, where, reporter, [*found.broken])
+    batch = _Batch(options, workers, cache, reporter, [*found.broken])
     campaigns = batch.with_settings(
         [_Campaign(key, list(own)) for key, own in groupby(found.refs, lambda ref: ref.key)]
     )
     return batch.result(campaigns, found.skipped)
 
 
-def opened_alone(ref: ArchiveRef) -> None:
+def try_open(ref: ArchiveRef) -> None:
     """Open an archive, to see whether that fails, or ends this process."""
-    with factors.opened(ref):
+    with factors.open_ref(ref):
         pass
 
 
@@ -104,9 +104,9 @@ class _Batch:
 
     options: Options
     workers: Workers
-    where: Where
+    cache: CacheLocation
     reporter: Reporter
-    broken: list[Broken]
+    broken: list[Unused]
     read: int = 0
     cached: int = 0
     stream: Iterator[Any] = field(default_factory=lambda: iter(()))
@@ -135,19 +135,20 @@ class _Batch:
         asked: list[tuple[_Campaign, tuple[Any, ...]]] = []
         for one in campaigns:
             own = arms.get(one.key.arm)
-            refs = factors.consulted(one.refs, own)
-            one.settings = factors.known_settings(refs, self.options, own, self.where)
+            refs = factors.archives_for_settings(one.refs, own)
+            one.settings = factors.cached_settings(refs, self.options, own, self.cache)
             if one.settings is None:
-                asked.append((one, (refs, self.options, own, self.where)))
+                asked.append((one, (refs, self.options, own, self.cache)))
         tasks = [
-            ArchiveTask(one.key.campaign, factors.decided, arguments) for one, arguments in asked
+            ArchiveTask(one.key.campaign, factors.decide_settings, arguments)
+            for one, arguments in asked
         ]
         again: list[_Campaign] = []
         for (one, arguments), found in zip(
             asked, self._results(tasks, "deciding settings"), strict=True
         ):
-            if isinstance(found, Broken):
-                alone = [ArchiveTask(ref.location, opened_alone, (ref,)) for ref in arguments[0]]
+            if isinstance(found, Unused):
+                alone = [ArchiveTask(ref.location, try_open, (ref,)) for ref in arguments[0]]
                 results = self._results(alone, "opening archives one by one")
                 broken = [other for other in results if other is not None]
                 reason = found.reason
@@ -161,11 +162,11 @@ class _Batch:
             if one.settings is None and broken and one.refs:
                 again.append(one)
             elif one.settings is None and reason:
-                self.broken.append(Broken(one.key.campaign, reason))
+                self.broken.append(Unused(one.key.campaign, reason))
         if again:
             self._decide(again, arms)
 
-    def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> list[T | Broken]:
+    def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> list[T | Unused]:
         """What comes of tasks."""
         if not tasks:
             return []
@@ -175,12 +176,14 @@ class _Batch:
     # Factors
 
     def _reducing(self, one: _Campaign, refs: tuple[ArchiveRef, ...]) -> ArchiveTask[Bundle]:
-        return ArchiveTask(refs[0].location, factors.reduced, (refs, one.ready, self.where))
+        return ArchiveTask(refs[0].location, factors.reduce_bundle, (refs, one.ready, self.cache))
 
     def _reduced(self, one: _Campaign) -> Iterator[Bundle]:
         """The bundles of a campaign in turn; what ends its process is looked for one by one."""
         for refs, known in one.bundles:
-            found: Any = factors.cached(refs, one.ready, self.where) if known else next(self.stream)
+            found: Any = (
+                factors.cached_bundle(refs, one.ready, self.cache) if known else next(self.stream)
+            )
             if found is None:  # damaged
                 (found,) = self.workers.results([self._reducing(one, refs)])
             if isinstance(found, Bundle):
@@ -188,16 +191,16 @@ class _Batch:
                 continue
             alone = [self._reducing(one, (ref,)) for ref in refs]
             for own in self.workers.results(alone):
-                yield Bundle((), broken=(own,)) if isinstance(own, Broken) else own
+                yield Bundle((), broken=(own,)) if isinstance(own, Unused) else own
 
     # Estimates
 
-    def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Broken, ...]) -> BatchResult:
+    def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Unused, ...]) -> BatchResult:
         """Reduce and estimate everything; what the cache has is read here if that can be seen."""
         tasks = []
         for one in campaigns:
-            for refs in factors.bundles([ref for ref in one.refs if ref.use != "standstill"]):
-                known = self.workers.near and factors.is_cached(refs, one.ready, self.where)
+            for refs in factors.split_bundles([ref for ref in one.refs if ref.use != "standstill"]):
+                known = self.workers.local and factors.is_cached(refs, one.ready, self.cache)
                 one.bundles.append((refs, known))
                 tasks += [] if known else [self._reducing(one, refs)]
         self.stream = self.workers.results(tasks)
@@ -233,7 +236,7 @@ class _Batch:
         # The path stands in the reason of some as well.
         broken = tuple(
             dict.fromkeys(
-                Broken(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
+                Unused(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
             )
         )
         if not repetitions:
@@ -285,18 +288,18 @@ class _Batch:
         try:
             yield
         except IdentificationError as error:
-            self.broken.append(Broken(name, str(error)))
+            self.broken.append(Unused(name, str(error)))
 
     def _cell(self, ref: ArchiveRef) -> Cell:
         """The cell of an archive."""
-        texts = self.where.store(ref.location).get(ref.cell, list)
+        texts = self.cache.store(ref.location).get(ref.cell, list)
         if texts is not None and json_digest(texts) == ref.cell:
             return factors.cell_from(*texts)
-        with factors.opened(ref) as archive:
+        with factors.open_ref(ref) as archive:
             return factors.cell_in(archive)
 
 
-def _nothing_to_fit(broken: Sequence[Broken]) -> InputError:
+def _nothing_to_fit(broken: Sequence[Unused]) -> InputError:
     problem = "there is no excitation and no imported recording that can be fitted"
     if broken:
         path, reason = broken[0]

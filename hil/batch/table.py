@@ -16,8 +16,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from hil.files import replacing
-from hil.reading import instant
+from hil.files import replace_file
+from hil.reading import parse_time
 from hil.version import software
 
 from .estimates import relative_error
@@ -58,7 +58,7 @@ def write_tables(folder: Path, result: BatchResult) -> list[Path]:
     for table in TABLES:
         for ending, write in writers.items():
             paths.append(folder / f"{table.name}{ending}")
-            with replacing(paths[-1]) as temporary:
+            with replace_file(paths[-1]) as temporary:
                 write(temporary, table, result)
     return paths
 
@@ -81,7 +81,7 @@ def _levels(result: BatchResult) -> Iterator[tuple[LevelEstimate, Row]]:
                 "setup": level.setup,
                 "archive": level.archive,
                 "archive_sha256": level.sha256,
-                "when": instant(level.when),
+                "when": parse_time(level.when),
             },
         )
 

@@ -84,7 +84,7 @@ class ArchiveRef:
         return *self.key, self.index, self.name, self.sha256
 
 
-class Broken(NamedTuple):
+class Unused(NamedTuple):
     """An archive of which nothing was used, and why."""
 
     path: str
@@ -114,7 +114,7 @@ class Bundle:
     summaries: tuple[Summary, ...] = ()  #: of those that could be read, in their order
     #: sum of the factors of those that are fitted; None where none is
     phase: PhaseFactor | None = None
-    broken: tuple[Broken, ...] = ()  #: the others
+    broken: tuple[Unused, ...] = ()  #: the others
     read: int = 0  #: archives that were read for it; the rest comes from the cache
 
 
@@ -184,8 +184,8 @@ class BatchResult:
     repetitions: tuple[LevelEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[LevelEstimate, ...]  #: likewise, by arm and time
     pooled: tuple[LevelEstimate, ...]  #: one per arm
-    broken: tuple[Broken, ...]  #: archives, and campaigns (by folder), that could not be used
-    skipped: tuple[Broken, ...]  #: archives that are not meant to be fitted, and why
+    broken: tuple[Unused, ...]  #: archives, and campaigns (by folder), that could not be used
+    skipped: tuple[Unused, ...]  #: archives that are not meant to be fitted, and why
     read: int  #: archives whose factor was computed
     cached: int  #: archives whose factor was known
     code: str  #: digest of the programs

@@ -17,7 +17,7 @@ from hil.errors import HilError
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess, stream_in_children
 
-from .types import Broken, CacheError
+from .types import CacheError, Unused
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -46,7 +46,7 @@ class WorkerSoftwareError(HilError):
 class Workers(ABC):
     """Who does the work on archives."""
 
-    near: bool  #: whether files they write can be read here under the same names
+    local: bool  #: whether files they write can be read here under the same names
     count: int  #: how many tasks are done at once
 
     def __enter__(self) -> Self:
@@ -61,10 +61,10 @@ class Workers(ABC):
     @abstractmethod
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Broken]:
+    ) -> Iterator[T | Unused]:
         """What comes of tasks, in their order; later ones are worked on meanwhile.
 
-        A task that fails, ends its process or takes too long has a `Broken` in its place.
+        A task that fails, ends its process or takes too long has a `Unused` in its place.
 
         `done` is called with a number of tasks whenever so many more are finished.
         """
@@ -76,7 +76,7 @@ class LocalWorkers(Workers):
     By default one for each core that this process may use; a task may last for `timeout` [s].
     """
 
-    near = True
+    local = True
 
     def __init__(self, count: int | None = None, *, timeout: float = TIMEOUT) -> None:
         self.count = count or len(os.sched_getaffinity(0))
@@ -92,7 +92,7 @@ class LocalWorkers(Workers):
 
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Broken]:
+    ) -> Iterator[T | Unused]:
         """See :class:`Workers`.
 
         Raises:
@@ -126,15 +126,15 @@ class LocalWorkers(Workers):
 
     def _named(self, task: ArchiveTask[Any], result: Any) -> Any:
         if isinstance(result, PlanningTimedOut):
-            return Broken(task.path, f"took longer than {self._timeout:g} s")
+            return Unused(task.path, f"took longer than {self._timeout:g} s")
         if isinstance(result, PlannerCrashed):
             status = result.status
             end = f"signal {-status}" if status < 0 else f"status {status}"
-            return Broken(task.path, f"ended its process, twice, with {end}")
+            return Unused(task.path, f"ended its process, twice, with {end}")
         return result
 
 
-def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Broken]:
+def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Unused]:
     """In a child: what comes of each task; one that takes too long ends the process."""
     found = []
     for task in tasks:
@@ -145,7 +145,7 @@ def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Brok
     return found
 
 
-def run_task(task: ArchiveTask[T]) -> T | Broken:
+def run_task(task: ArchiveTask[T]) -> T | Unused:
     """What comes of a task, or why nothing does.
 
     Raises:
@@ -157,6 +157,6 @@ def run_task(task: ArchiveTask[T]) -> T | Broken:
     except (CacheError, WorkerSoftwareError):
         raise
     except HilError as error:
-        return Broken(task.path, str(error))
+        return Unused(task.path, str(error))
     except Exception as error:  # a fault of ours: it costs this archive, not the batch
-        return Broken(task.path, f"{type(error).__name__}: {error}")
+        return Unused(task.path, f"{type(error).__name__}: {error}")

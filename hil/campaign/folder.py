@@ -22,13 +22,13 @@ from hil.archive import ArchiveName
 from hil.files import (
     digest,
     file_digest,
+    file_lock,
     is_locked,
     json_digest,
-    locked,
     write_atomically,
-    write_or_tell,
+    write_output,
 )
-from hil.reading import is_no_file, json_of, lies_there, opened, text_of, toml_of
+from hil.reading import is_not_a_file, open_file, parse_json, parse_toml, path_exists, read_text
 from identification.errors import ModelError
 from identification.model.urdf_text import urdf_tree
 
@@ -87,11 +87,11 @@ def load_record(
     Raises:
         CampaignFolderError: it cannot be read.
     """
-    if not lies_there(path):
+    if not path_exists(path):
         return None
     try:
-        text = text_of(path)
-        if version and (found := json_of(text)["format_version"]) != version:
+        text = read_text(path)
+        if version and (found := parse_json(text)["format_version"]) != version:
             raise ValueError(f"format version {found}, this is {version}")
         return read_back(kind, text, strict=strict)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -106,7 +106,7 @@ def save_record(path: Path, record: Any, version: int) -> None:
         OutputError: the disk refuses.
     """
     content = {"format_version": version, **asdict(record)}
-    write_or_tell(path, json.dumps(content, indent=1) + "\n")
+    write_output(path, json.dumps(content, indent=1) + "\n")
 
 
 def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
@@ -127,7 +127,7 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
     except (ModelError, UnicodeDecodeError):  # whoever loads it says so
         return sums
     try:
-        cell = toml_of(as_text(contents.get("cell.toml", b"")))
+        cell = parse_toml(as_text(contents.get("cell.toml", b"")))
         folders = [root / name for name in cell["cell"]["mesh_folders"]]
     except (ValueError, KeyError, TypeError):  # likewise
         folders = []
@@ -237,7 +237,7 @@ class CampaignFolder:
         contents = self._contents()
         sums = self._checksums(contents)
         try:
-            cell = toml_of(as_text(contents[self.cell.name]))
+            cell = parse_toml(as_text(contents[self.cell.name]))
         except (KeyError, ValueError):
             return json_digest(sums)  # no cell that anything could be run with
         cell.get("campaign", {}).pop("repetitions", None)
@@ -267,7 +267,7 @@ class CampaignFolder:
     @property
     def sealed(self) -> bool:
         """Whether there is a manifest."""
-        return lies_there(self._path)
+        return path_exists(self._path)
 
     def locked(self) -> AbstractContextManager[None]:
         """Keep every other run out of the folder; a run that dies lets go of it.
@@ -284,7 +284,7 @@ class CampaignFolder:
             problem = f"{LOCK} cannot be written ({error.strerror})"
             return CampaignFolderError(self.root, problem, "make it a writable file")
 
-        return locked(self.root / LOCK, refusal, patience=LOCK_PATIENCE)
+        return file_lock(self.root / LOCK, refusal, patience=LOCK_PATIENCE)
 
     @property
     def busy(self) -> bool:
@@ -400,7 +400,7 @@ class CampaignFolder:
                 digests[entry.name] = file_digest(self.archives / entry.name)
             return digests[entry.name] == entry.sha256
         except OSError as error:
-            if is_no_file(error):
+            if is_not_a_file(error):
                 return False
             raise CampaignFolderError(
                 self.root, f"{entry.name} cannot be read ({error.strerror})", "make it readable"
@@ -415,7 +415,7 @@ class CampaignFolder:
         contents = {}
         for file in (self.cell, self.plan, self.urdf):
             try:
-                with opened(file) as stream:
+                with open_file(file) as stream:
                     contents[file.name] = stream.read()
             except FileNotFoundError:
                 continue

@@ -19,7 +19,7 @@ from hil.errors import InputError
 from hil.files import write_atomically
 from hil.motion_checks import MotionChecks, planned
 from hil.progress import Reporter
-from hil.reading import json_of, text_of
+from hil.reading import parse_json, read_text
 from identification.excitation import (
     RESCORE_PERIOD,
     DrawnMotion,
@@ -129,7 +129,7 @@ class CampaignPlan:
             InputError: the file is not a plan.
         """
         try:
-            return cls.from_text(text_of(path))
+            return cls.from_text(read_text(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
                 path, f"is not a campaign plan ({error})", remedy="design the excitation again"
@@ -142,7 +142,7 @@ class CampaignPlan:
         Raises:
             ValueError, KeyError, TypeError, AttributeError: it is none.
         """
-        content: dict[str, Any] = json_of(text)
+        content: dict[str, Any] = parse_json(text)
         version = content["format_version"]
         if version not in READ:
             raise ValueError(f"format version {version}")

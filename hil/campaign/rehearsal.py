@@ -10,7 +10,7 @@ from typing import Final, Literal, Self
 
 from pydantic import StrictBool, model_validator
 
-from hil.files import write_or_tell
+from hil.files import write_output
 from hil.results import Frozen
 
 from .folder import CampaignFolder, load_record
@@ -94,7 +94,7 @@ class Rehearsal(Frozen):
         Raises:
             OutputError: the disk refuses.
         """
-        write_or_tell(path, self.model_dump_json(indent=1) + "\n")
+        write_output(path, self.model_dump_json(indent=1) + "\n")
 
     def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
         """Whether it is the rehearsal of a plan, or of the same motions repeated as often or not.

@@ -22,7 +22,7 @@ from hil.cell import Cell
 from hil.errors import ArchiveError
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Task
-from hil.reading import json_of
+from hil.reading import parse_json
 from hil.recording import archive_spec, dated_anew, origin_of
 from hil.version import software
 from identification.excitation.excitation import trajectory_from_dict
@@ -484,6 +484,6 @@ def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
         if kind == "move":
             with suppress(ArchiveError, ValueError, KeyError, TypeError):  # not seen, then
                 archive = open_archive(folder.archives / entry.name, fields=())
-                motion = trajectory_from_dict(json_of(archive.text("plan.json"))["trajectory"])
+                motion = trajectory_from_dict(parse_json(archive.text("plan.json"))["trajectory"])
                 found.append(Interval("move", 0, motion).ends)
     return found

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
-from hil.reading import lies_there
+from hil.reading import path_exists
 from hil.results import ConductResult, RecordedResult, Results, StepResult, WarmUpResult
 from hil.terminal_text import plural
 
@@ -242,7 +242,7 @@ def _motions(campaign: Campaign, kind: str, words: str) -> Step:
 
 
 def _identified(folder: CampaignFolder) -> Step:
-    if not lies_there(folder.results):
+    if not path_exists(folder.results):
         return Step("next", "not identified yet", "identify {}")
     results = Results.load(folder.results)
     used = {*results.repetitions, *(one.archive for one in results.validation)}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.files import write_together
+from hil.files import write_files
 from hil.motion_checks import MotionChecks
 from identification.excitation import Excitation
 from planner import Trajectory, to_csv
@@ -65,7 +65,7 @@ def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[
     """
     plan = plan_around(cell, excitation, MotionChecks.of(cell))
     files = trajectory_files(cell, plan)
-    write_together(root, files)
+    write_files(root, files)
     return tuple(files)
 
 

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
-from hil.reading import text_of, toml_of
+from hil.reading import parse_toml, read_text
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
 from planner import JointLimits
@@ -381,7 +381,7 @@ class Cell:
 
 def _parse(path: Path, text: str) -> CellFile:
     try:
-        raw = toml_of(text)
+        raw = parse_toml(text)
     except ValueError as error:
         raise CellError(path, "", None, f"is not TOML ({error})", "correct that line") from error
     require_known(path, raw, CellFile)
@@ -394,7 +394,7 @@ def _parse(path: Path, text: str) -> CellFile:
 def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str:
     """The text of a file that the cell file `path` names in a field, or of the cell file itself."""
     try:
-        return text_of(file)
+        return read_text(file)
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise CellError(path, field, value, f"cannot be read ({why})", remedy) from error

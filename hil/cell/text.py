@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import InputError
-from hil.reading import toml_of
+from hil.reading import parse_toml
 from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_value
 
@@ -61,7 +61,7 @@ def with_values(text: str, values: Mapping[str, Any]) -> str:
         table, _, key = name.rpartition(".")
         if value is None:
             continue
-        there: Any = toml_of(text)
+        there: Any = parse_toml(text)
         for part in table.split("."):
             there = there.get(part, {})
         if not there and f"[{table}]" not in text:

@@ -56,7 +56,7 @@ def check(files: Files, as_json: JsonOption = False) -> None:
             status = NO_ARCHIVE
             _say_error(path, error, as_json=as_json)
             continue
-        if not found.keeps and not status:
+        if not found.conforms and not status:
             status = PROFILE_BROKEN
         typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
     raise typer.Exit(status)
@@ -122,7 +122,7 @@ def _shown(lines: Sequence[str]) -> str:
 
 
 def _check_lines(found: Check) -> list[str]:
-    verdict = "keeps" if found.keeps else "does not keep"
+    verdict = "keeps" if found.conforms else "does not keep"
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
     if found.repaired:
         lines[0] += ", repaired with loss"
@@ -130,7 +130,7 @@ def _check_lines(found: Check) -> list[str]:
         faults = found.faults.get(aspect, ())
         lines.append(f"  {aspect:<13} {'no' if faults else 'ok':<3} {meaning}")
         lines += [f"  {'':<13}     {fault}" for fault in faults]
-    if not found.keeps:
+    if not found.conforms:
         lines.append(f"  to mend what can be: hil archive repair {found.path}")
     return lines
 
@@ -140,7 +140,7 @@ def _check_dict(found: Check) -> dict[str, Any]:
     return {
         "file": str(found.path),
         "archive": True,
-        "keeps": found.keeps,
+        "keeps": found.conforms,
         "version": found.version,
         "samples": found.samples,
         "repaired": found.repaired,

@@ -10,7 +10,7 @@ import typer
 from hil.batch.workers import LocalWorkers
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.compare import compare_campaigns, gather
-from hil.files import make_folder, write_together
+from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
 
@@ -43,7 +43,7 @@ def compare(
         from hil.report.changes import comparison_page  # figures are slow to import
 
         make_folder(output.parent)
-        write_together(output.parent, {output.name: comparison_page(found)})
+        write_files(output.parent, {output.name: comparison_page(found)})
         reporter.say(f"report: {output}")
     if json:
         print_json(found.document)

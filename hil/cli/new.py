@@ -19,7 +19,7 @@ from hil.cli.arguments import (
     print_json,
 )
 from hil.errors import InputError
-from hil.files import write_atomically, writing_to
+from hil.files import convert_write_errors, write_atomically
 from hil.importers import convention_of
 from hil.new import (
     Known,
@@ -31,7 +31,7 @@ from hil.new import (
     with_clear_home,
 )
 from hil.progress import say
-from hil.reading import port_number
+from hil.reading import parse_port
 
 PORT = 1000
 """On which a PC listens to a C4G Open, as delivered."""
@@ -106,7 +106,7 @@ def new(
     text, unknown = (made.for_design() if design_only else made).text(output)
     if design_only and not unknown:
         text = with_clear_home(text, made, output)
-    with writing_to(output):
+    with convert_write_errors(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:
             write_atomically(made.urdf_beside(output), made.urdf)
@@ -131,7 +131,7 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     from drivers.transports.udp import UdpSpec
 
     host, _, port_text = address.partition(":")
-    port = port_number(port_text or str(PORT))
+    port = parse_port(port_text or str(PORT))
     if not host or port is None:
         remedy = "e.g. 10.2.12.150:1000"
         raise InputError(None, f"{address!r} is no HOST or HOST:PORT", remedy=remedy)

@@ -14,7 +14,7 @@ from hil.cli.arguments import JsonOption, QuietOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.errors import InputError
-from hil.files import write_or_tell
+from hil.files import write_output
 from hil.identify.options import Options
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.progress import reporter as make_reporter
@@ -60,7 +60,7 @@ def payload(
     )
     lines = payload_lines(found, wanted, outside)
     if urdf is not None:
-        write_or_tell(urdf, found.urdf)
+        write_output(urdf, found.urdf)
     typer.echo(text if json else "\n".join(lines))
     if outside or found.estimate.contradicted:
         raise typer.Exit(NOT_GOOD)

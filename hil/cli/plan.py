@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, exactly_one, print_json
 from hil.errors import InputError
-from hil.files import write_atomically, writing_to
+from hil.files import convert_write_errors, write_atomically
 from hil.move import random_via_points
 from hil.plots import check_format, draw_plan, save
-from hil.reading import json_of, named_text
+from hil.reading import parse_json, read_input
 from hil.terminal_text import printable
 from planner.errors import (
     InvalidPlanFile,
@@ -46,11 +46,11 @@ def read_plan_file(path: Path) -> PlanFile:
     Raises:
         InputError: it cannot be read, or is not a plan.
     """
-    text = named_text(path).removeprefix("\ufeff")
+    text = read_input(path).removeprefix("\ufeff")
     try:
         if path.suffix.lower() == ".toml":
             return PlanFile.from_toml(text)
-        return PlanFile.from_dict(json_of(text))
+        return PlanFile.from_dict(parse_json(text))
     except (ValueError, AttributeError) as error:
         raise InputError(path, str(error), remedy="name a plan file") from error
     except RecursionError as error:
@@ -102,7 +102,7 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
         InputError: a row is not one finite number per joint.
     """
     # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
-    lines = enumerate(named_text(path).removeprefix("\ufeff").splitlines(), 1)
+    lines = enumerate(read_input(path).removeprefix("\ufeff").splitlines(), 1)
     rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]
     rows = [(number, cells) for number, cells in rows if cells]
     if rows and all(_number(cell) is None for cell in rows[0][1]):  # names
@@ -281,5 +281,5 @@ def _worst(plan: MotionPlan) -> tuple[float, str, int]:
 
 
 def _write(path: Path, text: str) -> None:
-    with writing_to(path):
+    with convert_write_errors(path):
         write_atomically(path, text)

@@ -9,7 +9,7 @@ import typer
 
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
-from hil.files import make_folder, write_atomically, writing_to
+from hil.files import convert_write_errors, make_folder, write_atomically
 from hil.plots import save
 from hil.plots.archive_view import archive_page, draw_archive, view_of
 from hil.plots.plan_picture import FORMATS
@@ -57,7 +57,7 @@ def plot(
     view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
     make_folder(target.parent)
     if kind == PAGE:
-        with writing_to(target):
+        with convert_write_errors(target):
             write_atomically(target, archive_page(view))
     else:
         save(draw_archive(view), target)

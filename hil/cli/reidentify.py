@@ -13,15 +13,15 @@ from typing import Annotated, Any, Final
 import typer
 
 from hil.batch import run
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
-from hil.batch.types import BatchEstimator, BatchResult, Broken, LevelEstimate
+from hil.batch.types import BatchEstimator, BatchResult, LevelEstimate, Unused
 from hil.batch.workers import LocalWorkers, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
 from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
-from hil.files import make_folder, write_atomically, writing_to
+from hil.files import convert_write_errors, make_folder, write_atomically
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
 
@@ -67,16 +67,16 @@ def reidentify(
     if output is not None:
         make_folder(output)
     options, keep = how.options(estimator=estimator), cache != "none"
-    where = Where(str(Path(cache).resolve()) if keep and cache else None, keep)
+    location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
     with _workers(dask, workers, places) as hands:
-        result = run.reidentify(places, options, hands, reporter, where=where)
+        result = run.reidentify(places, options, hands, reporter, cache=location)
     found = trends(result)
     written: list[Path] = []
     if output is not None:
         from hil.report.changes import trend_page  # matplotlib is slow to import
 
         page = output / "trend.html"
-        with writing_to(output):
+        with convert_write_errors(output):
             written = [*write_tables(output, result), page]
             write_atomically(page, trend_page(found))
     if json:
@@ -178,7 +178,7 @@ def _above(folders: Sequence[str]) -> str:
     return "/".join([*shared, ""]) if shared and len(set(folders)) > 1 else ""
 
 
-def unused_lines(broken: Sequence[Broken]) -> Iterator[str]:
+def unused_lines(broken: Sequence[Unused]) -> Iterator[str]:
     """The first of what could not be used, and why."""
     for one in broken[:_MOST_LINES]:
         yield f"{one.path} could not be used: {one.reason}"
@@ -186,7 +186,7 @@ def unused_lines(broken: Sequence[Broken]) -> Iterator[str]:
         yield f"and {more} more: see --output and --json"
 
 
-def skipped_line(skipped: Sequence[Broken]) -> str:
+def skipped_line(skipped: Sequence[Unused]) -> str:
     """How many archives were left alone, by reason without the archive or number it names."""
     counts: Counter[str] = Counter()
     for one in skipped:

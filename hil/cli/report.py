@@ -8,7 +8,7 @@ import typer
 
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
-from hil.files import make_folder, write_together
+from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
 from hil.results import Results, csv_tables
 
@@ -31,7 +31,7 @@ def report(
     page = opened.report(reporter=make_reporter(quiet=quiet or json))
     if csv is not None:
         make_folder(csv)
-        write_together(csv, csv_tables(Results.load(opened.folder.results)))
+        write_files(csv, csv_tables(Results.load(opened.folder.results)))
     if not json:
         typer.echo(page)
         return

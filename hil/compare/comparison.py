@@ -20,8 +20,8 @@ from scipy.stats import t as student
 
 from hil.batch import run
 from hil.batch.estimates import errors, relative_error
-from hil.batch.factors import cell_in, opened
-from hil.batch.types import ArchiveRef, Arm, Broken, LevelEstimate
+from hil.batch.factors import cell_in, open_ref
+from hil.batch.types import ArchiveRef, Arm, LevelEstimate, Unused
 from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.errors import InputError
@@ -102,7 +102,7 @@ class Gathered:
     campaigns: tuple[LevelEstimate, ...]
     repetitions: tuple[tuple[LevelEstimate, ...], ...]
     dated: bool
-    broken: tuple[Broken, ...]
+    broken: tuple[Unused, ...]
     simulated: bool = False
 
 
@@ -231,7 +231,7 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
 
 
 def _cell(ref: ArchiveRef) -> Cell:
-    with opened(ref) as archive:
+    with open_ref(ref) as archive:
         return cell_in(archive)
 
 

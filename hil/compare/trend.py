@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau, theilslopes
 from scipy.stats import t as student
 
-from hil.batch.types import BatchResult, Broken, LevelEstimate
-from hil.reading import instant
+from hil.batch.types import BatchResult, LevelEstimate, Unused
+from hil.reading import parse_time
 from hil.terminal_text import plural
 from identification import RobotModel
 
@@ -138,10 +138,10 @@ class Trends:
     """All arms of a batch by name, what was not used for it, and how many archives were fitted."""
 
     arms: tuple[ArmTrend, ...]
-    broken: tuple[Broken, ...]
+    broken: tuple[Unused, ...]
     estimator: str
     archives: int
-    skipped: tuple[Broken, ...] = ()
+    skipped: tuple[Unused, ...] = ()
 
 
 def trends(result: BatchResult) -> Trends:
@@ -164,7 +164,7 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
     Campaigns without a time of recording are left out if others have one, since nobody knows where
     they belong. If none has, all are used in the order of their folders' names.
     """
-    known = [(at.timestamp(), one) for one in campaigns if (at := instant(one.when)) is not None]
+    known = [(at.timestamp(), one) for one in campaigns if (at := parse_time(one.when)) is not None]
     if known:
         known.sort(key=lambda pair: (pair[0], pair[1].campaign))
         ordered = [one for _, one in known]

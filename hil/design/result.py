@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import digest, json_digest, write_atomically
-from hil.reading import text_of
+from hil.reading import read_text
 from hil.version import software
 from identification.excitation import (
     CRITERIA,
@@ -178,7 +178,7 @@ class DesignResult:
         """
         path = path / RESULT if path.is_dir() else path
         try:
-            text = text_of(path)
+            text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             remedy = "name a file that `hil design` wrote"

@@ -11,10 +11,10 @@ from typing import Any, BinaryIO, cast
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
-from hil.files import exclusive_folder, write_atomically
+from hil.files import lock_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
-from hil.reading import opened
+from hil.reading import open_file
 from identification import excitation
 from planner.toml_text import to_text
 
@@ -40,7 +40,7 @@ class DesignFolder:
 
     def held(self) -> AbstractContextManager[None]:
         """Make the folder, and keep every other search out of it until this is left."""
-        return exclusive_folder(self.root, "search", "-o")
+        return lock_folder(self.root, "search", "-o")
 
     def begin(self, settings: DesignSettings, *, force: bool) -> None:
         """Make room for a new design, and write down what is asked for; the folder is held.
@@ -79,7 +79,7 @@ class DesignFolder:
     def _begun(self) -> bool:
         """Whether the settings in the folder are those of a design, not a person's own."""
         try:
-            with opened(self.settings) as file:
+            with open_file(self.settings) as file:
                 return file.read(len(_HEAD)) == _HEAD.encode()
         except OSError:
             return False
@@ -94,7 +94,7 @@ class DesignFolder:
         with self._written():
             # Without a buffer nothing is left that closing the file would fail to write.
             if self.journal.exists():
-                opened(self.journal).close()  # which refuses what is no file
+                open_file(self.journal).close()  # which refuses what is no file
             file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
         with file:
             yield cast(BinaryIO, file)

@@ -25,7 +25,7 @@ from pydantic import (
 
 from hil.cell.errors import first_error
 from hil.errors import InputError
-from hil.reading import text_of, toml_of
+from hil.reading import parse_toml, read_text
 
 Method = Literal["a", "b", "balanced", "front"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
@@ -311,7 +311,7 @@ def load_settings(path: Path) -> DesignSettings:
         SettingsError: names file, field, value and remedy.
     """
     try:
-        raw = toml_of(text_of(path))
+        raw = parse_toml(read_text(path))
     except OSError as error:
         problem = f"cannot be read ({error.strerror})"
         raise SettingsError(path, problem, remedy="name a TOML file") from error

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.reading import text_of, toml_of
+from hil.reading import parse_toml, read_text
 
 from .check import Check, Status, System, bad, named, ok, unknown, warn
 
@@ -32,7 +32,7 @@ def controller_in(path: Path) -> ControllerTable:
     try:
         return Cell.load(path).controller
     except UnknownFieldsError as unknown:
-        table = toml_of(text_of(path)).get("controller")
+        table = parse_toml(read_text(path)).get("controller")
         if table is None or any(name.startswith("controller.") for name in unknown.fields):
             raise
         try:

@@ -15,7 +15,7 @@ from hil.campaign.status import conduct_of
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.progress import Reporter
-from hil.reading import lies_there
+from hil.reading import path_exists
 from hil.report import ReportSeries
 from hil.results import Results
 from identification import Factor, IdentificationError, RobotModel, estimate
@@ -117,7 +117,7 @@ def identify_sources(
         raise InputError(
             folder, "is a folder among archives", remedy="name one campaign folder, or files"
         )
-    if lies_there(folder / "manifest.json"):
+    if path_exists(folder / "manifest.json"):
         return identify_campaign(folder, reporter, options, predict=predict)
     loose = sorted(folder.glob("*.mcap"))  # of `hil record`
     if not loose:

@@ -20,7 +20,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import file_digest
-from hil.reading import lies_there
+from hil.reading import path_exists
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
 from identification.signals.noise import standstill_variance
@@ -240,7 +240,7 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
             yield path
             continue
         folder = CampaignFolder(path)
-        if lies_there(path / "manifest.json"):
+        if path_exists(path / "manifest.json"):
             kinds = ("excitation", "validation", "standstill")
             inside = [archive for kind in kinds for archive in folder.completed(kind)]
         else:

@@ -25,7 +25,7 @@ from hil.archive.cdr import LayoutError, MessageLayout, layout_of
 from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
-from hil.reading import opened, text_of
+from hil.reading import open_file, read_text
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 
@@ -147,7 +147,7 @@ class ArrayFile:
             SourceError: it cannot be read, or holds no array of numbers.
         """
         with _readable(path):
-            opened(path).close()  # no pipe, which would be waited for
+            open_file(path).close()  # no pipe, which would be waited for
             found = READERS[path.suffix.lower()](path)
         usable = {
             name: array
@@ -415,7 +415,7 @@ atexit.register(_close)
 
 def _matlab_text(path: Path) -> dict[str, Stored]:
     """Matrices of a MATLAB or Octave script."""
-    text = _COMMENT.sub("", text_of(path).removeprefix("\ufeff")).replace("...", " ")
+    text = _COMMENT.sub("", read_text(path).removeprefix("\ufeff")).replace("...", " ")
     found = {}
     for name, body in _ASSIGNED.findall(text):
         rows = [row.replace(",", " ").split() for row in re.split(r"[;\n]", body)]

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from hil.errors import SourceError
-from hil.reading import text_of, toml_of
+from hil.reading import parse_toml, read_text
 
 ANGLES = {
     "rad": 1.0,
@@ -212,7 +212,7 @@ class ColumnMap(_Table):
         """
         path = Path(path)
         try:
-            return cls.model_validate(toml_of(text_of(path)))
+            return cls.model_validate(parse_toml(read_text(path)))
         except ValidationError as error:
             place, problem = _complaint(error)
             raise SourceError(

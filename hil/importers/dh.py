@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple, get_args
 from xml.sax.saxutils import quoteattr
 
 from hil.errors import InputError
-from hil.reading import named_text
+from hil.reading import read_input
 
 Convention = Literal["standard", "modified"]
 CONVENTIONS: Final[tuple[Convention, ...]] = get_args(Convention)
@@ -133,7 +133,7 @@ def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
 
 
 def _rows(path: Path) -> list[_Row]:
-    lines = named_text(path, "name a table of DH parameters").removeprefix("\ufeff").splitlines()
+    lines = read_input(path, "name a table of DH parameters").removeprefix("\ufeff").splitlines()
     filled = [
         (number, line)
         for number, line in enumerate(lines, 1)

@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 from hil.archive import container
 from hil.archive.container import Damage, Record
 from hil.errors import SourceError
-from hil.reading import opened
+from hil.reading import open_file
 
 LARGEST_CHUNK: Final = 1 << 28
 """Bytes of records in one chunk; usual are one to sixteen million."""
@@ -123,7 +123,7 @@ def _records(stream: BinaryIO) -> Iterator[Record]:
 def _opened(path: Path) -> Iterator[BinaryIO]:
     """The file; whatever reading it says becomes our error."""
     try:
-        with opened(path) as stream:
+        with open_file(path) as stream:
             yield stream
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error

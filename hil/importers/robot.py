@@ -22,7 +22,7 @@ from hil.errors import SourceError
 from hil.files import file_digest
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import check_clock, examine, limits_of
-from hil.reading import named_text
+from hil.reading import read_input
 from identification import FrictionLaw
 from identification.errors import ModelError
 from identification.model.kinematics import pinocchio_model
@@ -87,7 +87,7 @@ class Robot:
         """
         path = Path(path)
         otherwise = "name a URDF file"
-        urdf = named_text(path, otherwise) if convention is None else urdf_of_dh(path, convention)
+        urdf = read_input(path, otherwise) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
         except ModelError as error:  # about this file, and not about a cell that nobody wrote

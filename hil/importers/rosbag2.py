@@ -25,7 +25,7 @@ from hil.errors import SourceError
 from hil.importers import mcap_messages
 from hil.importers.mcap_messages import JOINT_STATES, Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
-from hil.reading import opened
+from hil.reading import open_file
 
 SUFFIXES = (".db3", ".mcap")
 _PACKED = (".zstd", ".zst")
@@ -62,7 +62,7 @@ def bag_files(source: Path) -> list[Path]:
 def _regular(file: Path) -> Path:
     """The same; no pipe, which would be waited for."""
     try:
-        opened(file).close()
+        open_file(file).close()
     except OSError as error:
         raise SourceError(file, f"cannot be read: {error.strerror}") from error
     return file

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hil.errors import SourceError
 from hil.importers.column_map import Column, Format
-from hil.reading import text_of
+from hil.reading import read_text
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ class Table:
             SourceError: it cannot be read, has no row of numbers, or a line without any.
         """
         try:
-            text = text_of(path, _LONGEST).removeprefix("\ufeff")
+            text = read_text(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({why})"

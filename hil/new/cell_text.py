@@ -26,7 +26,7 @@ from hil.cell.text import urdf_limits, with_values
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
 from hil.motion_checks import collision_checker
-from hil.reading import named_text, text_of
+from hil.reading import read_input, read_text
 from identification.errors import ModelError
 from identification.excitation.constraints import clearance
 from identification.model.kinematics import Chain, chain_from_urdf
@@ -267,7 +267,7 @@ def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     Raises:
         InputError: it cannot be read, or is no URDF of an open chain.
     """
-    return _cell_of(path, named_text(path, "name a URDF"), fixed)
+    return _cell_of(path, read_input(path, "name a URDF"), fixed)
 
 
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
@@ -336,7 +336,7 @@ def with_clear_home(text: str, new: NewCell, path: Path) -> str:
     The first clear posture with none to three joints a right angle away from the home that is
     there; that stays where none is clear, or the URDF has no shapes.
     """
-    urdf = new.urdf if new.urdf is not None else text_of(new.urdf_path)
+    urdf = new.urdf if new.urdf is not None else read_text(new.urdf_path)
     cell = Cell.from_texts(text, urdf, path)
     try:
         checker = collision_checker(cell)

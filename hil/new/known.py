@@ -25,7 +25,7 @@ from hil.campaign.motion_link import END_TIMEOUT
 from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
 from hil.errors import ArchiveError, ControllerFault, OperatorStopError
-from hil.reading import toml_of
+from hil.reading import parse_toml
 
 _DECIMALS: Final = 3
 """Of degrees: rounding stays below what a cell may exceed its URDF's limits by."""
@@ -177,7 +177,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
     known = Known()
     if "cell.toml" in archive.attachments:
         try:
-            tables = toml_of(archive.text("cell.toml"))
+            tables = parse_toml(archive.text("cell.toml"))
         except ValueError as error:
             raise refusal(f"is no TOML ({error})", "cell.toml") from error
         loose = [name for name, entries in tables.items() if not isinstance(entries, Mapping)]

@@ -24,7 +24,7 @@ from hil.compare.trend import (
     findings,
     summary,
 )
-from hil.reading import instant
+from hil.reading import parse_time
 from hil.report.drawing import (
     BAND,
     DASHED,
@@ -133,7 +133,7 @@ def _panel(
     if not known.any():
         return
     # Days of matplotlib, or numbers of the campaigns.
-    first = instant(arm.campaigns[0].when) if arm.dated else None
+    first = parse_time(arm.campaigns[0].when) if arm.dated else None
     at = arm.time + (0.0 if first is None else first.timestamp() / _DAY)
     low, high = float((values - half)[known].min()), float((values + half)[known].max())
     # Never a scale that makes a change of nothing look like much; limits far away may leave it.

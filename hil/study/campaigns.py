@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
-from hil.batch.types import Broken
+from hil.batch.types import Unused
 from hil.batch.workers import ArchiveTask, LocalWorkers
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
@@ -433,7 +433,7 @@ def in_children(
     with reporter.task(title, of) as task:
         task.advance(of - len(tasks))
         for one in workers.results(tasks, task.advance):
-            if isinstance(one, Broken):
+            if isinstance(one, Unused):
                 raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")
             found.append(one)
     return found

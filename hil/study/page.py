@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from hil.files import write_together
+from hil.files import write_files
 from hil.progress import Reporter
 from hil.report import drawing
 from hil.report.figures import matrix_panel
@@ -27,7 +27,7 @@ def write_outcome(root: Path, results: StudyResults, reporter: Reporter) -> None
     Raises:
         OutputError: they cannot be written.
     """
-    write_together(root, {"results.json": results.to_json(), "report.html": study_page(results)})
+    write_files(root, {"results.json": results.to_json(), "report.html": study_page(results)})
     reporter.say(f"report: {root / 'report.html'}")
 
 

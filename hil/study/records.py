@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from hil.batch.workers import LocalWorkers
 from hil.campaign import CampaignFolder
-from hil.files import json_digest, make_folder, write_or_tell
+from hil.files import json_digest, make_folder, write_output
 from hil.identify.options import FIXED
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import executed_rows, moving_rows
 from hil.progress import Reporter, Silent
-from hil.reading import text_of
+from hil.reading import read_text
 from hil.results import Frozen
 from identification import Factor, RobotModel
 from identification.estimators.least_squares import estimate_repetitions
@@ -111,7 +111,7 @@ R = TypeVar("R", bound=Record)
 def read_record(path: Path, kind: type[R], inputs: str) -> R | None:
     """The record in a file, if it rests on these inputs."""
     try:
-        record = kind.model_validate_json(text_of(path))
+        record = kind.model_validate_json(read_text(path))
     except (OSError, ValueError):
         return None
     return record if record.inputs == inputs else None
@@ -120,7 +120,7 @@ def read_record(path: Path, kind: type[R], inputs: str) -> R | None:
 def write_record(path: Path, record: Record) -> None:
     """Write a record."""
     make_folder(path.parent)
-    write_or_tell(path, record.model_dump_json() + "\n")
+    write_output(path, record.model_dump_json() + "\n")
 
 
 # What a motion says of any estimate

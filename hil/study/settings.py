@@ -10,8 +10,8 @@ from typing import Annotated, Final, TypeVar
 from pydantic import Field
 
 from hil.errors import InputError
-from hil.files import exclusive_folder, write_or_tell
-from hil.reading import text_of
+from hil.files import lock_folder, write_output
+from hil.reading import read_text
 from hil.results import Frozen
 
 M = TypeVar("M", bound=Frozen)
@@ -103,7 +103,7 @@ def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
         InputError: it cannot be read, or is not of this kind.
     """
     try:
-        return kind.model_validate_json(text_of(path))
+        return kind.model_validate_json(read_text(path))
     except (OSError, ValueError) as error:
         raise InputError(path, f"{problem} ({error})", remedy=remedy) from error
 
@@ -134,7 +134,7 @@ class StudyFolder:
 
     def locked(self) -> AbstractContextManager[None]:
         """Make the folder, and keep every other study out of it until this is left."""
-        return exclusive_folder(self.root, "study", "--output")
+        return lock_folder(self.root, "study", "--output")
 
     def begin(self, settings: StudySettings) -> None:
         """Write down what is asked for, or resume a study that was asked for the same.
@@ -146,7 +146,7 @@ class StudyFolder:
         if not self.settings.exists():
             if any(self.root.iterdir()):
                 raise InputError(self.root, "is not empty and holds no study", remedy=remedy)
-            write_or_tell(self.settings, settings.to_json())
+            write_output(self.settings, settings.to_json())
             return
         there = load_json(StudySettings, self.settings, "is not the settings of a study", remedy)
         for name in StudySettings.model_fields:

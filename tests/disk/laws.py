@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.run import reidentify
 from hil.batch.workers import Workers
 from hil.compare import gather
@@ -115,7 +115,7 @@ def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
 
 
 def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
-    if check_archive(path).keeps and not _same(open_archive(path), truth.archives[path]):
+    if check_archive(path).conforms and not _same(open_archive(path), truth.archives[path]):
         yield f"{path.name}: keeps the profile with other content"
 
 
@@ -179,7 +179,7 @@ def _by_archive(
     root: Path, workers: Workers
 ) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
     """Estimates of a batch by archive or "" for all, and what it says."""
-    result = reidentify([str(root)], FIXED, workers, Silent(), where=Where(keep=False))
+    result = reidentify([str(root)], FIXED, workers, Silent(), cache=CacheLocation(keep=False))
     found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
     found[""] = (result.pooled[0].values, result.pooled[0].std)
     said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]

@@ -224,7 +224,7 @@ def checked(folder: Path) -> dict[str, Any]:
         outcomes[outcome.outcome] = outcomes.get(outcome.outcome, 0) + 1
         lost += outcome.records_lost or 0
         records += check.samples
-        if not check.keeps:
+        if not check.conforms:
             faulty.append(f"{path.name}: {dict(check.faults)}")
     return {
         "archives": len(paths), "outcomes": outcomes, "faulty": faulty, "records": records,

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from hil.batch.discovery import Place
-from hil.batch.types import ArchiveRef, Broken
+from hil.batch.discovery import Location
+from hil.batch.types import ArchiveRef, Unused
 from hil.batch.workers import ArchiveTask, Workers, run_task
 from hil.errors import ArchiveError
 
@@ -26,8 +26,8 @@ class Here(Workers):
 
     count = 1
 
-    def __init__(self, *deadly: str, near: bool = True) -> None:
-        self.deadly, self.near = deadly, near
+    def __init__(self, *deadly: str, local: bool = True) -> None:
+        self.deadly, self.local = deadly, local
         self.tasks: list[ArchiveTask[Any]] = []
 
     def results(
@@ -38,13 +38,13 @@ class Here(Workers):
             if done is not None:
                 done(1)
             deadly = any(ref.name in self.deadly for ref in _refs(task.arguments[0]))
-            yield Broken(task.path, "ended its process") if deadly else run_task(task)
+            yield Unused(task.path, "ended its process") if deadly else run_task(task)
 
 
 def _refs(argument: Any) -> Iterator[ArchiveRef]:
     if isinstance(argument, ArchiveRef):
         yield argument
-    elif not isinstance(argument, Place):  # looking into an archive is harmless
+    elif not isinstance(argument, Location):  # looking into an archive is harmless
         for one in argument:
             yield from _refs(one)
 

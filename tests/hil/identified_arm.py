@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.files import write_together
+from hil.files import write_files
 from hil.identify.run import consistency_of
 from hil.outcome import Exports, exports_of
 from identification import Estimate, Motion
@@ -48,7 +48,7 @@ class IdentifiedArm:
 def write_exports(folder: Path, *args: Any, **kwargs: Any) -> Exports:
     """Write what `exports_of` makes of the arguments."""
     exports = exports_of(*args, **kwargs)
-    write_together(folder, exports.contents)
+    write_files(folder, exports.contents)
     return exports
 
 

@@ -22,10 +22,10 @@ from benchmarks import archive_files
 from hil.archive import ArchiveWriter, Samples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.batch import discovery, factors
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.discovery import Discovery, discover
 from hil.batch.estimates import warning_lines
-from hil.batch.factors import cached, opened, reduced
+from hil.batch.factors import cached_bundle, open_ref, reduce_bundle
 from hil.batch.run import reidentify
 from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult, ChangedError
 from hil.batch.workers import LocalWorkers
@@ -51,7 +51,7 @@ from .conftest import small
 from .mcap_bytes import with_attachment
 
 EXACT = {"rtol": 1e-9, "atol": 0.0}
-UNCACHED = Where(keep=False)
+UNCACHED = CacheLocation(keep=False)
 SETTINGS = Settings(Preprocessing())
 PAYLOAD = "[robot.payload]\nmass = 3.0\ncentre = [0.02, 0.0, 0.08]\n\n[robot.friction]"
 
@@ -59,16 +59,16 @@ PAYLOAD = "[robot.payload]\nmass = 3.0\ncentre = [0.02, 0.0, 0.08]\n\n[robot.fri
 def batch(
     *places: Path | str,
     options: Options = FIXED,
-    where: Where = UNCACHED,
+    cache: CacheLocation = UNCACHED,
     workers: Any = None,
     **changed: Any,
 ) -> BatchResult:
     names, options = [str(place) for place in places], replace(options, **changed)
-    return reidentify(names, options, workers or Here(), Silent(), where=where)
+    return reidentify(names, options, workers or Here(), Silent(), cache=cache)
 
 
-def found_in(*roots: Path | str, where: Where = UNCACHED) -> Discovery:
-    return discover([str(root) for root in roots], where, Here())
+def found_in(*roots: Path | str, cache: CacheLocation = UNCACHED) -> Discovery:
+    return discover([str(root) for root in roots], cache, Here())
 
 
 def names_of(ones: Any) -> list[str]:
@@ -248,10 +248,10 @@ class TestNumbers:
             alone = batch(folder, workers=workers)
         files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
         assert same_bits(alone, batch(*files))
-        assert same_bits(alone, batch(folder, workers=Here(near=False)))
-        cached = Where(str(tmp_path / "cache"))
-        assert same_bits(alone, batch(folder, where=cached))
-        assert same_bits(alone, batch(folder, where=cached))
+        assert same_bits(alone, batch(folder, workers=Here(local=False)))
+        place = CacheLocation(str(tmp_path / "cache"))
+        assert same_bits(alone, batch(folder, cache=place))
+        assert same_bits(alone, batch(folder, cache=place))
 
 
 class TestCache:
@@ -262,7 +262,7 @@ class TestCache:
         for path in (folder / "archives").glob("*.mcap"):
             os.utime(path, (long_ago, long_ago))
         monkeypatch.setattr("hil.batch.discovery._UNTOUCHED", 0)
-        first = batch(folder, where=Where())
+        first = batch(folder, cache=CacheLocation())
         assert (first.read, first.cached) == (5, 0)
 
         def never(*_: object, **__: object) -> None:
@@ -271,7 +271,7 @@ class TestCache:
         monkeypatch.setattr(factors, "open_archive", never)
         monkeypatch.setattr("hil.batch.discovery.open_archive", never)
         workers = Here()
-        second = batch(folder, where=Where(), workers=workers, estimator="consistent")
+        second = batch(folder, cache=CacheLocation(), workers=workers, estimator="consistent")
         assert (second.read, second.cached, workers.tasks) == (0, 5, [])
         assert "consistent" in second.campaigns[0].method
 
@@ -279,23 +279,23 @@ class TestCache:
         archive = sorted((folder / "archives").glob("excitation_002*"))[0]
         away = folder.parent / archive.name
         archive.rename(away)
-        assert batch(folder, where=Where()).read == 4
+        assert batch(folder, cache=CacheLocation()).read == 4
         away.rename(archive)
-        longer = batch(folder, where=Where())
+        longer = batch(folder, cache=CacheLocation())
         assert longer.read == 1
         assert same_bits(longer, batch(folder))
 
     def test_of_other_settings_is_another(self, folder: Path) -> None:
-        batch(folder, where=Where())
-        assert batch(folder, where=Where(), delay=0.002).read == 5
+        batch(folder, cache=CacheLocation())
+        assert batch(folder, cache=CacheLocation(), delay=0.002).read == 5
 
     def test_of_a_read_only_folder_lies_elsewhere(
         self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
         monkeypatch.setattr("os.access", lambda *_: False)
-        assert batch(folder, where=Where()).read == 5
-        assert batch(folder, where=Where()).read == 0
+        assert batch(folder, cache=CacheLocation()).read == 5
+        assert batch(folder, cache=CacheLocation()).read == 0
         assert not (folder / "archives" / ".hil-cache").exists()
         assert list((tmp_path / "xdg" / "hil").iterdir())
 
@@ -315,8 +315,8 @@ class TestBroken:
         (loose / "nothing.mcap").write_bytes(b"")
         (loose / "other.mcap").write_bytes(b"not an archive at all")
         damage(damaged)
-        for where in (Where(), Where(), UNCACHED):
-            result = batch(loose, where=where)
+        for cache in (CacheLocation(), CacheLocation(), UNCACHED):
+            result = batch(loose, cache=cache)
             reasons = reasons_of(result.broken)
             assert set(reasons) == {torn.name, damaged.name, "nothing.mcap", "other.mcap"}
             assert "repair" in reasons[torn.name]
@@ -779,24 +779,24 @@ class TestNotes:
         self, old_archive: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         opened_so_far = opening(monkeypatch)
-        first = found_in(old_archive, where=Where())
-        assert found_in(old_archive, where=Where()) == first
+        first = found_in(old_archive, cache=CacheLocation())
+        assert found_in(old_archive, cache=CacheLocation()) == first
         assert opened_so_far() == 1
         monkeypatch.setattr(discovery, "code_digest", lambda: "other programs")
         monkeypatch.setattr(discovery, "arm_digest", lambda *_, **__: "another idea of an arm")
-        (ref,) = found_in(old_archive, where=Where()).refs
+        (ref,) = found_in(old_archive, cache=CacheLocation()).refs
         assert ref.arm == "another idea of an arm"
         assert opened_so_far() == 2
 
     def test_spare_workers_what_is_known(self, tmp_path: Path, arm: Cell) -> None:
         for name in ("a", "b", "c"):
             recording(tmp_path / f"{name}.mcap", arm)
-        where = Where(str(tmp_path / "cache"))
+        cache = CacheLocation(str(tmp_path / "cache"))
         with LocalWorkers(2) as workers:
-            found = discover([str(tmp_path)], where, workers)
+            found = discover([str(tmp_path)], cache, workers)
         assert [ref.name for ref in found.refs] == ["a.mcap", "b.mcap", "c.mcap"]
-        far = Here(near=False)
-        assert discover([str(tmp_path)], where, far) == found
+        far = Here(local=False)
+        assert discover([str(tmp_path)], cache, far) == found
         assert [task.path for task in far.tasks] == [ref.location for ref in found.refs]
 
 
@@ -816,15 +816,15 @@ class TestChanges:
         self, remote: tuple[str, bytes], tmp_path: Path
     ) -> None:
         address, other = remote
-        where = Where(str(tmp_path / "cache"))
-        (ref,) = discover([address], where, Here()).refs
-        with opened(ref):
+        cache = CacheLocation(str(tmp_path / "cache"))
+        (ref,) = discover([address], cache, Here()).refs
+        with open_ref(ref):
             pass
         fsspec.filesystem("memory").pipe(address, other)
-        with pytest.raises(ChangedError), opened(ref):
+        with pytest.raises(ChangedError), open_ref(ref):
             pass
-        assert "changed" in reduced((ref,), SETTINGS, where).broken[0].reason
-        assert cached((ref,), SETTINGS, where) is None
+        assert "changed" in reduce_bundle((ref,), SETTINGS, cache).broken[0].reason
+        assert cached_bundle((ref,), SETTINGS, cache) is None
 
     def test_while_it_is_read_are_no_fault_of_the_archive(
         self, tmp_path: Path, arm: Cell, monkeypatch: pytest.MonkeyPatch
@@ -833,34 +833,34 @@ class TestChanges:
         (ref,) = found_in(path).refs
         read = factors.open_archive
 
-        def written_to(where: Path, **how: object):
+        def written_to(cache: Path, **how: object):
             path.write_bytes(path.read_bytes()[:-500])
-            return read(where, **how)
+            return read(cache, **how)
 
         monkeypatch.setattr(factors, "open_archive", written_to)
-        with pytest.raises(ChangedError), opened(ref):
+        with pytest.raises(ChangedError), open_ref(ref):
             pass
-        where = Where(str(tmp_path / "cache"))
-        assert reduced((ref,), SETTINGS, where).broken
-        assert cached((ref,), SETTINGS, where) is None
+        cache = CacheLocation(str(tmp_path / "cache"))
+        assert reduce_bundle((ref,), SETTINGS, cache).broken
+        assert cached_bundle((ref,), SETTINGS, cache) is None
 
     def test_of_a_store_that_fails_are_not_cached(
         self, remote: tuple[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         address, _ = remote
-        where = Where(str(tmp_path / "cache"))
-        (ref,) = discover([address], where, Here()).refs
+        cache = CacheLocation(str(tmp_path / "cache"))
+        (ref,) = discover([address], cache, Here()).refs
 
         def busy(*_: object) -> None:
             raise RuntimeError("503, Service Unavailable")
 
         with monkeypatch.context() as patch:
             patch.setattr(fsspec.get_filesystem_class("memory"), "get_file", busy)
-            with pytest.raises(InputError, match="503"), opened(ref):
+            with pytest.raises(InputError, match="503"), open_ref(ref):
                 pass
-            failed = reduced((ref,), SETTINGS, where)
+            failed = reduce_bundle((ref,), SETTINGS, cache)
             assert "503" in failed.broken[0].reason
-        again = reduced((ref,), SETTINGS, where)
+        again = reduce_bundle((ref,), SETTINGS, cache)
         assert again.read == 1
         assert "503" not in str(again.broken)
 
@@ -871,17 +871,20 @@ class TestChanges:
         data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
         path.write_bytes(data)
         now = replace(ref, stamp=factors.stamp_of(path))
-        where = Where(str(tmp_path / "cache"))
-        found, again = reduced((now,), SETTINGS, where), cached((now,), SETTINGS, where)
+        cache = CacheLocation(str(tmp_path / "cache"))
+        found, again = (
+            reduce_bundle((now,), SETTINGS, cache),
+            cached_bundle((now,), SETTINGS, cache),
+        )
         assert again is not None and again.broken == found.broken
 
     def test_of_nothing_read_a_store_from_the_cache(self, folder: Path, tmp_path: Path) -> None:
         store = fsspec.filesystem("memory")
         for path in sorted((folder / "archives").glob("*.mcap")):
             store.pipe(f"memory://{tmp_path.name}/archives/{path.name}", path.read_bytes())
-        where = Where(str(tmp_path / "cache"))
-        far, near = (batch(at, where=where) for at in (f"memory://{tmp_path.name}", folder))
+        cache = CacheLocation(str(tmp_path / "cache"))
+        far, near = (batch(at, cache=cache) for at in (f"memory://{tmp_path.name}", folder))
         assert not far.broken
         assert far.campaigns[0].values.tobytes() == near.campaigns[0].values.tobytes()
-        again = batch(f"memory://{tmp_path.name}", where=where)
+        again = batch(f"memory://{tmp_path.name}", cache=cache)
         assert (again.read, again.cached) == (0, 5)

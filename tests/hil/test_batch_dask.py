@@ -18,16 +18,16 @@ import pytest
 
 from hil.batch import cluster as dask_cluster
 from hil.batch import run
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.cluster import (
     ClusterError,
     DaskWorkers,
     WorkerSoftwareError,
-    perform,
+    perform_task,
     release_children,
-    software,
+    software_versions,
 )
-from hil.batch.types import Broken
+from hil.batch.types import Unused
 from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import Campaign
 from hil.errors import InputError
@@ -172,7 +172,7 @@ class TestResults:
             tasks[k] = work.task(harm, k)
         with connected(cluster, timeout=2.0) as workers:
             found = list(workers.results(tasks))
-        broken = {k: one for k, one in enumerate(found) if isinstance(one, Broken)}
+        broken = {k: one for k, one in enumerate(found) if isinstance(one, Unused)}
         assert [k for k in range(20) if found[k] == k] == [k for k in range(20) if k not in broken]
         assert [(k, broken[k].path) for k in broken] == [(k, tasks[k].path) for k in (3, 8, 9, 15)]
         for k, words in {
@@ -215,7 +215,7 @@ class TestWorkers:
                 tasks = tasks_of(work.number, 12)
                 tasks[5] = work.task(work.kill_worker, 5)
                 found = list(workers.results(tasks))
-        assert found[5] == Broken(tasks[5].path, "ended every worker that read it")
+        assert found[5] == Unused(tasks[5].path, "ended every worker that read it")
         assert found[:5] + found[6:] == [k for k in range(12) if k != 5]
 
     def test_with_other_code_are_refused(
@@ -226,9 +226,9 @@ class TestWorkers:
             connected(cluster)
 
     def test_with_other_code_that_join_later_compute_nothing(self) -> None:
-        expected = software() | {"hil": "other code"}
+        expected = software_versions() | {"hil": "other code"}
         with pytest.raises(WorkerSoftwareError, match=r"hil \w+ instead of other code"):
-            perform(work.task(work.number, 0), timeout=PATIENCE, expected=expected)
+            perform_task(work.task(work.number, 0), timeout=PATIENCE, expected=expected)
         release_children()
 
     @pytest.mark.slow
@@ -261,8 +261,8 @@ def test_a_scheduler_without_workers_is_an_error(
 @pytest.mark.slow
 def test_a_batch_has_the_bits_of_one_machine(campaign: Campaign, cluster: Cluster) -> None:
     def figures(hands: Workers) -> list[bytes]:
-        where = Where(keep=False)
-        found = run.reidentify([str(campaign.folder.root)], FIXED, hands, Silent(), where=where)
+        cache = CacheLocation(keep=False)
+        found = run.reidentify([str(campaign.folder.root)], FIXED, hands, Silent(), cache=cache)
         assert not found.broken
         levels = [*found.repetitions, *found.campaigns, *found.pooled]
         return [one.values.tobytes() + one.std.tobytes() for one in levels]

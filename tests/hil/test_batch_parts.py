@@ -26,8 +26,8 @@ from hil.batch import remote, table
 from hil.batch.cache import (
     _HEAD,
     _MAGIC,
+    CacheLocation,
     Store,
-    Where,
     arm_digest,
     code_digest,
     decoded,
@@ -35,16 +35,16 @@ from hil.batch.cache import (
     settings_digest,
     sum_key,
 )
-from hil.batch.factors import BUNDLE, bundles, cached
+from hil.batch.factors import BUNDLE, cached_bundle, split_bundles
 from hil.batch.remote import archives_below, local_file
 from hil.batch.table import TABLES, write_tables
 from hil.batch.types import (
     ArchiveRef,
     Arm,
     BatchResult,
-    Broken,
     CacheError,
     LevelEstimate,
+    Unused,
 )
 from hil.batch.workers import ArchiveTask, LocalWorkers
 from hil.cell import Cell
@@ -70,7 +70,7 @@ def a_ref(index: int, campaign: str = "/data/one") -> ArchiveRef:
 
 @given(st.permutations(range(40)))
 def test_bundles_do_not_depend_on_the_order_of_archives(order: list[int]) -> None:
-    found = bundles([a_ref(k) for k in order])
+    found = split_bundles([a_ref(k) for k in order])
     assert [len(one) for one in found] == [BUNDLE, BUNDLE, 40 - 2 * BUNDLE]
     assert [ref.index for one in found for ref in one] == list(range(40))
 
@@ -119,10 +119,10 @@ class TestCache:
 
     @pytest.mark.parametrize("forged", [[{"gram": 3}], [{"type": "PhaseFactor"}], [], {}, None])
     def test_a_forged_sum_counts_as_absent(self, tmp_path: Path, forged: object) -> None:
-        settings, where = Settings(Preprocessing()), Where(str(tmp_path))
+        settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
         key = sum_key([a_ref(0)], settings_digest(settings))
-        where.store(a_ref(0).location).put(key, forged)
-        assert cached([a_ref(0)], settings, where) is None
+        cache.store(a_ref(0).location).put(key, forged)
+        assert cached_bundle([a_ref(0)], settings, cache) is None
 
     @given(st.integers(1, 6), st.booleans())
     def test_a_square_matrix_is_restored_to_the_bit(self, size: int, symmetric: bool) -> None:
@@ -140,16 +140,16 @@ class TestCache:
 
     def test_archives_of_a_folder_share_a_store(self, tmp_path: Path) -> None:
         here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
-        for where in (Where(), Where(str(tmp_path / "elsewhere"))):
-            assert where.store(here) == where.store(there)
-            assert where.store(here) != where.store(str(tmp_path / "sub" / "a.mcap"))
-        assert Where().store(here).folder == tmp_path / ".hil-cache"
-        remote = Where(str(tmp_path)).store("s3://bucket/one/a.mcap")
+        for place in (CacheLocation(), CacheLocation(str(tmp_path / "elsewhere"))):
+            assert place.store(here) == place.store(there)
+            assert place.store(here) != place.store(str(tmp_path / "sub" / "a.mcap"))
+        assert CacheLocation().store(here).folder == tmp_path / ".hil-cache"
+        remote = CacheLocation(str(tmp_path)).store("s3://bucket/one/a.mcap")
         assert remote.folder.parent == tmp_path
 
     def test_a_file_in_place_of_the_folder_is_left_alone(self, tmp_path: Path) -> None:
         (tmp_path / ".hil-cache").write_text("not a folder")
-        store = Where().store(str(tmp_path / "excitation_000_a1.mcap"))
+        store = CacheLocation().store(str(tmp_path / "excitation_000_a1.mcap"))
         assert tmp_path not in store.folder.parents
 
     def test_settings_are_cached_to_the_last_bit(self, tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
         found = list(workers.results([fine, dead, slow, wrong, fine], finished.append))
     assert sum(finished) == 5
     assert [found[0], found[4]] == [2.0, 2.0]
-    broken = {one.path: one.reason for one in found if isinstance(one, Broken)}
+    broken = {one.path: one.reason for one in found if isinstance(one, Unused)}
     assert "ended its process, twice, with status 3" in broken["dead.mcap"]
     assert "took longer than 4 s" in broken["slow.mcap"]
     assert "ValueError" in broken["wrong.mcap"]
@@ -277,8 +277,8 @@ def result() -> BatchResult:
         repetitions=(repetition,),
         campaigns=(one, other),
         pooled=(replace(pooled, unseen_torque_rms=one.torque_rms),),
-        broken=(Broken("a/torn.mcap", "its footer is missing"),),
-        skipped=(Broken("a/slow.mcap", "holds a validation run"),),
+        broken=(Unused("a/torn.mcap", "its footer is missing"),),
+        skipped=(Unused("a/slow.mcap", "holds a validation run"),),
         read=1,
         cached=0,
         code="c0de",

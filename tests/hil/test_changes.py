@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau
 from typer.testing import CliRunner
 
-from hil.batch.types import Arm, Broken, LevelEstimate
+from hil.batch.types import Arm, LevelEstimate, Unused
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.plan import design
@@ -429,7 +429,7 @@ def test_without_information_the_payload_is_not_tested() -> None:
 
 # --- the page ----------------------------------------------------------------------------------
 
-BROKEN = Broken("/data/<b>torn</b>.mcap", "its footer is missing")
+BROKEN = Unused("/data/<b>torn</b>.mcap", "its footer is missing")
 
 
 @cache

@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.errors import OutputError
-from hil.files import write_together
-from hil.reading import instant, port_number, whole_number
+from hil.files import write_files
+from hil.reading import parse_count, parse_port, parse_time
 
 
 def test_files_are_written_replaced_and_taken_away(tmp_path: Path) -> None:
     (tmp_path / "old").write_text("old")
     (tmp_path / "gone").write_text("gone")
-    write_together(tmp_path, {"old": "new", "bytes": b"\x00\x01", "gone": None, "never": None})
+    write_files(tmp_path, {"old": "new", "bytes": b"\x00\x01", "gone": None, "never": None})
     assert {path.name for path in tmp_path.iterdir()} == {"old", "bytes"}
     assert (tmp_path / "old").read_text() == "new"
     assert (tmp_path / "bytes").read_bytes() == b"\x00\x01"
@@ -55,7 +55,7 @@ def test_if_the_disk_takes_one_of_them_no_more_none_is_written(folder: Path, fai
         no_file_above(2_000_000),
         pytest.raises(OutputError, match=r"too large.*nothing there was"),
     ):
-        write_together(folder, contents)
+        write_files(folder, contents)
     assert unchanged(folder)
 
 
@@ -64,7 +64,7 @@ def test_a_folder_in_the_way_is_named_and_left(folder: Path, taken: str | None) 
     (folder / "c").mkdir()
     (folder / "c" / "mine").touch()
     with pytest.raises(OutputError, match="c is a folder"):
-        write_together(folder, {"a": "new", "b": None, "c": taken, "d": None})
+        write_files(folder, {"a": "new", "b": None, "c": taken, "d": None})
     assert (folder / "c" / "mine").exists()
     assert unchanged(folder)
 
@@ -89,13 +89,13 @@ def test_if_one_cannot_get_to_its_place_the_others_are_put_back(
     if not links:
         monkeypatch.setattr("os.link", refused)
     with pytest.raises(OutputError, match="not permitted"):
-        write_together(folder, {"d": None, "c": "new", "a": "new", "b": "new"})
+        write_files(folder, {"d": None, "c": "new", "a": "new", "b": "new"})
     assert unchanged(folder)
 
 
 def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file") as caught:
-        write_together(tmp_path / "gone", {"a": "new"})
+        write_files(tmp_path / "gone", {"a": "new"})
     assert caught.value.exit_code == 1
 
 
@@ -108,13 +108,13 @@ def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path) -> None:
 )
 def test_a_moment_is_read_whatever_its_zone(at: datetime, minutes: int) -> None:
     zoned = at.replace(tzinfo=timezone(timedelta(minutes=minutes)))
-    assert instant(zoned.isoformat()) == zoned
-    assert instant(at.isoformat()) == at.replace(tzinfo=UTC)
+    assert parse_time(zoned.isoformat()) == zoned
+    assert parse_time(at.isoformat()) == at.replace(tzinfo=UTC)
 
 
 @given(st.one_of(st.text(), st.datetimes().map(datetime.isoformat)))
 def test_any_text_is_a_moment_of_some_robot_or_none(text: str) -> None:
-    found = instant(text)
+    found = parse_time(text)
     assert found is None or 1970 <= found.year < 2200
 
 
@@ -122,7 +122,7 @@ def test_any_text_is_a_moment_of_some_robot_or_none(text: str) -> None:
     "text", ["", "soon", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "1969-12-31"]
 )
 def test_what_is_no_moment(text: str) -> None:
-    assert instant(text) is None
+    assert parse_time(text) is None
 
 
 # --- Numbers that somebody else wrote are read, or are none; reading them never fails
@@ -130,17 +130,17 @@ def test_what_is_no_moment(text: str) -> None:
 
 @given(st.integers(0, 10**18 - 1))
 def test_a_number_is_read_as_it_was_written(number: int) -> None:
-    assert whole_number(str(number)) == number
+    assert parse_count(str(number)) == number
 
 
 @given(st.one_of(st.text(), st.text("0123456789²٣-+_ ."), st.integers(4000, 6000).map("7".__mul__)))
 def test_any_text_is_a_number_of_some_size_or_none(text: str) -> None:
-    found = whole_number(text)
+    found = parse_count(text)
     assert found is None or (0 <= found < 2**63 and text.lstrip("0") in (str(found), ""))
 
 
 def test_ports_and_numbers_that_are_none() -> None:
-    assert whole_number(None) is None
-    assert whole_number("") is None
-    assert [port_number(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]
-    assert not any(map(port_number, ("", "0", "65536", "-1", "ten", "9" * 5000)))
+    assert parse_count(None) is None
+    assert parse_count("") is None
+    assert [parse_port(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]
+    assert not any(map(parse_port, ("", "0", "65536", "-1", "ten", "9" * 5000)))

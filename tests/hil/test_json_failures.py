@@ -18,7 +18,7 @@ from hil.campaign import Campaign
 from hil.campaign.live_link import write_error
 from hil.cli import COMMANDS, app, as_json, exit_code_of, main
 from hil.errors import ArchiveWriteError, ControllerFault, HilError, InputError
-from hil.files import make_folder, writing_to
+from hil.files import convert_write_errors, make_folder
 from planner import PlannerError
 
 NOWHERE = "/nowhere"
@@ -118,7 +118,7 @@ class TestDisk:
         assert exit_code_of(write_error(Failed(1, "a.mcap", "exists already", "", None))) == 2
 
     def test_folder_and_tables(self, refusal: OSError, tmp_path: Path) -> None:
-        with pytest.raises(HilError) as caught, writing_to(tmp_path):
+        with pytest.raises(HilError) as caught, convert_write_errors(tmp_path):
             raise refusal
         assert exit_code_of(caught.value) == 1
 

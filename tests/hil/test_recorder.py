@@ -256,7 +256,7 @@ def test_a_recording_on_the_simulated_link_keeps_every_packet_of_both_ends(
     assert [sent for _, sent, _, _ in packets] == [False, True] * (len(packets) // 2)
     assert archive.outcome.entries["packets"] == str(len(packets))
     assert archive.outcome.entries["packets_lost"] == "0"
-    assert check_archive(path).keeps, check_archive(path).faults
+    assert check_archive(path).conforms, check_archive(path).faults
 
 
 def test_a_packet_that_was_lost_is_not_there_and_those_around_it_keep_their_cycles(
@@ -285,7 +285,7 @@ def test_a_recording_over_udp_keeps_every_packet_of_both_ends(tmp_path: Path, ce
     assert_decoded_packets_are_the_cycles(archive, path)
     first = next(packet for packet in packets_of(path) if len(packet[3]) == INIT_LENGTH)
     assert first[3] == archive.attachments["init_packet.bin"]
-    assert check_archive(path).keeps, check_archive(path).faults
+    assert check_archive(path).conforms, check_archive(path).faults
 
 
 def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
@@ -296,7 +296,7 @@ def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     repaired = repair(path, tmp_path / "repaired.mcap")
     found = check_archive(repaired.output)
-    assert found.keeps, found.faults
+    assert found.conforms, found.faults
     after = packets_of(repaired.output)
     assert after
     assert before[: len(after)] == after

@@ -28,7 +28,7 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
-from hil.batch.cache import Where
+from hil.batch.cache import CacheLocation
 from hil.batch.discovery import discover
 from hil.campaign import (
     Campaign,
@@ -479,7 +479,7 @@ def test_an_amended_archive_keeps_its_content(tmp_path: Path, undisturbed: Campa
     amend_outcome(path, "rejected", "something touched it")
     after = open_archive(path)
     assert after.complete
-    assert check_archive(path).keeps
+    assert check_archive(path).conforms
     assert after.outcome.entries == {
         **before.outcome.entries, "outcome": "rejected", "reason": "something touched it"
     }  # fmt: skip
@@ -925,7 +925,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
     outcome = open_archive(slowed, fields=()).outcome
     assert outcome is not None and outcome.outcome == "completed"
-    found = discover([str(campaign.folder.root)], Where(str(tmp_path / "cache")), Here())
+    found = discover([str(campaign.folder.root)], CacheLocation(str(tmp_path / "cache")), Here())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
     (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
     assert "not named in its campaign's manifest.json" in told.reason

@@ -40,13 +40,13 @@ from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.cli.plan import read_plan_file, read_via_points
 from hil.errors import ArchiveError, HilError, InputError
-from hil.files import write_atomically, write_together
+from hil.files import write_atomically, write_files
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import Format
 from hil.importers.rosbag2 import bag_files, topics
 from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
-from hil.reading import json_of, opened, text_of, toml_of
+from hil.reading import open_file, parse_json, parse_toml, read_text
 from hil.results import Results
 from hil.study.records import Record, read_record, write_record
 from hil.study.results import StudyResults
@@ -192,7 +192,7 @@ def test_what_is_written_goes_through_no_link(suffix: str, folder: Path) -> None
     (folder / f"{target.name}{suffix}").unlink(missing_ok=True)
     (folder / f"{target.name}{suffix}").symlink_to(own)
     write_atomically(target, "new")
-    write_together(folder, {"results.json": "new"})
+    write_files(folder, {"results.json": "new"})
     assert own.read_text() == "mine"
     assert not target.is_symlink()
     assert target.read_text() == "new"
@@ -352,14 +352,14 @@ def test_the_series_of_a_report_are_numbers_and_not_too_many(
 def test_what_is_no_text_of_ours_is_said_in_one_kind_of_error(thing: str, tmp_path: Path) -> None:
     put(tmp_path / "it", thing)
     with within(20.0), pytest.raises((OSError, ValueError)):
-        json_of(text_of(tmp_path / "it"))
+        parse_json(read_text(tmp_path / "it"))
 
 
 def test_a_text_that_is_one_is_read_as_ever(tmp_path: Path) -> None:
     (tmp_path / "it").write_bytes("a = 1\r\nb = 'ä'\r".encode())
-    assert text_of(tmp_path / "it") == (tmp_path / "it").read_text("utf-8")
-    assert toml_of(text_of(tmp_path / "it")) == {"a": 1, "b": "ä"}
-    with opened(tmp_path / "it") as stream:
+    assert read_text(tmp_path / "it") == (tmp_path / "it").read_text("utf-8")
+    assert parse_toml(read_text(tmp_path / "it")) == {"a": 1, "b": "ä"}
+    with open_file(tmp_path / "it") as stream:
         assert stream.read().startswith(b"a = 1\r\n")
 
 

@@ -54,7 +54,7 @@ def data_of(content: Content, topic: str, nth: int) -> bytearray:
 def test_the_library_writes_it_as_we_do(content, written, tmp_path):
     path = content.write(tmp_path / written.path.name)
     check = check_archive(path)
-    assert check.keeps, check.faults
+    assert check.conforms, check.faults
     assert check.samples == 43
     assert not check.repaired
 
@@ -134,7 +134,7 @@ def test_a_broken_rule_is_named(what, content, written, tmp_path):
     change, aspect = BROKEN[what]
     change(content)
     check = check_archive(content.write(tmp_path / written.path.name))
-    assert not check.keeps
+    assert not check.conforms
     assert check.faults.get(aspect), check.faults
     assert set(check.faults) <= set(ASPECTS) == {one for _, one in BROKEN.values()}
     if change is another_position:
@@ -148,7 +148,7 @@ def test_imported_recordings_are_checked_by_their_own_rules(tmp_path):
     samples = Samples(stamp, position, motor_current=position)
     path = write_samples(tmp_path / "x.mcap", samples, joint_names=("a", "b"), metadata={})
     check = check_archive(path)
-    assert check.keeps, check.faults
+    assert check.conforms, check.faults
 
 
 def test_a_damaged_description_is_a_fault_of_an_archive(written, tmp_path):

@@ -138,7 +138,7 @@ def assert_saved(path: Path, written: Written, sound: list[int]) -> None:
     """A repair saves these chunks; the check counts the same samples, and so does the reader."""
     cycles = [FIRST + c for k in sound for c in range(10 * k, min(10 * k + 10, 43))]
     check = check_archive(path)
-    assert not check.keeps
+    assert not check.conforms
     assert check.samples == len(cycles)
     done = repair(path)
     assert done.losses
@@ -147,7 +147,7 @@ def assert_saved(path: Path, written: Written, sound: list[int]) -> None:
     written.assert_true(back)
     assert back.columns["cycle"].tolist() == cycles
     assert repair(done.output).whole
-    assert check_archive(done.output).keeps
+    assert check_archive(done.output).conforms
 
 
 class TestChunksOfAnotherArchive:
@@ -158,7 +158,7 @@ class TestChunksOfAnotherArchive:
         assert archive.complete
         assert archive.n_samples == 43
         assert header.CHUNKS not in archive.outcome.entries
-        assert check_archive(path).keeps
+        assert check_archive(path).conforms
         assert repair(path).whole
 
     @pytest.mark.parametrize("place", [0, 1, 4])
@@ -178,7 +178,7 @@ class TestChunksOfAnotherArchive:
             archive = open_archive(path)
             assert not archive.complete
             assert archive.n_samples == n_read
-            assert not check_archive(path).keeps
+            assert not check_archive(path).conforms
         part = open_archive(path, start=50.1, stop=50.3)
         assert part.n_samples == 0
         assert not part.complete
@@ -405,7 +405,7 @@ class TestLoss:
         assert archive.outcome.entries["samples"] == str(done.samples) == str(len(sound))
         path.write_bytes(output)
         check = check_archive(path)
-        assert check.keeps, check.faults
+        assert check.conforms, check.faults
         assert check.repaired
         self.assert_others_read(done.output, archive)
 

@@ -107,7 +107,7 @@ def outcomes(path: Path) -> dict[str, str]:
 
 def test_the_same_content_written_by_others_is_as_good(written, path):
     path = forged(written, path)
-    assert check_archive(path).keeps
+    assert check_archive(path).conforms
     assert set(outcomes(path).values()) == {""}
 
 
@@ -185,7 +185,7 @@ def test_joints_or_a_description_that_do_not_belong_are_damage(written, path):
     path = forged(written, path, metadata={"joint_names": '["a", "b", "c"]'})
     assert "not that of 3 joints" in str(open_archive(path).damage)
     assert "holds no sample" in outcomes(path)["open_recording"]
-    assert not check_archive(path).keeps
+    assert not check_archive(path).conforms
     entries = {"kind": "move", "joint_names": '["x"]', "attachments": "[]", "format_version": "1"}
     second = mcap_bytes.metadata("hil", {**entries, "checksum": header.checksum(entries)})
     end = written.records[-1]
@@ -282,7 +282,7 @@ class TestAnnouncements:
     def test_announced_again_as_it_was(self, written, path):
         again = channel(CYCLE, schema.CYCLE)
         path = forged(written, path, chunk=lambda chunk: again + chunk)
-        assert check_archive(path).keeps
+        assert check_archive(path).conforms
 
     def test_cycles_that_begin_behind_other_samples(self, written, tmp_path):
         chunks, why = [without_cycles, with_cycles], "other channels than those before"
@@ -297,7 +297,7 @@ class TestAnnouncements:
         archive = open_archive(path)
         assert why in str(archive.damage)
         assert {len(column) for column in archive.columns.values()} == {10}
-        assert not check_archive(path).keeps
+        assert not check_archive(path).conforms
         done = repair(path)
         assert done.samples == repaired
         assert done.losses
@@ -337,7 +337,7 @@ class TestImported:
 
     def test_as_it_was(self, imported, tmp_path):
         path = forged(imported, tmp_path / IMPORTED)
-        assert check_archive(path).keeps
+        assert check_archive(path).conforms
         assert open_archive(path).n_samples == 60
 
     def test_currents_of_other_times_than_the_positions(self, imported, tmp_path):
@@ -370,7 +370,7 @@ class TestImported:
         for part in (open_archive(path), open_archive(path, start=0.0, stop=1e3)):
             assert {len(column) for column in part.columns.values()} == {sound}
             assert part.damage is not None
-        assert not check_archive(path).keeps
+        assert not check_archive(path).conforms
 
 
 class TestNames:
