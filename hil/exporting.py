@@ -207,7 +207,7 @@ def _write_variants(
 
 def _motion(found: Identification) -> Motion:
     """Some rows of the motion that was predicted, from all its recordings."""
-    parts = [samples.motion for samples in found.unseen]
+    parts = [samples.motion for samples in found.prepared.held_out]
     share = _MOST_ROWS // len(parts)
     some = [motion.rows(_some(motion.n_samples, share)) for motion in parts]
     columns = [np.concatenate(column) for column in zip(*(one[:4] for one in some), strict=True)]

@@ -141,8 +141,8 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
     arms = Simulated(model, np.array(standard), np.array(values))
     parts: list[Array] = []
     time: list[Array] = []
-    with reporter.task("simulating (motions)", len(found.unseen)) as task:
-        for samples in found.unseen:
+    with reporter.task("simulating (motions)", len(found.prepared.held_out)) as task:
+        for samples in found.prepared.held_out:
             last = float(time[-1][-1]) if time else 0.0
             time.append(last + samples.motion.time - samples.motion.time[0])
             parts.append(replay(arms, samples))
@@ -157,7 +157,7 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
         errors=dict(zip(names, errors, strict=False)),
         spread=spread,
         reasons=() if spread is None else _reasons(found, arms, errors[0], spread),
-        tested_on=found.tested_on,
+        tested_on=found.prepared.sources.tested_on,
         verdict=found.verdict.line,
     )
 
@@ -167,7 +167,7 @@ def _reasons(
 ) -> tuple[str, ...]:
     """Why joints drift by more than the parameters are uncertain."""
     strays, uncertain = _figures(error)[0], _figures(spread)[0]
-    left = slow_residual(arms, found.unseen)
+    left = slow_residual(arms, found.prepared.held_out)
     sentences = []
     for joint in np.flatnonzero(strays > DRIFT * uncertain):
         constant, friction = left.constant[joint], left.friction[joint]

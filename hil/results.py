@@ -1,8 +1,7 @@
-"""What an identification leaves behind: `results.json`, checked on the way in and out.
+"""Schema of `results.json`.
 
-Everything is plain numbers in SI units, so that another program can read it without `hil`; what
-is infinite or was not measured stands as the string "Infinity" or "NaN".
-Per-joint lists follow `joint_names`; per-parameter lists follow `parameters`.
+Numbers are in SI units; infinite and unknown numbers are the strings "Infinity" and "NaN". Lists
+per joint are in the order of `joint_names`, lists per parameter in that of `parameters`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from hil.reading import parse_json, read_text
 
 
 class Frozen(BaseModel):
-    """A section of a file: unchangeable, without unknown fields; no finite number is a word."""
+    """A section of the file: immutable, without unknown fields."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", ser_json_inf_nan="strings", from_attributes=True
@@ -37,7 +36,7 @@ class Frozen(BaseModel):
 
     @classmethod
     def of(cls, source: object = None, **others: Any) -> Self:
-        """With what an object has under the names of fields, and others; arrays become lists."""
+        """Build a section from the equally named attributes of `source` and from `others`."""
         own = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
         return cls.model_validate(
             {
@@ -48,7 +47,7 @@ class Frozen(BaseModel):
 
     @classmethod
     def rows(cls, **columns: Any) -> list[Self]:
-        """One for each entry of columns, the first of which is there; a column of None is None."""
+        """Build a section per entry of the columns; a column may be None, except the first."""
         lists = {
             name: values.tolist() if isinstance(values, np.ndarray) else values
             for name, values in columns.items()
@@ -59,7 +58,7 @@ class Frozen(BaseModel):
         ]
 
     def to_json(self) -> str:
-        """As indented JSON, the text of a file."""
+        """Return indented JSON."""
         return self.model_dump_json(indent=1) + "\n"
 
 
@@ -68,7 +67,7 @@ def _known(value: Any) -> Any:
 
 
 Known = Annotated[float | None, BeforeValidator(_known)]
-"""A number, or null where it is not a number."""
+"""A number, null if unknown."""
 
 
 class StepResult(Frozen):
@@ -76,93 +75,89 @@ class StepResult(Frozen):
 
     step: str
     done: bool
-    words: str  #: What is known of it
+    words: str  #: Summary
     details: list[str]
 
 
 class RecordedResult(Frozen):
-    """One motion, as its archive has it."""
+    """One recorded motion."""
 
     archive: str
     kind: str
-    when: str | None  #: Begin, ISO 8601 (UTC); null in virtual time
+    when: str | None  #: Start, ISO 8601 (UTC); null in virtual time
     seconds: float
     cycles: int
-    missed: int  #: Packets that never arrived
-    late: int  #: Answers that were late
+    missed: int  #: Packets that did not arrive
+    late: int  #: Late replies
     not_accepted: int = Field(validation_alias=AliasChoices("not_accepted", "not_taken"))
-    """Answers that the controller did not take."""
-    lost: int  #: Cycles that were exchanged and not archived
+    """Replies that the controller did not accept."""
+    lost: int  #: Cycles that were not archived
     outcome: str
-    why: str  #: Why it ended so
+    why: str  #: Reason of the outcome
 
 
 class WarmUpResult(Frozen):
-    """Friction while the arm warmed up, motion by motion."""
+    """Friction during warm-up, per motion."""
 
     verdict: str  #: One of `warm`, `not warm`, `going on`
-    threshold: float  #: Change per motion that counts as warm, as a share
+    threshold: float  #: Relative change per motion below which the arm is warm
     friction: list[list[float | None]]
     """Of each motion and joint, N·m or N; null for a joint that hardly moves."""
     change: list[float | None]
-    """Largest change per motion of any joint, as a share; null before it can be determined."""
+    """Largest relative change of any joint from motion to motion; null if unknown."""
 
 
 class ConductResult(Frozen):
-    """How a campaign was run."""
+    """Execution of a campaign."""
 
     steps: list[StepResult]
     warm_up: WarmUpResult | None
-    recorded: list[RecordedResult]
-    """Every archive of the manifest, in the order in which they were made."""
+    recorded: list[RecordedResult]  #: Archives of the manifest, in chronological order
 
 
 class FindingResult(Frozen):
-    """One check and its outcome."""
+    """One check of the verdict."""
 
     check: str
     level: Literal["good", "information", "doubtful", "wrong"]
-    words: str
-    next_step: str  #: What to do about it; empty where nothing needs doing
+    words: str  #: Result of the check
+    next_step: str  #: Remedy; empty if none is needed
 
 
 class JointJudgement(Frozen):
-    """One joint on unseen motion; on that of the fit where `JudgementResult.in_sample`."""
+    """Errors of one joint on held-out motion, or on the fit if `JudgementResult.in_sample`."""
 
     joint: str
     unit: Literal["N·m", "N"]
     rms: float  #: Root mean square of the torque error, in `unit`
     relative: Known  #: ||e|| / ||tau||
-    fitted_relative: Known = None  #: The same on the motion that was fitted
-    explained: Known
-    """Share of the torque's variance that is explained (R²): zero is no better than a constant."""
-    limit: Known
-    """Largest torque of the joint, in `unit`; of the drive, or the URDF's effort limit."""
+    fitted_relative: Known = None  #: `relative` on the fitted motion
+    explained: Known  #: Variance explained (R²)
+    limit: Known  #: Torque limit of the drive, or the URDF's effort limit, in `unit`
     share_of_limit: Known  #: RMS error over `limit`
-    nominal_relative: Known  #: ||e|| / ||tau|| of the nominal (CAD) model on the same motion
-    controller_relative: Known  #: The same of the controller's own dynamic model
+    nominal_relative: Known  #: `relative` of the nominal (CAD) model
+    controller_relative: Known  #: `relative` of the controller's dynamic model
     nominal_scale: Known = None
-    """Measured torque over what the nominal inertias ask for, friction set aside."""
+    """Measured torque over the torque of the nominal inertias, friction excluded."""
     controller_inertia: Known = None
-    """The controller's own diagonal inertia (joint side, rotor included) over the identified one:
-    median over the recorded postures."""
-    controller_inertia_spread: Known = None  #: Standard deviation of that ratio over the postures
+    """The controller's diagonal inertia (joint side, with rotor) over the identified one: median
+    over the recorded postures."""
+    controller_inertia_spread: Known = None  #: Standard deviation of that ratio
 
 
 class ProfileResult(Frozen):
-    """Mean residual of one joint over bins of its speed or position, all recordings."""
+    """Mean residual of one joint in bins of its speed or position."""
 
     centre: list[float]
     mean: list[Known]
-    std: list[Known]  #: Standard error that allows for the residual's correlation in time
+    std: list[Known]  #: Standard error, with the residual's autocorrelation
 
 
 class JudgementResult(Frozen):
-    """Every check, the figures per joint, and what the residual follows."""
+    """Checks of the verdict, errors per joint and analysis of the residual."""
 
-    in_sample: bool = False
-    """Whether nothing was held out: all figures are of the fitted motion then."""
-    nominal: str | None = None  #: What `JointJudgement.nominal_relative` is of, in words
+    in_sample: bool = False  #: Whether nothing was held out; errors are those of the fit then
+    nominal: str | None = None  #: Description of the nominal model
     findings: list[FindingResult]
     next_steps: list[str]
     joints: list[JointJudgement]
@@ -170,34 +165,34 @@ class JudgementResult(Frozen):
     position: list[ProfileResult]  #: Over rad or m
     lag: list[float]  #: Of `autocorrelation`, s
     autocorrelation: list[list[Known]]  #: Of each joint's residual
-    effective_rows: list[float]  #: Independent samples that each joint's rows are worth
+    effective_rows: list[float]  #: Effective number of independent samples per joint
     friction_over_time: list[list[Known]] | None
-    """Per joint: share by which friction was higher than estimated, in the order of recording."""
+    """Relative deviation of friction from its estimate, per joint, in chronological order."""
 
     @property
     def worst_first(self) -> list[FindingResult]:
-        """Findings with the worst first, otherwise in the order of the checks."""
+        """Findings in descending order of severity."""
         levels = ("wrong", "doubtful", "information", "good")
         return sorted(self.findings, key=lambda finding: levels.index(finding.level))
 
     def any_joint(self, figure: str) -> bool:
-        """Whether a figure of :class:`JointJudgement` is known of any joint."""
+        """Whether a field of :class:`JointJudgement` is known for any joint."""
         return any(getattr(joint, figure) is not None for joint in self.joints)
 
 
 class EliminationStepResult(Frozen):
-    """The model after one more parameter was removed."""
+    """One step of the backward elimination."""
 
-    removed: str | None  #: None for the model it all begins with
+    removed: str | None  #: None for the full model
     left: int
-    spread: float  #: Largest over smallest relative standard deviation of those left
+    spread: float  #: Largest over smallest relative standard deviation
     in_sample: float  #: Relative torque error on the fitted motion
     held_out: float  #: Relative torque error on the held-out motion
-    largest_relative_std: float  #: Of those left
+    largest_relative_std: float
 
 
 class EssentialParameter(Frozen):
-    """One parameter of the essential model, as estimated with the others of it."""
+    """One parameter of the essential model."""
 
     name: str
     unit: str
@@ -211,26 +206,25 @@ class EssentialParameter(Frozen):
 
 
 class BlindResult(Frozen):
-    """Parameters chosen inside the fitted motion alone, tried on the held-out motion."""
+    """Essential parameters chosen on the fitted motion only."""
 
-    left: int  #: How many were chosen
-    essential: float
-    """Relative torque error of these on the held-out motion, which had no say in the choice."""
+    left: int  #: Number of parameters
+    essential: float  #: Their relative torque error on the held-out motion
     full: float  #: That of all parameters
 
 
 class EssentialResult(Frozen):
-    """Which parameters the motion needs."""
+    """Essential parameters."""
 
-    reason: str  #: Why the cut is where it is
-    cut: int  #: Index of the step chosen
-    steps: list[EliminationStepResult]  #: The whole path, down to one parameter
+    reason: str  #: Criterion of the choice
+    cut: int  #: Index of the chosen step
+    steps: list[EliminationStepResult]  #: Down to one parameter
     refused: list[str]
-    """Less well known than the rule of thumb allows, but needed by the held-out motion."""
+    """Parameters with a large relative standard deviation that the held-out motion needs."""
     parameters: list[EssentialParameter]
     by_spread_left: int
-    """Number of parameters that relative standard deviations alone leave (Pham and Gautier)."""
-    by_spread_held_out: float  #: Held-out error of those
+    """Number of parameters by relative standard deviation alone (Pham and Gautier)."""
+    by_spread_held_out: float  #: Held-out error of these
     blind: BlindResult | None
 
 
@@ -242,22 +236,22 @@ class LinkResult(Frozen):
     centre: list[float]  #: Centre of mass in the joint's frame, m
     rotor_inertia: float | None
     room: float
-    """Smallest second moment over the nominal body's: 1 as there, 0 at the edge of possible."""
-    reference: str  #: What stood for its nominal body
+    """Smallest second moment over that of the nominal body; 0 at the limit of consistency."""
+    reference: str  #: Origin of its nominal body
 
 
 class ConsistencyResult(Frozen):
-    """The nearest parameters that a machine can have, and what they cost."""
+    """Physically consistent parameters closest to the estimate."""
 
     sentence: str
     impossible: bool
     costly: bool
-    held_out: float  #: Relative torque error of the consistent model on held-out motion
+    held_out: float  #: Relative torque error on held-out motion
     unconstrained_held_out: float
     in_sample: float
     unconstrained_in_sample: float
-    moved: list[str]  #: Parameters moved by more than three standard deviations
-    shift: list[float]  #: How far each parameter was moved, in its standard deviations
+    moved: list[str]  #: Parameters changed by more than three standard deviations
+    shift: list[float]  #: Change of each parameter in standard deviations
     bounds: list[str]
     links: list[LinkResult]
     status: str
@@ -267,7 +261,7 @@ class ExportResult(Frozen):
     """Files for other tools, in the folder of `results.json`."""
 
     written: list[str]
-    withheld: dict[str, str]  #: File name and why it was not written
+    withheld: dict[str, str]  #: Files that were not written, with the reason
 
 
 SCHEMA_VERSION: Final = 2
@@ -286,26 +280,26 @@ class CriteriaResult(Frozen):
 
 
 class ExcitationResult(Frozen):
-    """The excitation: as planned, and as it was really executed (from the archives)."""
+    """The excitation as planned, and as executed according to the archives."""
 
-    method: str | None = None  #: Name of the search that found it
+    method: str | None = None  #: Of the design
     duration: float
     n_via: int | None
     fly: float | None
-    n_sines: int | None = None  #: Sines per joint, where the motion is a sum of sines
+    n_sines: int | None = None  #: Sines per joint of a sum of sines
     planned: CriteriaResult | None
     executed: CriteriaResult
 
 
 def outside_mark(z: float | None) -> str:
-    """`out3` or `out2` for a deviation beyond 3 or 2 standard deviations; "" for any other."""
+    """Return `out3` or `out2` for more than 3 or 2 standard deviations, else an empty string."""
     if z is None or abs(z) <= 2.0:
         return ""
     return "out3" if abs(z) > 3.0 else "out2"
 
 
 class ParameterResult(Frozen):
-    """One parameter: pooled estimate, its standard deviation, and what it is compared with."""
+    """One parameter."""
 
     name: str
     expression: str
@@ -315,23 +309,20 @@ class ParameterResult(Frozen):
     std: float
     repetition_mean: float
     repetition_std: float | None
-    """Standard deviation over the repetitions (of one repetition, not of their mean)."""
-    truth: Known  #: Planted value; only a simulated cell has one
-    undetermined: bool = False
-    """Whether the motion says nothing about it, alone or as part of a combination."""
+    """Standard deviation of a single repetition."""
+    truth: Known  #: True value of a simulated arm
+    undetermined: bool = False  #: Whether the motion does not determine it
     of_this_run: bool = False
-    """Whether it holds for this run only: friction changes with the temperature of the gears."""
-    prior_std: float | None = None
-    """What was believed before the data, from CAD; infinite where nothing was."""
+    """Whether it is valid for this run only: friction depends on the temperature of the gears."""
+    prior_std: float | None = None  #: Of the prior from CAD; infinite if there is none
     prior_ratio: float | None = None
-    """Standard deviation with prior and data over that of the prior alone: 0 where all that is
-    known comes from the data, 1 where all comes from the prior."""
+    """Posterior over prior standard deviation: 0 if determined by the data, 1 by the prior."""
     learned: bool | None = None
-    """Whether at least three quarters of what is known of it come from the data."""
+    """Whether at least three quarters of the information come from the data."""
 
     @property
     def label(self) -> str:
-        """Name for figures, led by the number it has in the paper's Table 2."""
+        """Name for figures, after its number in the paper's Table 2."""
         return self.name if self.table2_id is None else f"{self.table2_id} {self.name}"
 
     @property
@@ -341,7 +332,7 @@ class ParameterResult(Frozen):
 
     @property
     def deviation(self) -> float | None:
-        """(estimate - truth) / std; None without a truth or a usable standard deviation."""
+        """(estimate - truth) / std; None if unknown."""
         return self.deviation_of(self.estimate, self.std)
 
     @property
@@ -351,7 +342,7 @@ class ParameterResult(Frozen):
 
     @property
     def grade(self) -> Literal["well", "roughly", "hardly", "undetermined"]:
-        """How well the data determine it: to 10 %, to 50 %, worse, or not at all."""
+        """Accuracy: 10 % or better, 50 % or better, worse, or undetermined."""
         if self.undetermined or not math.isfinite(self.std):
             return "undetermined"
         size = abs(self.estimate)
@@ -360,7 +351,7 @@ class ParameterResult(Frozen):
         )
 
     def deviation_of(self, estimate: float, std: float) -> float | None:
-        """The same of another estimate of this parameter."""
+        """Return the deviation of another estimate of this parameter."""
         if self.truth is None or not std > 0.0:
             return None
         z = (estimate - self.truth) / std
@@ -368,7 +359,7 @@ class ParameterResult(Frozen):
 
 
 class ValidationResult(Frozen):
-    """Torque prediction on one motion that was never used for fitting; lists are per joint."""
+    """Torque prediction on one held-out motion; lists are per joint."""
 
     archive: str
     duration: float = Field(gt=0.0)
@@ -378,36 +369,36 @@ class ValidationResult(Frozen):
     relative_error: list[float]
     overall_relative_error: float  #: ||e|| / ||tau|| over all joints, rows in which the joint moves
     all_rows_relative_error: float
-    """The same over every row, standstill and the first and last rows included."""
+    """As above over all rows, including standstill and the first and last rows."""
     all_rows_joint_errors: list[float] = Field(default_factory=list)
-    """The same of each joint; empty in a file that was written before there were any."""
+    """As above per joint; empty in files of older versions."""
 
 
 class FittedResult(Frozen):
-    """Torque error on the motion that was fitted, all recordings; lists are per joint."""
+    """Torque error on the fitted motion, all recordings; lists are per joint."""
 
     relative_error: list[float]
     """||e|| / ||tau||, rows in which the joint moves; torque as recorded."""
     overall_relative_error: float
     all_rows_relative_error: float
-    """The same over every row, standstill and the first and last rows included."""
+    """As above over all rows, including standstill and the first and last rows."""
     all_rows_joint_errors: list[float] = Field(default_factory=list)
-    """The same of each joint; empty in a file that was written before there were any."""
+    """As above per joint; empty in files of older versions."""
     smoothed_relative_error: list[float] | None = None
-    """Every row, of the torque as it was fitted, where that was smoothed; null where not."""
+    """All rows, of the smoothed torque if that was fitted."""
     smoothed_overall_relative_error: float | None = None
 
     @property
     def words(self) -> str:
-        """The figures over all joints, in a sentence without its full stop."""
+        """Summary, without full stop."""
         smoothed = self.smoothed_overall_relative_error
         text = (
             "on the fitted motion (in-sample) the torque error is"
             f" {self.overall_relative_error:.2%} over all joints,"
-            f" {self.all_rows_relative_error:.2%} with every row, standstill included"
+            f" {self.all_rows_relative_error:.2%} over all rows including standstill"
         )
         if smoothed is not None:
-            text += f"; of the torque smoothed as it was fitted {smoothed:.2%}, every row"
+            text += f", and {smoothed:.2%} of the smoothed torque over all rows"
         return text
 
 
@@ -415,45 +406,45 @@ class CalibrationResult(Frozen):
     """Held-out means of torque and their 95 % intervals; lists are per joint."""
 
     block: float = Field(gt=0.0)  #: Time that a mean covers, s
-    means: int = Field(gt=0)  #: How many were compared with their interval, all joints
-    inside: float  #: Share of them inside: 0.95 if the intervals are honest
-    white_inside: float  #: Share inside the intervals that white residuals would have
-    joint_inside: list[Known]  #: Null for a joint whose intervals are not known
-    half_width: list[Known]  #: Median of half the interval, N·m or N
+    means: int = Field(gt=0)  #: Number of means, all joints
+    inside: float  #: Share inside their intervals; 0.95 if the intervals are correct
+    white_inside: float  #: Share inside the intervals for white residuals
+    joint_inside: list[Known]  #: Share per joint; null if its intervals are unknown
+    half_width: list[Known]  #: Median half width of the intervals, N·m or N
 
     def words(self, joint_names: Sequence[str]) -> str:
-        """The figures, in a sentence without its full stop."""
+        """Return the summary, without full stop."""
         shares = [1.0 if share is None else share for share in self.joint_inside]
         lowest = min(shares, default=1.0)
         text = (
             f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
-            " joint) lie inside their 95% intervals"
+            " joint) are inside their 95% intervals"
         )
         if lowest < self.inside:
             text += f", {lowest:.0%} of {joint_names[shares.index(lowest)]}"
-        return f"{text}; intervals for white residuals would hold {self.white_inside:.0%}"
+        return f"{text}; with intervals for white residuals {self.white_inside:.0%}"
 
 
 class DelaysResult(Frozen):
     """Delay of the torque behind the position; lists are per joint, s."""
 
-    found: list[Known]  #: Null where the recordings do not determine it
-    interval: list[Known]  #: Half a 95 % interval of it
-    applied: list[float]  #: What the fit took it to be
+    found: list[Known]  #: Estimate; null if undetermined
+    interval: list[Known]  #: Half width of its 95 % interval
+    applied: list[float]  #: Used by the fit
 
 
 class ChoiceResult(Frozen):
-    """A setting that was chosen by predicting parts of what was fitted from the rest."""
+    """A setting that was chosen by inner prediction."""
 
     name: str
     candidates: list[str]
     errors: list[float | None]
-    """||e|| / ||tau|| of the predictions, all joints and rows; null where there was none."""
-    chosen: int  #: Index of the candidate that was used
+    """||e|| / ||tau|| of the predictions, all joints and rows; null if unknown."""
+    chosen: int  #: Index of the candidate
 
 
 class CoverageResult(Frozen):
-    """How many parameters lie within 2 and 3 standard deviations of the planted truth."""
+    """Number of parameters within 2 and 3 standard deviations of their true value."""
 
     within_2: int
     within_3: int
@@ -461,28 +452,27 @@ class CoverageResult(Frozen):
 
 
 class VerdictResult(Frozen):
-    """Is the model good? One sentence, and the reasons."""
+    """Verdict on the model."""
 
     good: bool
-    line: str
-    reasons: list[str]  #: What is wrong; empty if good
+    line: str  #: Summary
+    reasons: list[str]  #: Why the model is not good
     warnings: list[str] = Field(validation_alias=AliasChoices("warnings", "doubts"))
-    """What is not as it should be, but too small or too uncertain to say no."""
+    """Problems that do not make the model bad."""
 
 
 class EstimatorResult(Frozen):
-    """How the parameters were estimated."""
+    """Estimator of the parameters."""
 
-    name: str  #: As `hil identify --estimator` has it
-    words: str
-    prior: str | None
-    """What the prior of `ParameterResult.prior_std` is, in words; or why there is none."""
+    name: str  #: Of `hil identify --estimator`
+    words: str  #: Description
+    prior: str | None  #: Description of the prior, or the reason why there is none
     condition: float  #: Of the weighted regressor with columns of unit length
-    grouping: str  #: Why there are as many base parameters, in words
+    grouping: str  #: Explanation of the number of base parameters
 
 
 class EndogeneityResult(Frozen):
-    """Durbin-Wu-Hausman test: was least squares biased by noise in the regressor?"""
+    """Durbin-Wu-Hausman test for a bias of least squares by noise in the regressor."""
 
     sentence: str
     biased: bool
@@ -490,14 +480,14 @@ class EndogeneityResult(Frozen):
     p_value: float
     degrees_of_freedom: tuple[int, int]
     noise: list[float]
-    """What the instruments do not explain of the regressor, as a share of each joint's torque."""
+    """Part of the regressor that the instruments do not explain, as a share of the torque."""
     shifted: list[str]
-    """Parameters in which least squares and instrumental variables differ by more than chance."""
-    shift: list[float]  #: Least squares less instrumental variables, per parameter
+    """Parameters with a significant difference between least squares and instrumental variables."""
+    shift: list[float]  #: Least squares minus instrumental variables, per parameter
 
 
 class UncertaintyResult(Frozen):
-    """Standard deviation of each parameter by several routes."""
+    """Standard deviation of each parameter by several methods."""
 
     reported: Literal[
         "least_squares",
@@ -506,9 +496,9 @@ class UncertaintyResult(Frozen):
         "scatter_of_mean",
         "posterior",
     ]
-    """The route that `ParameterResult.std` was read from."""
-    method: str  #: How estimate and reported standard deviation were made, in words
-    interval_factor: float  #: Standard deviations in half a 95 % interval
+    """Method of `ParameterResult.std`."""
+    method: str  #: Description of estimate and reported standard deviation
+    interval_factor: float  #: Half width of a 95 % interval in standard deviations
     least_squares: list[float]
     independent_repetitions: list[float] | None
     phase_clustered: list[float] | None
@@ -517,22 +507,21 @@ class UncertaintyResult(Frozen):
 
 
 class Results(Frozen):
-    """One identification, whole."""
+    """Results of one identification."""
 
     schema_version: int = SCHEMA_VERSION
     name: str
     cell: str
     simulated: bool
-    effects: list[str]
-    """Unmodelled effects that were switched on in the simulation (names with sizes)."""
+    effects: list[str]  #: Unmodelled effects of the simulation, with their sizes
     joint_names: list[str]
     period: float
     software: dict[str, str]
     excitation: ExcitationResult
     estimator: EstimatorResult
     endogeneity: EndogeneityResult | None
-    endogeneity_untested: str | None  #: Why there was no such test
-    notes: list[str]  #: What was found and done when the recordings were prepared
+    endogeneity_untested: str | None  #: Reason if there was no test
+    notes: list[str]  #: Decisions in the preparation of the recordings
     parameters: list[ParameterResult]
     n_base: int
     uncertainty: UncertaintyResult
@@ -541,21 +530,19 @@ class Results(Frozen):
     noise_std: list[float]  #: Torque residual standard deviation per joint, N·m
     correlation: list[list[float]]
     """Normalised Ψ of eq. 5 (signed), friction included, from the executed motion."""
-    validation: list[ValidationResult]  #: Empty where nothing was held out
-    fitted: FittedResult | None = None  #: In-sample errors, to stand beside those on unseen motion
-    calibration: CalibrationResult | None = None
-    """Null where nothing was held out, or too little was fitted to predict parts of it."""
-    delays: DelaysResult | None = None  #: Null where they could not be looked for
+    validation: list[ValidationResult]  #: Empty if nothing was held out
+    fitted: FittedResult | None = None
+    calibration: CalibrationResult | None = None  #: Null without enough data
+    delays: DelaysResult | None = None  #: Null if they could not be estimated
     choices: list[ChoiceResult] = Field(default_factory=list)
-    """Settings that were chosen automatically, in order."""
+    """Automatic choices, in order."""
     coverage: CoverageResult | None
     verdict: VerdictResult
-    essential: EssentialResult | None = None  #: Which parameters the motion needs
-    consistency: ConsistencyResult | None = None  #: The nearest parameters that a machine can have
-    exports: ExportResult | None = None  #: Files for other tools beside this one
+    essential: EssentialResult | None = None
+    consistency: ConsistencyResult | None = None
+    exports: ExportResult | None = None
     judgement: JudgementResult | None = None
-    """Every check behind the verdict, and the figures it rests on."""
-    conduct: ConductResult | None = None  #: How the campaign was run; null of loose archives
+    conduct: ConductResult | None = None  #: Null without a campaign folder
 
     @property
     def not_significant(self) -> list[str]:
@@ -565,14 +552,14 @@ class Results(Frozen):
 
     @classmethod
     def load(cls, path: Path) -> Results:
-        """Read and check a `results.json`.
+        """Read a `results.json`.
 
         Raises:
-            InputError: the file is not of this schema.
+            InputError: the file does not match this schema.
         """
 
         def refusal(problem: str, field: str = "") -> InputError:
-            again = "identify again from the archives, which hold all that is needed"
+            again = "identify again from the archives"
             return InputError(path, problem, field=field, remedy=again)
 
         try:
@@ -593,10 +580,10 @@ class Results(Frozen):
 
 
 def csv_tables(results: Results) -> dict[str, str]:
-    """CSV in full precision: the text of each table, by file name: the path of its field.
+    """Return the tables of results as CSV in full precision, by file name (path of the field).
 
-    A list with a number for each joint has a column for each, `field.joint`; a matrix with a
-    column for each parameter has their names. What is neither stays in `results.json`.
+    Lists per joint become columns `field.joint`; columns of a matrix with one column per parameter
+    have the names of the parameters.
     """
     fields = results.model_dump(mode="json")
     names = [parameter["name"] for parameter in fields["parameters"]]
@@ -617,7 +604,7 @@ def csv_tables(results: Results) -> dict[str, str]:
 
 
 def _tables(value: dict[str, Any], path: str) -> Iterator[tuple[str, list[Any]]]:
-    """Lists of records and of rows of equal length, however deep, and where they are."""
+    """Yield path and rows of all lists of records and of all matrices."""
     for name, item in value.items():
         if isinstance(item, dict):
             yield from _tables(item, f"{path}{name}.")

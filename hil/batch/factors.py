@@ -21,13 +21,13 @@ from hil.errors import ArchiveError, HilError
 from hil.files import file_digest
 from hil.identify.options import Options
 from hil.identify.settings import (
-    MOST_READ,
+    MAX_RECORDINGS,
     Settings,
     carried_over,
     decide,
-    judged_samples,
     samples_of,
     signals_of,
+    validation_samples,
     with_noise,
 )
 from hil.identify.sources import Source, all_fitted, known_warnings, source_of
@@ -178,7 +178,7 @@ def archives_for_settings(
     ordered = sorted(refs, key=lambda ref: ref.order)
     rest = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]
-    return (*rest, *fitted[: 1 if arms is not None and rest else MOST_READ])
+    return (*rest, *fitted[: 1 if arms is not None and rest else MAX_RECORDINGS])
 
 
 def cached_settings(
@@ -239,7 +239,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     archive, source = load_source(ref)
     source = signals_of(source, settings)
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
-    samples = (samples_of if fitted else judged_samples)(source, cell, settings)
+    samples = (samples_of if fitted else validation_samples)(source, cell, settings)
     model = cell.model
     phase = PhaseFactor.from_samples(model, samples)
     fit, effect = _fit(model, samples, phase) if fitted else (None, 1.0)

@@ -214,7 +214,8 @@ class _Batch:
             for digest, own in groupby(campaigns, lambda one: one.key.arm):
                 members = list(own)
                 settings = members[0].ready
-                arms[digest] = Arm(digest, settings.law(self._cell(members[0].refs[0])))
+                cell = settings.with_friction_law(self._cell(members[0].refs[0]))
+                arms[digest] = Arm(digest, cell)
                 estimator = Estimator(name, arms[digest].cell.model, settings)
                 everything, levels = Group(), list[LevelEstimate]()
                 for one in members:

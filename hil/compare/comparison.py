@@ -26,7 +26,7 @@ from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.options import Options
-from hil.identify.sources import apart
+from hil.identify.sources import arm_differences
 from hil.progress import Reporter
 from identification import RobotModel
 
@@ -219,7 +219,7 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
         if one.arm != first.arm:
             here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
             why = "one of them is a simulation, or their controllers state other drives"
-            if differing := apart(here.cell, there.cell):
+            if differing := arm_differences(here.cell, there.cell):
                 why = f"they differ in {' and '.join(differing)}"
             raise InputError(
                 one.campaign,

@@ -1,4 +1,4 @@
-"""From archives to a result: reads archives and nothing else."""
+"""Identification from archives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """What needs the pages of a report is imported when it is used: workers of a batch do not."""
+    """Import `run`, which needs the report pages, on first use: batch workers never use it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import run

@@ -1,4 +1,4 @@
-"""From samples to an estimate, by the estimator that was chosen; and what is believed before."""
+"""Estimation of parameters from samples, and the prior from CAD."""
 
 from __future__ import annotations
 
@@ -51,62 +51,60 @@ from .options import Estimator, Options
 from .prepared import Prepared
 from .settings import samples_of
 
-# Hz. A narrower smoother takes part of the motion out of the regressor, which instruments cannot
-# mend. On simulated NS 16 logs with a hundred to a thousand times the encoders' noise, instrumental
-# variables at the bandwidth that suits least squares (7 to 14 Hz) were worse than least squares; at
-# 20 Hz they were better throughout.
-NARROWEST: Final = 20.0
-# Change by the data, in the deviations that the prior allows, beyond which one of the two is wrong.
-_SURPRISING: Final = 4.0
-_NAMED: Final = 6
-"""Parameters that a warning names."""
+# Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
+# cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
+# variables at the best bandwidth of least squares (7 to 14 Hz) were worse than least squares, and
+# at 20 Hz always better.
+MIN_IV_BANDWIDTH: Final = 20.0
+# Difference between data and prior, in standard deviations, that is reported.
+_MAX_PRIOR_DEVIATION: Final = 4.0
+_MAX_NAMES: Final = 6
+"""Number of parameters named in a warning."""
 FRICTION_SHARE: Final = 0.5
-"""Friction changes with temperature, lubricant and wear by tens of per cent (Bittencourt and
-Gunnarsson 2012): a data sheet's is no better than to half of itself."""
+"""Relative standard deviation of nominal friction, which varies by tens of per cent with
+temperature, lubricant and wear (Bittencourt and Gunnarsson 2012)."""
 
 Array = NDArray[np.float64]
 Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
-"""Of samples and the sum of their factors; without samples as far as the factor gives."""
+"""Estimate from samples and the sum of their factors."""
 
-# Time since the origin and commanded positions of a motion; and the lag of each axis in it, which
-# is the same in every repetition.
+# Time since the origin and commanded positions of a motion, and the lag of each axis, which is the
+# same in every repetition.
 _Plan = tuple[tuple[Array, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Estimation:
-    """An estimate, and what was computed beside it."""
+    """An estimate with its tests and warnings."""
 
-    estimator: Estimator  #: by name
+    estimator: Estimator
     result: RepeatedEstimate  #: pooled and per repetition
-    held_out: tuple[PhaseFactor, ...]  #: factors of what is predicted, one per recording
-    #: the estimate with the prior from CAD, which says of each parameter whether it was learned
-    #: from the data; in words why there is none
+    held_out: tuple[PhaseFactor, ...]  #: one per held-out recording
+    #: estimate with the prior from CAD, or the reason why there is none
     posterior: PosteriorEstimate | str
-    #: whether noise in the regressor has biased least squares; in words why that could not be
-    #: tested
+    #: test for bias by noise in the regressor, or the reason why it was not possible
     endogeneity: EndogeneityTest | str
-    warnings: tuple[str, ...]  #: what a reader must know of the estimate
+    warnings: tuple[str, ...]
 
 
 def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> Estimation:
-    """Estimate by `options.estimator`, and say beside it what can be said.
+    """Estimate the parameters by `options.estimator`, with all applicable tests.
 
     Raises:
-        InputError: the estimator needs something that the archives do not have.
-        ArchiveError: a recording without a usable row.
+        InputError: the archives lack data that the estimator needs.
+        ArchiveError: a recording has no usable row.
     """
     cell, name = prepared.sources.cell, options.estimator
     model, variance = cell.model, prepared.settings.delay_variance
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
-        if not samples.usable.any():  # such as the beginning of a torn one
+        if not samples.usable.any():  # for example a truncated recording
             lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
             raise ArchiveError(
                 Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
             )
     with reporter.task("estimating", 4) as task:
-        # The test is of the very samples that least squares reads.
-        fitted = widely_smoothed(model, prepared) if name == "iv" else prepared.fitted
+        # The endogeneity test needs the samples of least squares, unless "iv" is the estimator.
+        fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
         instrumental = fit_instrumental(model, prepared, fitted)
         task.advance(1, name)
         prior = cad_prior(cell)
@@ -125,51 +123,51 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "prior")
         posterior: PosteriorEstimate | str = ""
         try:
-            posterior = fit_with_prior(model, fitted, required(prior), phase=result.phase)
+            posterior = fit_with_prior(model, fitted, require_prior(prior), phase=result.phase)
         except (IdentificationError, InputError) as error:
             posterior = prior if isinstance(prior, str) else str(error)
         if name == "prior" and isinstance(posterior, PosteriorEstimate):
-            warnings += _surprises(model, posterior)
+            warnings += _prior_contradictions(model, posterior)
         task.advance(1, "held-out motion")
         held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
         task.advance(1)
-    endogeneity, more = _beside(name, result.pooled, instrumental)
+    endogeneity, more = _endogeneity(name, result.pooled, instrumental)
     warnings += more
     return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
 
 
-def _beside(
+def _endogeneity(
     name: str, pooled: Estimate, instrumental: InstrumentalFit | str
 ) -> tuple[EndogeneityTest | str, list[str]]:
-    """The test of the bias of least squares, or why there is none; and warnings."""
+    """Return the endogeneity test, or the reason why there is none; and warnings."""
     warnings: list[str] = []
     if not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
-            f"the scaled condition number is {pooled.condition:.2g}, so the fit was solved by QR:"
-            " the motion separates some parameters poorly"
+            f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
+            " parameters poorly (solved by QR)"
         )
     if isinstance(instrumental, str):
         words = "Whether noise in the positions biases least squares could not be tested"
         return f"{words}: {instrumental}.", warnings
     test = instrumental.test
-    # What the motion does not determine differs by any amount.
+    # Undetermined parameters may differ by any amount.
     if name != "iv" and test.matters and not instrumental.pooled.estimate.undetermined:
         warnings.append(
             "noise in the measured positions biases least squares: instrumental variables differ"
-            f" from it by up to {float(np.max(test.predicted)):.1%} of an axis's torque; compare"
-            " with --estimator iv, or measure positions with less noise"
+            f" by up to {float(np.max(test.predicted)):.1%} of an axis's torque; compare with"
+            " --estimator iv, or measure positions with less noise"
         )
     return test, warnings
 
 
-# What is believed before any data
+# Prior from CAD
 
 
 def cad_prior(cell: Cell) -> GaussianPrior | str:
-    """Prior of a cell from its URDF and `[nominal]`; in words why it has none.
+    """Return the prior from the URDF and `[nominal]`, or the reason why there is none.
 
-    Standard deviations are `[nominal] uncertainty` of inertias (10 % without that table) and
-    `FRICTION_SHARE` of friction.
+    Relative standard deviations are `[nominal] uncertainty` for inertias (10 % without that table)
+    and `FRICTION_SHARE` for friction.
     """
     model, table = cell.model, cell.file.nominal
     known: dict[str, tuple[float, float]] = {}  # mean and standard deviation
@@ -192,14 +190,14 @@ def cad_prior(cell: Cell) -> GaussianPrior | str:
         return str(error)
 
 
-def required(prior: GaussianPrior | str) -> GaussianPrior:
-    """The prior of a cell, for an estimator that needs one.
+def require_prior(prior: GaussianPrior | str) -> GaussianPrior:
+    """Return the prior of a cell.
 
     Raises:
         InputError: there is none.
     """
     if isinstance(prior, str):
-        problem = f"there is no prior to be had: {prior}"
+        problem = f"there is no prior: {prior}"
         remedy = "give inertias in the URDF, or use --estimator wls"
         raise InputError(None, problem, field="--estimator prior", remedy=remedy)
     return prior
@@ -215,10 +213,14 @@ def fit_of(
     centre: Array | None = None,
     prior: GaussianPrior | None = None,
 ) -> Fit:
-    """How an estimator that needs nothing but factors fits.
+    """Return the fit function of an estimator that works on factors.
 
-    The centre is the consistent solution of all that is fitted together (p,); None for least
-    squares. The prior is for the estimator of that name.
+    Args:
+        model: of the arm.
+        name: of the estimator.
+        shrinkage: towards `centre`.
+        centre: (p,) physically consistent solution of all recordings; None for least squares.
+        prior: of the estimator "prior".
     """
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
@@ -238,11 +240,11 @@ def fit_of(
 def centre_of(
     model: RobotModel, total: Factor, shrinkage: Shrinkage
 ) -> tuple[Array | None, list[str]]:
-    """The consistent solution, which estimates are shrunk towards (p,); warnings where none is."""
+    """Return the consistent solution (p,) that estimates are shrunk towards; and warnings."""
     try:
         found = consistent_estimate(model, total, prior_weight=shrinkage.prior_weight)
     except SolverError as error:
-        return None, [f"least squares is reported, for {error}"]
+        return None, [f"least squares is reported because {error}"]
     return found.estimate.values, []
 
 
@@ -256,11 +258,11 @@ def _by_factor(
     centre, warnings = None, list[str]()
     if name == "auto" and shrinkage.strength > 0.0:
         centre, warnings = centre_of(model, total_phase(model, fitted).total, shrinkage)
-    own = required(prior) if name == "prior" else None
+    own = require_prior(prior) if name == "prior" else None
     fit = fit_of(model, name, shrinkage, centre, own)
     free = name == "consistent" or (centre is not None and math.isinf(shrinkage.strength))
     try:
-        # The scatter over repetitions is about noise: no need of a program for each.
+        # The scatter over repetitions shows noise; least squares is enough for it.
         each = fit_of(model, "wls") if free else fit
         return estimate_repetitions(model, fitted, fit, each=each), warnings
     except IdentificationError as error:
@@ -283,52 +285,52 @@ def _robust(
         fits.append(robust_estimate(model, some, _LOSSES[name], gram=phase.total))
         return fits[-1].estimate
 
-    result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last is that of all
+    result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
     warnings = [
-        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} lie beyond four "
-        "deviations: that is no gross error but something the model leaves out, and a robust loss "
-        "looks away from it; use --estimator wls"
+        f"{found.outlying[joint]:.0%} of the rows of {model.joint_names[joint]} deviate by more "
+        "than four standard deviations: an unmodelled effect rather than outliers, which a robust "
+        "loss would hide; use --estimator wls"
         for joint in np.flatnonzero(found.doubtful)
     ]
     if not found.converged:
-        warnings.append(f"the reweighting had not settled after {found.iterations} passes")
+        warnings.append(f"the reweighting did not converge in {found.iterations} iterations")
     return result, warnings
 
 
-def _surprises(model: RobotModel, posterior: PosteriorEstimate) -> list[str]:
-    far = np.flatnonzero(np.abs(np.nan_to_num(posterior.surprise)) > _SURPRISING)
+def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> list[str]:
+    far = np.flatnonzero(np.abs(np.nan_to_num(posterior.surprise)) > _MAX_PRIOR_DEVIATION)
     if not far.size:
         return []
     return [
-        f"data and prior contradict each other in {_first([model.parameter_names[k] for k in far])}"
-        f" (more than {_SURPRISING:g} deviations): the CAD figures, or their uncertainty in"
-        " [nominal], are wrong"
+        f"data and prior of {_abbreviated([model.parameter_names[k] for k in far])} differ by more"
+        f" than {_MAX_PRIOR_DEVIATION:g} standard deviations: correct the CAD values, or their"
+        " uncertainty in [nominal]"
     ]
 
 
-def _first(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"{', '.join(names[:_NAMED])}{more}"
+def _abbreviated(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return f"{', '.join(names[:_MAX_NAMES])}{more}"
 
 
 # Instruments
 
 
 class InstrumentalFit(NamedTuple):
-    """Instrumental variables of all recordings, and of each; and whether they were needed."""
+    """Instrumental-variable estimates, pooled and per recording, and the endogeneity test."""
 
     pooled: InstrumentalEstimate
     each: tuple[Estimate, ...]
     test: EndogeneityTest
 
 
-def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
-    """What is fitted, smoothed no narrower than `NARROWEST`, however noisy the positions are."""
-    wide = prepared.settings.preprocessed(rigid_bandwidth=NARROWEST)
+def smoothed_for_instruments(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
+    """Return the fitted samples, smoothed with a bandwidth of at least `MIN_IV_BANDWIDTH`."""
+    wide = prepared.settings.preprocessed(rigid_bandwidth=MIN_IV_BANDWIDTH)
     noiseless = replace(wide, noise_variance=(0.0,) * model.n_joints)
     return tuple(
         samples
-        if float(samples.position_bandwidth.min()) >= NARROWEST
+        if float(samples.position_bandwidth.min()) >= MIN_IV_BANDWIDTH
         else samples_of(source, prepared.sources.cell, noiseless)
         for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True)
     )
@@ -337,7 +339,7 @@ def widely_smoothed(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...
 def fit_instrumental(
     model: RobotModel, prepared: Prepared, fitted: Sequence[Samples]
 ) -> InstrumentalFit | str:
-    """Fit samples with the commanded motion as instruments; in words why that cannot be."""
+    """Fit with the commanded motion as instruments, or return the reason why that is impossible."""
     factors = []
     plans: list[_Plan] = []
     try:
@@ -370,4 +372,4 @@ def _instrumental(
         model, found.pooled.estimate, found.each, total_phase(model, fitted)
     )
     weak = found.pooled.weak
-    return result, [f"the instruments are too weak for {_first(weak)}"] if weak else []
+    return result, [f"the instruments are too weak for {_abbreviated(weak)}"] if weak else []

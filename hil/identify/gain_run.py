@@ -1,4 +1,4 @@
-"""Current-to-torque gains from archives: some of them with a payload whose mass is known."""
+"""Torque constants from archives, some of them recorded with a known payload."""
 
 from __future__ import annotations
 
@@ -26,12 +26,11 @@ from .sources import cell_of, source_of
 
 @dataclass(frozen=True, eq=False)
 class GainsFound:
-    """Gains and what they are for."""
+    """Identified torque constants."""
 
-    gains: Gains  #: torque per current of each motor
-    #: by archive name (path of those with one name), what it carried; None for nothing
-    loads: dict[str, Payload | None]
-    motor_side: bool  #: whether gears are known; without, gains include them
+    gains: Gains
+    loads: dict[str, Payload | None]  #: payload by archive name (by path if names are not unique)
+    motor_side: bool  #: whether gear ratios are known; otherwise gains include them
 
 
 def find_gains(
@@ -41,16 +40,17 @@ def find_gains(
     *,
     delay: float | Literal["stated"] | None = "stated",
 ) -> GainsFound:
-    """Identify the gain of every motor.
+    """Identify the torque constant of every motor.
 
-    An archive whose cell has a payload was recorded with it.
-
-    The `loaded` recordings carried what is named with each. Currents lag positions by `delay` [s];
-    "stated" takes it from the cell.
+    Args:
+        archives: recorded with the payload of their cell, if it has one.
+        loaded: archives with another payload than that of their cell.
+        reporter: of progress.
+        delay: time by which currents lag positions [s]; "stated" uses the cell's.
 
     Raises:
-        InputError: an archive cannot be used, or not together with the others; none has a payload.
-        IdentificationError: there is not one usable row.
+        InputError: an archive cannot be used, or not with the others; no archive has a payload.
+        IdentificationError: no usable row.
     """
     factors: list[PhaseFactor] = []
     loads: dict[str, Payload | None] = {}
@@ -70,13 +70,13 @@ def find_gains(
                 own = np.asarray(cell.drive_train.motor_from_joint)
             if first is None:
                 first, turns, model = cell, own, replace(cell.model, payload=None)
-            # One robot with one drive train; only what it carries may differ.
+            # One robot with one drive train; only the payload may differ.
             same = cell.urdf == first.urdf and np.array_equal(turns, own)
             if not same or cell.model.parameter_names != model.parameter_names:
-                problem = f"is of another robot, friction law or drive train than {first.path}"
-                remedy = "identify the gains of each robot by themselves"
+                problem = f"has another robot, friction law or drive train than {first.path}"
+                remedy = "identify the gains of each robot separately"
                 raise ArchiveError(path, problem, remedy=remedy)
-            # A torque in the log may be of other gains.
+            # A recorded torque may have been computed with other gains.
             without = replace(source.recording, torque=np.zeros_like(current))
             settings = stated_settings(cell, replace(FIXED, delay=delay))
             try:
@@ -95,6 +95,6 @@ def find_gains(
 
 def _require_load(loads: Iterable[Payload | None]) -> None:
     if not any(load is not None and load.parameters.any() for load in loads):
-        problem = "no recording has a known payload: gains and parameters can be scaled together"
-        remedy = "record the arm with a known load as well: --loaded ARCHIVE --mass KG"
+        problem = "without a known payload, gains and inertias are only known up to a factor"
+        remedy = "add a recording with a known load: --loaded ARCHIVE --mass KG"
         raise InputError(None, problem, field="--loaded", remedy=remedy)

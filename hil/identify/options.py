@@ -1,4 +1,4 @@
-"""What a person may choose about an identification."""
+"""Options of an identification."""
 
 from __future__ import annotations
 
@@ -18,72 +18,69 @@ Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent
 ESTIMATORS: Final[dict[Estimator, str]] = {
     "auto": "weighted least squares, regularised towards the consistent solution as far as that "
     "predicts better (chosen by inner prediction)",
-    "wls": "weighted least squares (eq. 4): every joint's residual in its own noise",
-    "ols": "ordinary least squares: every joint's residual alike, in N·m",
-    "huber": "iteratively reweighted least squares, Huber's loss",
-    "tukey": "iteratively reweighted least squares, Tukey's bisquare",
+    "wls": "weighted least squares (eq. 4), residuals weighted by the noise of their joint",
+    "ols": "ordinary least squares, equal weights of all joints",
+    "huber": "iteratively reweighted least squares, Huber loss",
+    "tukey": "iteratively reweighted least squares, Tukey's bisquare loss",
     "prior": "weighted least squares with a Gaussian prior from CAD",
-    "consistent": "weighted least squares among the parameters that a machine can have",
-    "iv": "instrumental variables, the commanded motion as instruments",
+    "consistent": "weighted least squares over physically consistent parameters",
+    "iv": "instrumental variables, with the commanded motion as instruments",
 }
 
 
 @dataclass(frozen=True)
 class Options:
-    """How archives are turned into a result.
+    """Options of an identification.
 
-    What is "auto" is chosen by predicting parts of what is fitted from the rest
+    Options that are "auto" are chosen by predicting blocks of the fitted data from the other blocks
     (:mod:`identification.selection.inner_prediction`).
 
     Raises:
-        InputError: there is no such method or estimator.
+        InputError: the method or estimator is unknown.
     """
 
-    #: "default" smooths positions only; "paper" smooths positions and torques and filters the
-    #: regressor alike
+    #: "default" smooths positions only; "paper" also smooths torques and filters the regressor
     method: Method = "default"
-    #: share of a single recording that is fitted; the rest is predicted. Used only where there are
-    #: no validation runs.
-    split: float = 0.7
-    #: time by which the torque lags the position [s]; "stated" takes it from the cell, None
-    #: likewise unless another one is found; "auto" estimates it per axis and compensates it
+    split: float = 0.7  #: fitted share of a single recording without validation runs
+    #: time by which the torque lags the position [s]; "stated" uses the cell's, None too unless the
+    #: data show another one; "auto" estimates and compensates it per axis
     delay: float | Literal["auto", "stated"] | None = None
-    #: low-pass [Hz] the torque has come through before it was recorded; None for none. "auto" looks
-    #: for one in imported torques; a controller's own currents are known to have come through none.
+    #: bandwidth [Hz] of a low-pass filter in the recorded torque; None for none; "auto" detects one
+    #: in imported torques (a controller's currents are unfiltered)
     torque_bandwidth: float | Literal["auto"] | None = "auto"
-    estimator: Estimator = "auto"  #: by name, see `ESTIMATORS`
-    bandwidth: float | Literal["auto"] = "auto"  #: widest of the smoothed positions [Hz]
-    #: the slope of the smoothed positions, or the measured velocity
+    estimator: Estimator = "auto"  #: see `ESTIMATORS`
+    bandwidth: float | Literal["auto"] = "auto"  #: maximum bandwidth of the smoothed positions [Hz]
+    #: derivative of the smoothed positions, or measured velocity
     velocity: VelocitySource | Literal["auto"] = "auto"
-    #: entries of `[robot.friction]` that differ from the cell's
+    #: entries of `[robot.friction]` that replace the cell's
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
-    #: which rows are left out for being slow: long "rests", all "slow" ones and those near a
-    #: reversal, or "none"; None goes by the friction law
+    #: rows excluded for low speed: long "rests", all "slow" rows and those near a reversal, or
+    #: "none"; None depends on the friction law
     standstill: LeftOut | Literal["auto"] | None = "auto"
-    in_sample: bool = False  #: everything is fitted and nothing predicted: all errors are in-sample
+    in_sample: bool = False  #: fit all recordings and hold out none
 
     def __post_init__(self) -> None:
         for name, known in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):
             if (value := getattr(self, name)) not in known:
                 remedy = f"use {', '.join(known)}"
-                raise InputError(None, f"{value!r} is no {name}", field=name, remedy=remedy)
+                raise InputError(None, f"unknown {name} {value!r}", field=name, remedy=remedy)
 
 
 FRICTION_TERMS: Final = ", ".join(
     [f"{kind.label.lower()}{'=RAD/S' if kind.speed_symbol else ''}" for kind in TERMS]
     + ["presliding=RAD"]
 )
-"""Of which a friction law can be put together."""
+"""Terms that :func:`friction_from` accepts."""
 
 
 def friction_from(text: str) -> Mapping[str, Any]:
-    """A friction law from its terms: ``coulomb,viscous,offset,presliding=1e-4``.
+    """Parse a friction law such as ``coulomb,viscous,offset,presliding=1e-4``.
 
     Returns:
-        Entries of `[robot.friction]`; terms that are not named are left out of the law.
+        Entries of `[robot.friction]`; terms that are not named are absent from the law.
 
     Raises:
-        InputError: a term is unknown or excludes another, or its figure is none.
+        InputError: a term is unknown or excludes another, or its value is not positive.
     """
     known = {kind.label.lower(): kind for kind in TERMS}
     absent = {kind.option: ABSENT.get(kind.option, False) for kind in TERMS} | {"presliding": 0.0}
@@ -97,15 +94,15 @@ def friction_from(text: str) -> Mapping[str, Any]:
             except ValueError:
                 value = math.nan
             if not 0.0 < value < math.inf:
-                problem = f"{term.strip()!r} has no figure above zero"
-                remedy = "write for instance presliding=1e-4"
+                problem = f"{term.strip()!r} needs a value above zero"
+                remedy = "for example presliding=1e-4"
                 raise InputError(None, problem, field="--friction", remedy=remedy)
             entries[kind.option if kind else name] = value
         elif kind is not None and not figure and entries[kind.option] == absent[kind.option]:
             entries[kind.option] = kind.label if kind.option in ABSENT else True
         else:
-            problem = f"{term.strip()!r} is no term of friction, or excludes another one"
-            remedy = f"use auto, or some of {FRICTION_TERMS}, with commas between them"
+            problem = f"{term.strip()!r} is not a friction term, or excludes another term"
+            remedy = f"use auto, or a comma-separated list of {FRICTION_TERMS}"
             raise InputError(None, problem, field="--friction", remedy=remedy)
     return entries
 
@@ -119,4 +116,4 @@ FIXED: Final = Options(
     friction={},
     standstill=None,
 )
-"""Nothing is decided: delay and friction law of the cell, no low-pass, weighted least squares."""
+"""No automatic choice: delay and friction of the cell, no low-pass, weighted least squares."""

@@ -1,4 +1,4 @@
-"""What an arm carries, from archives recorded without and with it."""
+"""Identification of a payload from archives recorded without and with it."""
 
 from __future__ import annotations
 
@@ -27,64 +27,63 @@ from identification.model.robot import RobotModel
 from .options import Options
 from .prepared import prepare_sources
 from .settings import samples_of, signals_of
-from .sources import aligned, apart, archives_in, gather_sources, refuse_duplicates
+from .sources import aligned, archives_in, arm_differences, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
 
-# Frames in which controllers count, as ROS-Industrial names them.
+# Flange frames of controllers, by their ROS-Industrial names.
 _FLANGES: Final = ("tool0", "flange")
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadFound:
-    """A payload, and what it was found from."""
+    """An identified payload."""
 
-    estimate: PayloadEstimate  #: of the body
-    body: Body  #: as it was found
-    frame: str  #: link of the robot description in whose frame it is
+    estimate: PayloadEstimate
+    body: Body
+    frame: str  #: link in whose frame `body` is
     box: tuple[float, float, float] | None  #: edges of the reference body [m]; None for a point
     gravity: float  #: magnitude [m/s²]
-    #: names of the archives without it and with it
-    bare: tuple[str, ...]
-    loaded: tuple[str, ...]
-    warnings: tuple[str, ...]  #: what a reader must know
+    bare: tuple[str, ...]  #: names of the archives without payload
+    loaded: tuple[str, ...]  #: names of the archives with payload
+    warnings: tuple[str, ...]
 
     @property
     def figures(self) -> Array:
-        """Those of the body (10,), as `NAMES`."""
+        """Values of `NAMES` (10,)."""
         return figures_of(self.body)
 
     @property
     def wrist_torque(self) -> tuple[float, float, float]:
-        """Torque of its weight about the frame's origin in the worst pose [N·m], and interval."""
+        """Maximum torque of its weight about the frame's origin and its interval [N·m]."""
         value, low, high = (self.gravity * part for part in self.estimate.moment)
         return value, low, high
 
-    def outside(self, wanted: Mapping[str, float]) -> list[str]:
-        """Sentences about figures that do not lie in their intervals.
+    def outside(self, expected: Mapping[str, float]) -> list[str]:
+        """Return a sentence about each expected value outside its interval.
 
         Raises:
-            InputError: there is no figure of that name.
+            InputError: a name is unknown.
         """
         found = []
-        for name, value in wanted.items():
+        for name, value in expected.items():
             if name not in NAMES:
-                problem = f"{name!r} is no figure of a payload"
-                remedy = f"use some of {', '.join(NAMES)}, such as mass=4.0"
+                problem = f"{name!r} is not a property of a payload"
+                remedy = f"use one of {', '.join(NAMES)}, for example mass=4.0"
                 raise InputError(None, problem, field="--check", remedy=remedy)
             low, high = self.estimate.intervals[NAMES.index(name)]
             if not low <= value <= high:
                 unit = _UNITS[name]
                 found.append(
-                    f"{name} {value:g} {unit} lies outside the 95 % interval {low:.4g} to"
+                    f"{name} {value:g} {unit} is outside the 95 % interval {low:.4g} to"
                     f" {high:.4g} {unit}"
                 )
         return found
 
     @property
     def sentences(self) -> list[str]:
-        """What was found, in words."""
+        """Summary for the operator."""
         body, estimate, torque = self.body, self.estimate, self.wrist_torque
         low, high = estimate.intervals[0]
         centre = ", ".join(f"{1e3 * part:.1f}" for part in body.centre)
@@ -97,14 +96,14 @@ class PayloadFound:
         if estimate.undetermined:
             shape = "a point mass" if self.box is None else "the box"
             lines.append(
-                f"The motion does not determine {', '.join(estimate.undetermined)}: they are those"
-                f" of the possible body closest to {shape}."
+                f"The motion does not determine {', '.join(estimate.undetermined)}: their values"
+                f" are those of the physically consistent body closest to {shape}."
             )
         if estimate.contradicted:
             lines.append(
-                "No possible body fits the recordings to their noise: torque constants, the"
-                " geometry of the URDF or friction that depends on the load may be the cause, and"
-                " the intervals do not contain it."
+                "No physically consistent body explains the recordings within their noise:"
+                " check torque constants, the geometry of the URDF and friction that depends on the"
+                " load; the intervals do not include this error."
             )
         return lines
 
@@ -116,7 +115,7 @@ class PayloadFound:
 
     @property
     def controllers(self) -> dict[str, str]:
-        """By controller, the figures as they are typed; units and frames stand in the manual."""
+        """Commands that set the payload, by controller; units and frames as in its manual."""
         mass, centre = f"{self.body.mass:.3f}", self.body.centre
         millimetres = ", ".join(f"{1e3 * part:.2f}" for part in centre)
         metres = ", ".join(f"{part:.5f}" for part in centre)
@@ -135,7 +134,7 @@ class PayloadFound:
 
     @property
     def urdf(self) -> str:
-        """A description with the frame's link and the payload fixed to it."""
+        """URDF of the payload, fixed to the frame's link."""
         xyz = " ".join(repr(float(part)) for part in self.body.centre)
         names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         tensor = " ".join(
@@ -159,7 +158,7 @@ class PayloadFound:
 """
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, for other programs; infinite ends of intervals are null."""
+        """Return all values as JSON data; infinite ends of intervals are null."""
         torque, estimate = self.wrist_torque, self.estimate
 
         def figure(value: float, low: float, high: float, unit: str) -> dict[str, Any]:
@@ -192,23 +191,26 @@ def find_payload(
     box: tuple[float, float, float] | None = None,
     options: Options = Options(estimator="wls"),
 ) -> PayloadFound:
-    """Weigh what the arm carries in some recordings and not in others.
+    """Identify the payload of the loaded recordings as their difference to the bare ones.
 
-    Settings are chosen on the bare recordings. What `[robot.payload]` of a cell states is left out
-    of account: the payload is all that the loaded recordings carry and the bare ones do not.
+    Settings are chosen on the bare recordings; `[robot.payload]` of the cells is ignored.
 
-    Either side is archives, folders of them, or campaign folders. The figures are in the `frame` of
-    a link, see `flange_of` if left out; `box` has the edges [m] of the reference body along the
-    axes of that frame, None for a point.
+    Args:
+        bare: archives, folders of them, or campaign folders.
+        loaded: likewise.
+        reporter: of progress.
+        frame: link in whose frame the payload is; by default that of `flange_of`.
+        box: edges [m] of the reference body along the axes of that frame; None for a point.
+        options: of the identification.
 
     Raises:
-        InputError: archives cannot be used, are of two arms, carry two payloads or none.
+        InputError: archives cannot be used, are of two arms, have two payloads or none.
         IdentificationError: the recordings do not determine the mass.
     """
     sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
     if not sides[False] or not sides[True]:
-        problem = "a payload is a difference of recordings without it and with it"
-        remedy = "name both: hil payload BARE... --loaded LOADED"
+        problem = "recordings without and with the payload are needed"
+        remedy = "give both: hil payload BARE... --loaded LOADED"
         raise InputError(None, problem, remedy=remedy)
     refuse_duplicates([*sides[False], *sides[True]])
     found = {
@@ -216,15 +218,15 @@ def find_payload(
         for kind, paths in sides.items()
     }
     bare_cell, loaded_cell = found[False].cell, found[True].cell
-    if differing := apart(bare_cell, loaded_cell):
+    if differing := arm_differences(bare_cell, loaded_cell):
         problem = f"is of another arm than {bare_cell.path}: {' and '.join(differing)} differ"
-        remedy = "name bare and loaded recordings of one arm"
+        remedy = "give bare and loaded recordings of one arm"
         raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
     paths = {path.name: path for path in (*sides[False], *sides[True])}
     training = (*found[False].training, *found[True].training)
     for source in training:
         if source.recording.torque is None:
-            problem = "holds no joint torques, and a payload is weighed in their unit"
+            problem = "contains no joint torques"
             remedy = "give drive.torque_constant in the column map"
             raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
     cell = bare_cell.without_payload()
@@ -257,7 +259,7 @@ def find_payload(
             None,
             f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg",
             field="--loaded",
-            remedy="name recordings that were made with it",
+            remedy="give recordings that were made with the payload",
         )
     return PayloadFound(
         estimate=estimate,
@@ -272,7 +274,7 @@ def find_payload(
 
 
 def flange_of(model: RobotModel) -> str:
-    """The link whose frame controllers count in: `tool0`, `flange`, or that of the last joint."""
+    """Return the flange link: `tool0`, `flange`, or the link of the last joint."""
     last = {
         name: pose for name, pose in model.chain.frames.items() if pose.joint == model.n_joints - 1
     }
@@ -281,11 +283,11 @@ def flange_of(model: RobotModel) -> str:
 
 
 def _mixed(found: Difference, path: Path) -> InputError:
-    """That not all bare recordings carry the same, or not all loaded ones."""
+    """Return the error about recordings of one side with different payloads."""
     more = "more" if found.mass > 0.0 else "less"
-    amount = f"{abs(found.mass):.3g} kg {more} than {found.reference.name}, though both are named"
+    amount = f"{abs(found.mass):.3g} kg {more} than {found.reference.name}"
     if found.run.loaded:
-        problem, remedy = "carries another payload", "weigh each payload by itself"
-        return InputError(path, f"{problem}: {amount} as loaded", field="--loaded", remedy=remedy)
-    problem = f"was recorded with another tool mounted: it carries {amount} as bare"
-    return InputError(path, problem, remedy="name it with --loaded, or leave it out")
+        problem, remedy = "carries another payload", "identify each payload separately"
+        return InputError(path, f"{problem}: {amount}", field="--loaded", remedy=remedy)
+    problem = f"was recorded with another tool: it carries {amount}, also given as bare"
+    return InputError(path, problem, remedy="give it with --loaded, or omit it")

@@ -1,4 +1,4 @@
-"""Estimate, validate, judge."""
+"""Identification: estimate, validate, verdict, results."""
 
 from __future__ import annotations
 
@@ -42,40 +42,30 @@ from .surroundings import nominal_of, surroundings_of
 Array = NDArray[np.float64]
 
 FIGURE_SAMPLES: Final = 4000
-"""Rows of a time series behind a figure, at most."""
+"""Maximum number of rows of a time series in a figure."""
 FRICTION_POINTS: Final = 600
-"""Points per joint behind a friction curve."""
-_RECORDINGS: Final = 4  # of those that were fitted: more say the same again
-_MARGIN: Final = 1.0  # s of rest that is shown before and after the motion
+"""Points per joint in a friction figure."""
+_RECORDINGS: Final = 4  # fitted recordings in a friction figure
+_MARGIN: Final = 1.0  # time shown before and after the motion, s
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What an identification found, and the series its figures need."""
+    """An identification with everything it was computed from."""
 
-    paths: tuple[Path, ...]  #: the archives
-    prepared: Prepared  #: their recordings as samples
-    estimation: Estimation  #: the estimate, and what was computed beside it
-    essential: EssentialChoice | str  #: the essential parameters; in words why there are none
-    consistency: ConsistencyCheck | str  #: parameters that a machine can have, likewise
-    verdict: Verdict  #: on the estimate
-    results: Results  #: as they go into `results.json`
-    series: ReportSeries  #: for the figures of the report
+    paths: tuple[Path, ...]  #: of the archives
+    prepared: Prepared
+    estimation: Estimation
+    essential: EssentialChoice | str  #: essential parameters, or the reason why there are none
+    consistency: ConsistencyCheck | str  #: consistent parameters, or the reason why there are none
+    verdict: Verdict
+    results: Results  #: content of `results.json`
+    series: ReportSeries  #: data of the report's figures
 
     @property
     def cell(self) -> Cell:
-        """Whose archives they are."""
+        """The cell of the archives."""
         return self.prepared.sources.cell
-
-    @property
-    def unseen(self) -> tuple[Samples, ...]:
-        """The recordings that were predicted; those that were fitted where none were."""
-        return self.prepared.held_out
-
-    @property
-    def tested_on(self) -> str:
-        """What these are, in words."""
-        return self.prepared.sources.tested_on
 
     @property
     def estimate(self) -> RepeatedEstimate:
@@ -88,7 +78,7 @@ def consistency_of(
     training: PhaseFactor,
     held_out: Factor,
 ) -> ConsistencyCheck | str:
-    """Weighted least squares with the inequalities of a machine and without; or why not."""
+    """Compare the consistent with the unconstrained estimate, or return why that failed."""
     total = training.total
     try:
         weights = joint_weights(total)
@@ -105,25 +95,25 @@ def identify_sources(
     *,
     predict: Sequence[Path] = (),
 ) -> Identification:
-    """Identify from one folder, of a campaign or of archives, or from archives.
+    """Identify from a campaign folder, a folder of archives, or archives.
 
     Raises:
-        InputError: a folder holds neither, or stands among archives.
+        InputError: the folder contains neither, or is not the only path.
     """
     folder = next((path for path in paths if path.is_dir()), None)
     if folder is None:
         return identify_archives(paths, reporter, options, predict=predict)
     if len(paths) > 1:
         raise InputError(
-            folder, "is a folder among archives", remedy="name one campaign folder, or files"
+            folder, "is a folder among files", remedy="give one campaign folder, or files only"
         )
     if path_exists(folder / "manifest.json"):
         return identify_campaign(folder, reporter, options, predict=predict)
-    loose = sorted(folder.glob("*.mcap"))  # of `hil record`
-    if not loose:
-        remedy = "name the folder of a campaign (`hil design -o`), or archives (*.mcap)"
-        raise InputError(folder, "holds neither a campaign nor archives", remedy=remedy)
-    return identify_archives(loose, reporter, options, predict=predict)
+    archives = sorted(folder.glob("*.mcap"))  # of `hil record`
+    if not archives:
+        remedy = "give a campaign folder (`hil design -o`), or archives (*.mcap)"
+        raise InputError(folder, "contains neither a campaign nor archives", remedy=remedy)
+    return identify_archives(archives, reporter, options, predict=predict)
 
 
 def identify_campaign(
@@ -133,17 +123,17 @@ def identify_campaign(
     *,
     predict: Sequence[Path] = (),
 ) -> Identification:
-    """Identify from the whole archives of a campaign folder, and predict others beside them.
+    """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
 
     Raises:
-        InputError: no whole excitation is in the folder.
+        InputError: the folder has no complete excitation.
     """
     folder = CampaignFolder(root)
     kinds = ("excitation", "validation")
     paths = [path for kind in kinds for path in folder.completed(kind)]
     if not paths:
-        problem = "its manifest.json names no completed excitation that is still whole"
-        remedy = "run the campaign, or name the archives themselves"
+        problem = "its manifest.json has no completed excitation with an intact archive"
+        remedy = "run the campaign, or give the archives instead of the folder"
         raise InputError(root, problem, remedy=remedy)
     found = identify_archives(
         [*paths, *folder.completed("standstill")],
@@ -166,13 +156,18 @@ def identify_archives(
     name: str = "",
     warnings: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives, which say what is fitted, predicted or rested at.
+    """Identify from archives; their kind decides what is fitted and what is held out.
 
-    Those of `predict` are predicted and not fitted, whatever they say. The result is named by the
-    first archive if nothing is given; `warnings` say what is known to be wrong with the archives.
+    Args:
+        paths: of the archives.
+        reporter: of progress.
+        options: of the identification.
+        predict: archives that are held out, whatever their kind.
+        name: of the result; by default that of the first archive.
+        warnings: added to those of the result.
 
     Raises:
-        InputError: the archives cannot be used, or not together, or not by the chosen estimator.
+        InputError: the archives cannot be used, not together, or not by the chosen estimator.
     """
     sources = gather_sources(paths, options.split, predict, in_sample=options.in_sample)
     for warning in warnings:
@@ -194,22 +189,21 @@ def identify_archives(
         else:
             if sources.in_sample:
                 consistency = replace(consistency, judged_on="in-sample")
-            if consistency.impossible:  # no machine predicts what the model predicts
+            if consistency.impossible:  # no rigid bodies produce the predicted torque
                 impossible.append(
-                    f"{consistency.sentence}: look there for a wrong sign, torque constant,"
-                    " coupling or description"
+                    f"{consistency.sentence}: check signs, torque constants, coupling and URDF"
                 )
             elif consistency.costly:
                 sources = sources.with_warning(consistency.sentence)
         task.advance(1, "essential parameters")
-        essential: EssentialChoice | str = "nothing was held out to choose them by"
+        essential: EssentialChoice | str = "they are chosen on held-out data, and there is none"
         if not sources.in_sample:
             try:
                 essential = choose_essential(cell.model, result.phase, estimation.held_out)
             except IdentificationError as error:
                 essential = str(error)
         if isinstance(essential, str):
-            sources = sources.with_warning(f"essential parameters were not looked for: {essential}")
+            sources = sources.with_warning(f"no essential parameters: {essential}")
         task.advance(1, "verdict")
         nominal = nominal_of(cell)
         evidence = gather(
@@ -242,7 +236,7 @@ def identify_archives(
             estimation,
             verdict,
             evidence,
-            None if nominal is None else nominal.words,
+            None if nominal is None else nominal.label,
             essential,
             consistency,
         ),
@@ -251,7 +245,7 @@ def identify_archives(
 
 
 def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSeries:
-    """The series of a report: the first motion that was fitted, the first that was held out."""
+    """Return the figure data of a report: the first fitted and the first held-out recording."""
     sources, fitted, example = prepared.sources, prepared.fitted, prepared.held_out[0]
     model, values = sources.cell.model, estimate.pooled.values
     excitation, motion = fitted[0], fitted[0].motion
@@ -297,7 +291,7 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
 
 
 def _shown(samples: Samples) -> slice:
-    """Rows for a figure: the motion, and a little of the rest before and after it."""
+    """Rows of a figure: the motion with a margin before and after it."""
     moving, time = moving_rows(samples), samples.motion.time
     if moving.start == moving.stop:
         return moving
@@ -309,7 +303,7 @@ def _shown(samples: Samples) -> slice:
 def _friction_data(
     model: RobotModel, values: Array, fitted: tuple[Samples, ...]
 ) -> tuple[Array, Array]:
-    """Speed and friction torque of fitted rows (FRICTION_POINTS, n), NaN where there are fewer."""
+    """Speed and friction torque of fitted rows, each (FRICTION_POINTS, n), padded with NaN."""
     some = fitted[:: -(-len(fitted) // _RECORDINGS)]
     parts = [(one.motion.velocity, friction_torque(model, values, one), one.usable) for one in some]
     speed, torque, usable = (np.concatenate(column) for column in zip(*parts, strict=True))

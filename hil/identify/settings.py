@@ -1,8 +1,4 @@
-"""Settings of an identification: decided from sources, and applied to make samples of them.
-
-The same settings make the same samples of an archive wherever it is read. To decide them only what
-is fitted is looked at, and of very many recordings the first.
-"""
+"""Settings that turn recordings into samples, and their automatic choice from the fitted data."""
 
 from __future__ import annotations
 
@@ -37,28 +33,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Settings:
-    """How archives of one arm become samples, and samples an estimate: figures and words only."""
+    """Settings of the preprocessing and estimation of an arm's archives; serialisable."""
 
-    preprocessing: Preprocessing  #: of recordings, with the delay of the torque
-    #: entries of `[robot.friction]` that differ from the cell's
+    preprocessing: Preprocessing  #: with the delay of the torque
+    #: entries of `[robot.friction]` that replace the cell's
     friction: Mapping[str, Any] = field(default_factory=dict)
-    #: of the positions (n,) [rad² or m²]; None takes each recording's own
+    #: of the positions (n,) [rad² or m²]; None estimates it in each recording
     noise_variance: tuple[float, ...] | None = None
-    torque_variance: tuple[float, ...] | None = None  #: of the torques (n,) [N²·m² or N²]; likewise
-    stated_delay: float = 0.0  #: of the torque, before any was looked for [s]
-    #: by which torques are read earlier, axis by axis (n,) [s]; None for none
-    axis_delays: tuple[float, ...] | None = None
-    delay_variance: float = 0.0  #: of a delay that was found [s²]; zero where it is known
-    #: of the automatic estimator
+    #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
+    torque_variance: tuple[float, ...] | None = None
+    stated_delay: float = 0.0  #: of the torque, by cell or options [s]
+    axis_delays: tuple[float, ...] | None = None  #: compensated per axis (n,) [s]; None for none
+    delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
-    choices: tuple[Choice, ...] = ()  #: what was chosen by inner prediction
+    choices: tuple[Choice, ...] = ()  #: made by inner prediction
 
     def preprocessed(self, **changes: Any) -> Settings:
-        """These settings with others of the preprocessing."""
+        """Return these settings with changes of the preprocessing."""
         return replace(self, preprocessing=replace(self.preprocessing, **changes))
 
-    def law(self, cell: Cell) -> Cell:
-        """The cell with the friction law of these settings."""
+    def with_friction_law(self, cell: Cell) -> Cell:
+        """Return the cell with the friction law of these settings."""
         return cell.with_friction(**self.friction) if self.friction else cell
 
     def delays(self, n_joints: int) -> Array:
@@ -69,13 +64,13 @@ class Settings:
 
 
 def stated_delay(cell: Cell) -> float:
-    """Time by which the torque lags the position, as `[controller]` states it [s]."""
+    """Return the delay of the torque that `[controller]` states [s]."""
     controller = cell.file.controller
     return controller.current_delay_cycles * cell.period if controller else 0.0
 
 
 def stated_settings(cell: Cell, options: Options) -> Settings:
-    """What is known or asked for before anything is looked for or chosen."""
+    """Return the settings that cell and options state, before any automatic choice."""
     delay, bandwidth = options.delay, options.torque_bandwidth
     delay = delay if isinstance(delay, float) else stated_delay(cell)
     return Settings(
@@ -93,7 +88,7 @@ def stated_settings(cell: Cell, options: Options) -> Settings:
 
 
 def signals_of(source: Source, settings: Settings) -> Source:
-    """The source with each axis's torque at the time of its position, where axes differ in that."""
+    """Return the source with the delay of each axis compensated, where delays differ by axis."""
     if settings.axis_delays is None:
         return source
     return replace(
@@ -104,16 +99,20 @@ def signals_of(source: Source, settings: Settings) -> Source:
 def samples_of(
     source: Source, cell: Cell, settings: Settings, model: RobotModel | None = None
 ) -> Samples:
-    """Samples of a source, as a fit reads them, once it went through :func:`signals_of`.
+    """Return the samples of a source from :func:`signals_of`, for a fit.
 
-    The cell has the law of the settings; the model is by default its own.
+    Args:
+        source: the recording.
+        cell: with the friction law of the settings.
+        settings: of the preprocessing.
+        model: in place of the cell's.
 
     Raises:
         RecordingError: the recording cannot be prepared.
     """
     recording, start = source.context or (source.recording, 0)
     driven = cell.file.drive_train is not None
-    whole = prepare(
+    samples = prepare(
         recording,
         model or cell.model,
         noise_variance=_array(settings.noise_variance),
@@ -123,12 +122,12 @@ def samples_of(
         current_limit=np.array(cell.drive_table.current_limit) if driven else None,
     )
     if source.context is None:
-        return whole
-    return whole.between(start, start + source.recording.n_samples)
+        return samples
+    return samples.between(start, start + source.recording.n_samples)
 
 
-def judged_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
-    """Samples of a source, as a verdict reads them: moving, and of the torque as recorded.
+def validation_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
+    """Return the samples of a source for a verdict: rows in motion, torque as recorded.
 
     Raises:
         RecordingError: the recording cannot be prepared.
@@ -140,56 +139,55 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
     return None if figures is None else np.array(figures)
 
 
-MOST_READ: Final = 32
-"""Recordings that settings are decided on: more say the same again."""
-# Where the delay is stated it is looked for all the same, to be reported: in so many samples.
+MAX_RECORDINGS: Final = 32
+"""Recordings that settings are chosen from."""
+# A stated delay is checked on the first samples of a recording.
 _DELAY_SAMPLES: Final = 8000
 RIPPLE: Final = ((1,), (2,), (1, 2))
-"""Periods per motor turn of a torque ripple: a rotor out of centre, a wave generator, both."""
+"""Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
 
 class Decided(NamedTuple):
-    """Settings, and what was found of delays on the way, in figures and sentences.
-
-    The longest of the recordings has these delays; None where that cannot be determined.
-    """
+    """Chosen settings."""
 
     settings: Settings
-    delays: DelayEstimate | None
-    notes: tuple[str, ...]
+    delays: DelayEstimate | None  #: in the longest recording; None if it cannot be determined
+    notes: tuple[str, ...]  #: about delays, one sentence each
 
 
 def with_noise(sources: Sources) -> tuple[Sources, str]:
-    """Noise of the positions from repetitions, where no standstill was recorded; and in words."""
-    recordings = [source.recording for source in sources.training[:MOST_READ]]
-    noise_was = "the noise of the positions was"
+    """Return the sources with position noise from standstill or repetitions, and its origin."""
+    recordings = [source.recording for source in sources.training[:MAX_RECORDINGS]]
+    noise = "the noise of the positions was"
     if sources.noise_variance is not None:
-        return sources, f"{noise_was} measured at standstill"
+        return sources, f"{noise} measured at standstill"
     if sources.same_motion and len(recordings) > 1:
-        with suppress(IdentificationError):  # no two that could be compared
-            noise = repetition_noise(recordings)
-            known = replace(sources, noise_variance=noise.position, torque_variance=noise.torque)
-            apart = f"what differs between {len(recordings)} repetitions at equal times"
-            return known, f"no standstill was recorded: {noise_was} measured on {apart}"
-    return sources, f"{noise_was} estimated from their own fast part"
+        with suppress(IdentificationError):  # no two comparable repetitions
+            found = repetition_noise(recordings)
+            known = replace(sources, noise_variance=found.position, torque_variance=found.torque)
+            return known, (
+                f"no standstill was recorded: {noise} estimated from the differences between"
+                f" {len(recordings)} repetitions"
+            )
+    return sources, f"{noise} estimated from their high-frequency part"
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
-    """Decide on everything that options leave open, from sources with torques and measured noise.
+    """Choose the settings that the options leave open, from sources with torques and noise.
 
     Raises:
         RecordingError: a recording cannot be prepared.
-        IdentificationError: a delay was asked for and there is not one usable row.
+        IdentificationError: a delay was requested and no row is usable.
     """
-    sources = replace(sources, training=sources.training[:MOST_READ])
+    sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
     stated = _with_noise_of(stated_settings(sources.cell, options), sources)
-    sources = replace(sources, cell=stated.law(sources.cell))
+    sources = replace(sources, cell=stated.with_friction_law(sources.cell))
     notes: list[str] = []
     settings, found = stated, _delays(sources, stated, options, reporter)
     suggested: tuple[float, ...] = ()
     if found is not None and options.delay == "auto":
         notes = _described(found)
-        if found.significant and found.agree:  # one delay moves the motion, several the torques
+        if found.significant and found.agree:
             settings = stated.preprocessed(torque_delay=found.common)
             notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
         elif found.significant:
@@ -197,8 +195,8 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
             settings = replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0)
             notes.append("each axis was compensated by its own delay")
     elif found is not None and options.delay is None:
-        # That of a controller is known: only what is well determined and differs by more than the
-        # estimate errs in closed loop is another one.
+        # A controller's delay is known; the estimate replaces it only if well determined and
+        # different by more than its bias in closed loop.
         far = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
         if sources.cell.file.controller is None or (far and found.determined.all()):
             notes = _described(found)
@@ -210,29 +208,26 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
     unchanged = f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied"
     if found is not None and lags:
-        # It was found without the low-pass, and may be nothing but the lag of that.
+        # It was estimated without the low-pass, and may be the lag of that.
         found, notes = None, [f"{unchanged} beside the low-pass of the torque"]
     elif how.torque_delay in suggested:
         notes.append(compensated)
     elif how.torque_delay != assumed:
         found, notes = None, [compensated]
     elif found is not None and suggested:
-        found, notes = None, [f"{notes[0]}: it predicts worse, and was not applied"]
+        found, notes = None, [f"{notes[0]}; not applied, as it predicts worse"]
     variance = found.variance if found is not None and notes else 0.0
     return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
 
 
 def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
-    """Settings for another campaign of the arm that they were decided on.
-
-    Its noise is its own, and so is the delay that its cell states.
-    """
-    own = _with_noise_of(settings, sources)
+    """Return the settings for another campaign of the arm: with its noise and stated delay."""
+    settings = _with_noise_of(settings, sources)
     if isinstance(options.delay, float):
-        return own
+        return settings
     stated = stated_delay(sources.cell)
     delay = settings.preprocessing.torque_delay + (stated - settings.stated_delay)
-    return replace(own, stated_delay=stated).preprocessed(torque_delay=delay)
+    return replace(settings, stated_delay=stated).preprocessed(torque_delay=delay)
 
 
 def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
@@ -244,25 +239,25 @@ def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
 
 
 def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:
-    """What inner prediction has to decide."""
+    """Return the questions that inner prediction has to answer."""
     recorded = [source.recording for source in sources.training]
-    asked: dict[Question, bool] = {
+    questions: dict[Question, bool] = {
         "delay": bool(suggested),
         "bandwidth": options.bandwidth == "auto",
         "velocity": options.velocity == "auto"
         and all(one.velocity is not None for one in recorded),
         "presliding": options.friction == "auto",
         "rows": options.standstill == "auto",
-        # A cell file with a drive train says which terms are wanted.
+        # A cell file with a drive train states the friction terms.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
-        # A controller's own currents come through no low-pass.
+        # Currents of a controller are unfiltered.
         "low-pass": options.torque_bandwidth == "auto"
         and options.method == "default"
         and recorded[0].motor_current is None,
         "estimator": options.estimator == "auto",
     }
-    return {question for question, wanted in asked.items() if wanted}
+    return {question for question, wanted in questions.items() if wanted}
 
 
 def _chosen(
@@ -272,11 +267,11 @@ def _chosen(
     options: Options,
     reporter: Reporter,
 ) -> Settings:
-    """Choose what is automatic by inner prediction, with some delays of the torque tried [s]."""
+    """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
     cell, questions = sources.cell, _questions(sources, options, suggested)
     if not questions:
         return settings
-    # Repetitions of one motion say the same again.
+    # One repetition of a motion is enough.
     read = sources.training[:1] if sources.same_motion else sources.training
     read = tuple(signals_of(source, settings) for source in read)
 
@@ -316,7 +311,7 @@ def _chosen(
 
 
 def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
-    """Torque ripple that the cell's gears may have; none where it has some, or no gear is known."""
+    """Candidates of torque ripple; none if the cell states some, or no gear ratios."""
     if cell.file.drive_train is None or cell.file.robot.friction.ripple:
         return []
     motors = cell.drive_train.motor_from_joint
@@ -326,14 +321,14 @@ def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
 def _delays(
     sources: Sources, stated: Settings, options: Options, reporter: Reporter
 ) -> DelayEstimate | None:
-    """Delays in the longest of the fitted recordings, or in its beginning if nobody asked."""
+    """Estimate the delays in the longest fitted recording, or in its beginning if not requested."""
     if options.delay == "stated":
         return None
     recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
     wanted = options.delay == "auto"
     if not wanted:
         recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
-    with reporter.task("looking for a delay", 1) as task:
+    with reporter.task("estimating the delay", 1) as task:
         try:
             found = estimate_delays(
                 recording,
@@ -350,7 +345,6 @@ def _delays(
 
 
 def _described(found: DelayEstimate) -> list[str]:
-    """What was found, in words."""
     notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
     if not found.significant:
         notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")

@@ -1,4 +1,4 @@
-"""Archives as identification needs them: whose they are, what is fitted, what is predicted."""
+"""Archives of an identification, sorted into fitted and held-out recordings."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ from identification.signals.recording import (
 Array = NDArray[np.float64]
 
 FLOAT32_STEP = 2.0**-24
-"""Relative rounding step of a position on the wire, as a share of its size."""
+"""Relative rounding error of a float32 position on the wire."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One archive: its recording and where the planned motion begins in it."""
+    """The recording of one archive."""
 
     path: Path  #: of the archive
     name: str  #: file name
     recording: Recording  #: joints in the order of the model
     origin: float  #: time of the first set-point [s]
-    merged: str = ""  #: what was done about repeated time stamps, in words; nothing for none
-    clock: tuple[str, ...] = ()  #: what was decided about its time stamps, in sentences
-    retimed: bool = False  #: whether other times than the stamps were used
-    #: the motion of a longer recording that this is a part of, and where it begins in it, so that
-    #: filters know what lies beyond its ends. Its torques are zero outside.
+    merged: str = ""  #: note about repeated time stamps
+    clock: tuple[str, ...] = ()  #: notes about its time stamps
+    retimed: bool = False  #: whether other times than the time stamps are used
+    #: of a part: the complete recording, with torques set to zero outside the part, and the index
+    #: of its first sample, so that filters see the motion beyond its ends
     context: tuple[Recording, int] | None = None
 
-    def changed(self, change: Callable[[Recording], Recording]) -> Source:
-        """The source with its recording, and the context of it, changed alike row by row."""
+    def map_recording(self, change: Callable[[Recording], Recording]) -> Source:
+        """Return the source with a row-by-row change of its recording and context."""
         context = self.context
         return replace(
             self,
@@ -66,62 +66,60 @@ class Source:
 class Sources:
     """All archives of one identification."""
 
-    cell: Cell  #: from the attachments of the first archive
+    cell: Cell  #: of the first archive
     header: ArchiveHeader  #: of the first archive
-    plan: dict[str, Any] | None  #: of the first archive; None where none was attached
-    training: tuple[Source, ...]  #: what is fitted
-    same_motion: bool  #: whether these are repetitions of one motion
-    held_out: tuple[Source, ...]  #: what is predicted and never fitted
-    #: of the positions (n,) [rad²]; None where no standstill was recorded
-    noise_variance: Array | None
-    torque_variance: Array | None  #: of the torques at standstill (n,) [N²·m²]; None likewise
-    warnings: tuple[str, ...]  #: what a reader must know about the archives
-    tested_on: str  #: what is predicted, in words
-    in_sample: bool = False  #: whether nothing was held out: `held_out` is `training` then
+    plan: dict[str, Any] | None  #: of the first archive
+    training: tuple[Source, ...]  #: fitted
+    same_motion: bool  #: whether `training` are repetitions of one motion
+    held_out: tuple[Source, ...]  #: predicted, not fitted
+    noise_variance: Array | None  #: of positions at standstill (n,) [rad²]; None if not recorded
+    torque_variance: Array | None  #: of torques at standstill (n,) [N²·m²]; None if not recorded
+    warnings: tuple[str, ...]
+    tested_on: str  #: description of the held-out motion
+    in_sample: bool = False  #: whether nothing is held out; `held_out` is `training` then
 
     def with_warning(self, warning: str) -> Sources:
-        """These sources with one more thing a reader must know."""
+        """Return the sources with one more warning."""
         return replace(self, warnings=(*self.warnings, warning))
 
 
 def cell_of(archive: Archive) -> Cell:
-    """The cell that travels inside an archive.
+    """Return the cell of an archive.
 
     Raises:
-        ArchiveError: the archive carries no cell or no URDF, or one that is not UTF-8.
+        ArchiveError: the archive has no cell or URDF, or one that is not UTF-8.
     """
     return Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
 
 
-def apart(one: Cell, other: Cell) -> list[str]:
-    """What two cells describe differently of the arm; what it carries may differ."""
+def arm_differences(one: Cell, other: Cell) -> list[str]:
+    """Return the parts in which two cells describe different arms, payloads aside."""
     parts = (
         {"robot.urdf": cell.urdf, "[robot]": cell.without_payload().file.robot}
         | {"[drive_train]": cell.file.drive_train}
         for cell in (one, other)
     )
-    mine, theirs = parts
-    return [name for name in mine if mine[name] != theirs[name]]
+    first, second = parts
+    return [name for name in first if first[name] != second[name]]
 
 
 def gather_sources(
     paths: Sequence[Path], split: float, predict: Sequence[Path] = (), *, in_sample: bool = False
 ) -> Sources:
-    """Open archives and sort them into what is fitted and what is predicted.
+    """Open archives and sort them into fitted and held-out recordings.
 
-    Excitations are fitted and validation runs predicted; imported recordings are what they were
-    declared; those of `predict` are predicted in any case. Where there is nothing to predict, the
-    last part of a single recording (see `Options.split`), or the last of several, is held out;
-    `in_sample` fits whatever moves.
+    Excitations are fitted, validation runs and `predict` are held out; imported recordings state
+    their use. Without held-out archives, the last part of a single recording (see `Options.split`)
+    or the last of several is held out, unless `in_sample`.
 
     Raises:
-        InputError: there is nothing to fit, an archive is named twice, or something is to be
-            predicted and all of it to be fitted.
-        ArchiveError: an archive cannot be read, is not fit, or belongs to another cell.
+        InputError: there is nothing to fit, an archive is given twice, or `predict` is given with
+            `in_sample`.
+        ArchiveError: an archive cannot be read or used, or belongs to another cell.
     """
     if in_sample and predict:
         raise InputError(
-            predict[0], "cannot be held out where all is fitted", remedy="leave out --in-sample"
+            predict[0], "cannot be held out if everything is fitted", remedy="omit --in-sample"
         )
     refuse_duplicates([*paths, *predict])
     archives = [open_archive(path) for path in [*paths, *predict]]
@@ -136,16 +134,16 @@ def gather_sources(
     if not fitted:
         raise InputError(
             paths[0] if paths else None,
-            "there is no excitation and no imported recording among the archives"
-            + (" but rejected ones" if by_use[REJECTED] else ""),
-            remedy="name archives of kind excitation or imported",
+            "the archives contain no excitation and no imported recording"
+            + (" that was not rejected" if by_use[REJECTED] else ""),
+            remedy="give archives of kind excitation or imported",
         )
     cell = cell_of(fitted[0])
     for archive in archives[1:]:
         for name in ("robot.urdf", "cell.toml"):
             if archive.attachments.get(name) != archives[0].attachments.get(name):
-                problem = f"carries another {name} than {archives[0].path}"
-                remedy = "identify each cell's archives by themselves"
+                problem = f"has another {name} than {archives[0].path}"
+                remedy = "identify the archives of each cell separately"
                 raise ArchiveError(archive.path, problem, remedy=remedy)
     rest = [source_of(archive, cell, to_fit=False).recording for archive in by_use["standstill"]]
     own = [(archive, source_of(archive, cell)) for archive in fitted]
@@ -165,16 +163,14 @@ def gather_sources(
         tested_on = "the rest of the same motion"
         training, held_out = _split(training[0], split)
         warnings.append(
-            f"a temporal split: the first {split:.0%} of one recording were fitted, the rest of the"
-            " same motion was predicted; other motions would be a harder test"
+            f"the first {split:.0%} of one recording were fitted and the rest was predicted;"
+            " another motion would be a stronger test"
         )
     elif not held_out:
         repeated = every.same_motion
         tested_on = "a repetition of the fitted motion" if repeated else "another recording"
         training, held_out = training[:-1], [training[-1]]
-        warnings.append(
-            f"no validation run: the last recording, {held_out[0].name}, was held out instead"
-        )
+        warnings.append(f"no validation run: the last recording, {held_out[0].name}, was held out")
     return replace(
         every,
         training=training,
@@ -188,10 +184,10 @@ def gather_sources(
 def all_fitted(
     cell: Cell, fitted: Sequence[tuple[Archive, Source]], rest: Recording | None
 ) -> Sources:
-    """Sources of which nothing is held out, with the noise of a recording at standstill.
+    """Return sources without held-out recordings; `rest` is a recording at standstill.
 
     Raises:
-        ArchiveError: the plan in the first archive is none.
+        ArchiveError: the plan in the first archive is not valid.
     """
     archives, found = zip(*fitted, strict=True)
     training, plan, same_motion = tuple(found), None, False
@@ -220,7 +216,7 @@ def all_fitted(
 
 
 def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
-    """Imported recordings with one origin if they show one motion, and whether they do."""
+    """Return imported recordings with a common origin, and whether they show one motion."""
     offsets = offsets_of_repetitions([source.recording for source in sources])
     if offsets is None:
         return sources, False
@@ -230,7 +226,7 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
 
 
 def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
-    """Archives, and those of folders, of campaigns the whole ones.
+    """Yield files, and the archives of folders (of campaigns: the complete ones).
 
     Raises:
         InputError: a folder has none.
@@ -246,26 +242,26 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
         else:
             inside = sorted(path.glob("*.mcap"))
         if not inside:
-            remedy = "name archives (*.mcap) or the folder of a campaign that was run"
-            raise InputError(path, "holds no whole archive", remedy=remedy)
+            remedy = "give archives (*.mcap) or the folder of a campaign that was run"
+            raise InputError(path, "contains no complete archive", remedy=remedy)
         yield from inside
 
 
 def refuse_duplicates(paths: Sequence[Path]) -> None:
-    """What is fitted must not be predicted as well."""
+    """Raise InputError if two files are equal: fitted recordings must not be held out as well."""
     seen: dict[str, Path] = {}
     for path in paths:
         try:
             digest = file_digest(path)
         except OSError:
-            continue  # opening it will say so
+            continue  # reported when it is opened
         if digest in seen:
-            raise InputError(path, f"holds the same as {seen[digest]}", remedy="name it once")
+            raise InputError(path, f"is a copy of {seen[digest]}", remedy="give only one of them")
         seen[digest] = path
 
 
 def _incomplete(archive: Archive) -> str | None:
-    """What a reader must know about an archive that did not end as planned."""
+    """Return the warning about an archive that did not end as planned."""
     name, outcome = archive.path.name, archive.outcome
     if archive.missing is not None or outcome is None or outcome.outcome == "completed":
         return archive.missing
@@ -275,7 +271,7 @@ def _incomplete(archive: Archive) -> str | None:
 
 
 def _not_judged(archive: Archive) -> str | None:
-    """What a reader must know about an archive that its campaign's manifest does not name."""
+    """Return the warning about an archive that is not in its campaign's manifest."""
     path = archive.path
     folder = CampaignFolder(path.parent.parent)
     if path.parent.name != folder.archives.name or ArchiveName.parse(path) is None:
@@ -283,35 +279,36 @@ def _not_judged(archive: Archive) -> str | None:
     with suppress(CampaignFolderError):
         if folder.sealed and path.name not in {entry.name for entry in folder.manifest()}:
             return (
-                f"{path.name} is not named in its campaign's manifest.json: the run that made it "
-                "was killed before it was judged"
+                f"{path.name} is not in its campaign's manifest.json: the run was killed before "
+                "the quality of the recording was checked"
             )
     return None
 
 
 def known_warnings(cell: Cell, archive: Archive) -> list[str]:
-    """What is known beforehand to stand between the numbers and the truth, in sentences."""
+    """Return the warnings about known systematic errors."""
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
     known = {
-        "the torque constants are assumed: predictions are as good as they look, but every "
-        "parameter is in their units": assumed and not archive.header.only_simulated,
-        "friction drift is switched on: the planted friction is that of a half-warm joint, "
-        "and a short run is colder, so friction estimates differ from it": any(
+        "the torque constants are assumed: predictions of current are not affected, but all "
+        "parameters are in units of the assumed constants": assumed
+        and not archive.header.only_simulated,
+        "friction drift is simulated: the true friction stated here is that of a half-warm joint, "
+        "and estimates from a short, colder run differ from it": any(
             "friction drift" in effect for effect in archive.header.effects
         ),
     }
-    return [words for words, true in known.items() if true]
+    return [text for text, true in known.items() if true]
 
 
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
-    """The recording of an archive, as far as it is of use.
+    """Return the usable part of an archive's recording.
 
     Raises:
-        ArchiveError: the recording is not fit to be identified from; names file and reason.
+        ArchiveError: the recording cannot be used for identification.
     """
     recording = recording_of(archive)
     if to_fit and recording.torque is None and recording.motor_current is None:
-        problem = "holds no joint torques to fit, and no motor currents"
+        problem = "contains neither joint torques nor motor currents"
         remedy = "import torques, or motor currents with gear ratios and torque constants"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     useful = useful_part(archive, recording)
@@ -323,41 +320,41 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     merged, timed = recording.n_samples - single.n_samples, single
     averaged = f"{merged} samples had the time stamp of the one before and were averaged with it"
-    words: tuple[str, ...] = ()
-    if archive.kind == "imported":  # a controller counts its own cycles
-        timed, words = true_times(single)
+    clock: tuple[str, ...] = ()
+    if archive.kind == "imported":  # other archives have the cycle counter of the controller
+        timed, clock = true_times(single)
     return Source(
         archive.path,
         archive.path.name,
         timed,
         float(timed.time[0]),
         averaged if merged else "",
-        words,
+        clock,
         retimed=timed is not single,
     )
 
 
 def useful_part(archive: Archive, recording: Recording) -> range | None:
-    """The samples that identification may look at; None for all of an imported recording.
+    """Return the range of usable samples; None for all of an imported recording.
 
-    Where the PC moved the arm, those it commanded. Where the controller's own program did, those
-    with the drive on: with it off the brakes carry the arm, and no current tells of it.
+    These are the samples with a commanded position, or, for motions of the controller's own
+    program, those with the drive on (otherwise the brakes carry the arm).
     """
     if archive.header.controllers_own and "status" in archive.columns:
-        useful, never = archive.columns["status"] == DRIVE_ON, "the drive was never on in it"
+        usable, problem = archive.columns["status"] == DRIVE_ON, "the drive is never on"
     elif recording.commanded_position is not None:
-        useful = ~np.isnan(recording.commanded_position).any(axis=1)
-        never = "the arm was never commanded in it"
+        usable = ~np.isnan(recording.commanded_position).any(axis=1)
+        problem = "it has no commanded position"
     else:
         return None
-    rows = np.flatnonzero(useful)
+    rows = np.flatnonzero(usable)
     if not rows.size:
-        raise ArchiveError(archive.path, never)
+        raise ArchiveError(archive.path, problem)
     return range(int(rows[0]), int(rows[-1]) + 1)
 
 
 def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source]]:
-    """The first part of a recording, and the rest; each knows the motion beyond its ends."""
+    """Split a recording in two parts, each with the complete motion as context."""
     recording, count = whole.recording, whole.recording.n_samples
     cut, rows = round(share * count), np.arange(count)[:, None]
 
@@ -379,14 +376,13 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:
-    """Variance of the measured positions at standstill, at least that of their resolution (n,).
+    """Return the variance of positions at standstill (n,), at least that of their resolution.
 
-    An arm that rests may show the same count for seconds; rounding to a count is noise all the
-    same, uniform over the step.
+    At rest the encoder may show a constant count; rounding is uniform noise over one count.
     """
     measured = standstill_variance(rest.time, rest.position)
     if cell.file.drive_train is None:
-        # The least that two readings of a joint differ by, 0 where none do.
+        # Smallest difference between two positions of a joint, 0 if all are equal.
         steps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in rest.position.T]
         least = np.where(np.isfinite(steps), steps, 0.0)
         return np.asarray(np.maximum(measured, least**2 / 12.0))

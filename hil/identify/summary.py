@@ -1,4 +1,4 @@
-"""An identification as numbers: `results.json`."""
+"""Content of `results.json` from an identification."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from .sources import Source, Sources
 
 Array = NDArray[np.float64]
 
-_LAGS: Final = 150  # points of an autocorrelation that a figure needs
+_LAGS: Final = 150  # points of an autocorrelation figure
 
 
 def summarise(
@@ -60,9 +60,7 @@ def summarise(
     essential: EssentialChoice | str,
     consistency: ConsistencyCheck | str,
 ) -> results.Results:
-    """Everything that was found, as it goes into `results.json`.
-
-    `nominal` is what the nominal model is, in words.
+    """Return the results; `nominal` describes the nominal model.
 
     Raises:
         InputError: the plan in the archives cannot be read.
@@ -71,7 +69,7 @@ def summarise(
     cell, model, pooled = sources.cell, sources.cell.model, estimate.pooled
     excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
-    truth = planted_in(cell, sources.header) if simulated else None
+    truth = true_values(cell, sources.header) if simulated else None
     posterior, endogeneity = estimation.posterior, estimation.endogeneity
     return results.Results(
         name=name,
@@ -126,7 +124,7 @@ def summarise(
 
 
 def _calibration(prepared: Prepared, estimation: Estimation) -> results.CalibrationResult | None:
-    """Intervals of held-out torque; None without held-out motion, or too little fitted."""
+    """Check the intervals of held-out torque; None if nothing or too little was held out."""
     if prepared.sources.in_sample:
         return None
     model, result = prepared.sources.cell.model, estimation.result
@@ -157,7 +155,7 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> results.Calibrat
 
 
 def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.ConsistencyResult:
-    """As it goes into `results.json`."""
+    """Return the result of a consistency check."""
     found = check.consistent
     standard = dict(zip(model.standard_names, found.standard.tolist(), strict=True))
     inertial = found.standard[model.layout.links]
@@ -179,7 +177,7 @@ def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.Co
 
 
 def essential_result(choice: EssentialChoice) -> results.EssentialResult:
-    """As it goes into `results.json`."""
+    """Return the result of a choice of essential parameters."""
     left = choice.elimination.estimate
     return results.EssentialResult.of(
         choice.elimination,
@@ -193,7 +191,7 @@ def essential_result(choice: EssentialChoice) -> results.EssentialResult:
 
 
 def uncertainty_result(estimation: Estimation) -> results.UncertaintyResult:
-    """Standard deviations by every method that was used."""
+    """Return the standard deviations by each method."""
     result = estimation.result
     pooled, many = result.pooled, len(result.repetitions) > 1
     by_posterior = estimation.estimator == "prior"
@@ -210,10 +208,10 @@ def uncertainty_result(estimation: Estimation) -> results.UncertaintyResult:
     )
 
 
-def planted_in(cell: Cell, header: ArchiveHeader) -> Array | None:
-    """What was planted in the simulated arm (p,): as the archive says, or else its cell.
+def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
+    """Return the parameters (p,) of the simulated arm by archive or cell; None if unknown.
 
-    None where neither says it of each parameter. That of a torque ripple, of random phase, is NaN.
+    Those of a torque ripple, which has a random phase, are NaN.
     """
     model, planted = cell.model, header.planted
     if planted is not None:
@@ -234,10 +232,9 @@ def _period(samples: Samples) -> float:
 
 
 def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
-    """Criteria of what was executed (all repetitions), and of the plan where one was attached.
+    """Return the criteria of the executed motion and of its plan, and the information (p, p).
 
-    Of every sample of the motion, resting joints included, as the criteria of a plan see it; and
-    their information (p, p).
+    As in the plan, all samples of the motion count, those of joints at rest included.
     """
     model, lengths = prepared.sources.cell.model, []
     factor = Factor.zero(model)
@@ -258,7 +255,7 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
         ), gram
     trajectory, via_points = planned.trajectory, planned.via_points
     n_via = None
-    if via_points is not None:  # without the posture that a closed path begins and ends at
+    if via_points is not None:  # without start and end of a closed path
         n_via = len(via_points) - 2 * np.array_equal(via_points[0], via_points[-1])
     return results.ExcitationResult(
         method=planned.method,
@@ -272,18 +269,18 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
 
 
 def _planned(sources: Sources) -> Excitation | None:
-    """The excitation that was planned, where the archives say what it was."""
+    """Return the planned excitation, if the archives contain one."""
     plan = sources.plan or {}
     try:
         return Excitation.from_dict(plan["excitation"]) if "excitation" in plan else None
     except (KeyError, TypeError, ValueError) as error:
-        problem = f"its plan.json holds no excitation that can be read ({error!r})"
+        problem = f"the excitation in its plan.json cannot be read ({error!r})"
         remedy = "identify with the version of hil that recorded it"
         raise InputError(sources.training[0].name, problem, remedy=remedy) from error
 
 
 def executed_rows(source: Source, samples: Samples) -> slice:
-    """Time samples of the motion: of its set-points, else those in which some joint moves."""
+    """Return the samples from the first to the last changing set-point, or moving joint."""
     commanded, time = source.recording.commanded_position, source.recording.time
     if commanded is None:
         return moving_rows(samples)
@@ -295,7 +292,7 @@ def executed_rows(source: Source, samples: Samples) -> slice:
 
 
 def moving_rows(samples: Samples) -> slice:
-    """Time samples from the first to the last in which some joint moves."""
+    """Return the samples from the first to the last in which a joint moves."""
     moving = np.flatnonzero(samples.usable.any(axis=1))
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
@@ -306,14 +303,14 @@ def _parameters(
     model, estimate, posterior = cell.model, estimation.result, estimation.posterior
     pooled, many = estimate.pooled, len(estimate.repetitions) > 1
     # Rows 29 and 31 of the paper's Table 2 have the other sign.
-    printed = {row.pivot or row.parameter: row.id for row in TABLE2}
-    ours = cell.urdf != URDF_PATH.read_text(encoding="utf-8")
+    ids = {row.pivot or row.parameter: row.id for row in TABLE2}
+    is_ns16 = cell.urdf == URDF_PATH.read_text(encoding="utf-8")
     known = None if isinstance(posterior, str) else posterior
     return results.ParameterResult.rows(
         name=model.parameter_names,
         expression=[*model.base.expressions(), *model.parameter_names[len(model.base.names) :]],
         unit=model.units,
-        table2_id=None if ours else [printed.get(name) for name in model.parameter_names],
+        table2_id=[ids.get(name) for name in model.parameter_names] if is_ns16 else None,
         estimate=pooled.values,
         std=pooled.std,
         repetition_mean=estimate.mean,
@@ -348,7 +345,7 @@ def _validation(prepared: Prepared, values: Array) -> list[results.ValidationRes
 
 
 def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
-    """In-sample errors: of the torque as recorded, and as it was fitted where that differs."""
+    """Return in-sample errors of the recorded torque, and of a smoothed one that was fitted."""
 
     def error(samples: Sequence[Samples], *, all_rows: bool = True) -> PredictionError:
         model = prepared.sources.cell.model
@@ -381,7 +378,7 @@ def _delays(prepared: Prepared) -> results.DelaysResult | None:
 
 
 def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult:
-    """Of the parameters that the data determine and whose truth is known."""
+    """Return the coverage of the determined parameters with known true values."""
     determined = np.isfinite(std) & np.isfinite(truth)
     distance, std = np.abs(values - truth)[determined], std[determined]
     within_2, within_3 = (int((distance <= limit * std).sum()) for limit in (2.0, 3.0))
@@ -391,7 +388,7 @@ def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult
 def _judgement(
     joint_names: Sequence[str], evidence: Evidence, verdict: Verdict, nominal: str | None
 ) -> results.JudgementResult:
-    """What the verdict rests on."""
+    """Return the verdict with the numbers behind it."""
 
     def profile(one: Profile) -> list[results.ProfileResult]:
         bins = one.bins

@@ -1,4 +1,4 @@
-"""What the cell says beside its model: limits, drive train, delay, the controller's own model."""
+"""Facts about cell and recording that a verdict needs beside the model."""
 
 from __future__ import annotations
 
@@ -29,17 +29,15 @@ from .sources import Source
 Array = NDArray[np.float64]
 
 _POSTURES = 500
-# The same instant on two readings of one clock.
-_SAME_TIME = 1e-6  # s
+_TIME_TOLERANCE = 1e-6  # s
 
 
 def controller_error(
     cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
 ) -> PredictionError | None:
-    """Error of the controller's model on the rows of predicted sources that a verdict counts.
+    """Return the torque error of the controller's model on the usable rows of sources.
 
-    None where the controller sent no such current, or something else than a current in it (zeros),
-    in any of the archives.
+    None if any of the archives lacks the controller's model current, or has zeros in it.
     """
     if cell.file.drive_train is None:
         return None
@@ -56,9 +54,9 @@ def controller_error(
 def controller_inertia(
     cell: Cell, estimate: Estimate, sources: Sequence[Source]
 ) -> InertiaRatio | None:
-    """The controller's diagonal inertia beside the identified one, over the recorded postures.
+    """Return the ratio of the controller's diagonal inertia to the identified one, per posture.
 
-    None where the controller sent none (zeros), or the data leave parameters open.
+    None if the controller sent none (zeros), or parameters are undetermined.
     """
     if cell.file.drive_train is None or estimate.undetermined:
         return None
@@ -71,14 +69,14 @@ def controller_inertia(
             found.append((recording.position[few], inertia))
     if not found:
         return None
-    positions, theirs = map(np.concatenate, zip(*found, strict=True))
-    return inertia_ratio(cell.model, estimate.values, positions, theirs)
+    positions, inertia = map(np.concatenate, zip(*found, strict=True))
+    return inertia_ratio(cell.model, estimate.values, positions, inertia)
 
 
 def _column_at(source: Source, field: str, time: Array) -> Array | None:
-    """A channel (m, n) of the source's archive at these of its times; None where it says nothing.
+    """Return a channel (m, n) of a complete archive at some of its times.
 
-    Nor of a source that is a part of its archive.
+    None for a part of an archive, and for a channel that is absent, zero or not finite.
     """
     if source.name != source.path.name:
         return None
@@ -89,21 +87,21 @@ def _column_at(source: Source, field: str, time: Array) -> Array | None:
     if not np.isfinite(column).all() or not np.any(column):
         return None
     at = (cycle - cycle[0]) * archive.period
-    rows = np.clip(np.searchsorted(at, time - _SAME_TIME), 0, len(at) - 1)
-    if np.abs(at[rows] - time).max() > _SAME_TIME:
+    rows = np.clip(np.searchsorted(at, time - _TIME_TOLERANCE), 0, len(at) - 1)
+    if np.abs(at[rows] - time).max() > _TIME_TOLERANCE:
         return None
     return np.asarray(column[rows])
 
 
-# Of a joint's range: what is smaller is rounding of floating-point numbers.
+# Position changes below this share of a joint's range are floating-point rounding.
 _ROUNDING: Final = 1e-9
-_SMALL: Final = 0.01  # quantile of the moves between samples that is one step of a coarse encoder
-_COARSE: Final = 0.02  # share of the accelerations
-_FAST: Final = 2.0  # bandwidths of the motion: what ends above has no effect on what is fitted
+_STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a coarse encoder
+_MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
+_FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
 
 def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
-    """What a verdict needs to know of the cell, beside the recordings and an estimate from them."""
+    """Collect the facts about the cell and the recordings that a verdict needs."""
     cell, sources = prepared.sources.cell, prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
@@ -132,29 +130,28 @@ def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
     )
 
 
-def _condition(check: str, words: str, advice: str) -> Finding:
-    return Finding(check, "doubtful", words, advice, "condition")
+def _condition(check: str, text: str, advice: str) -> Finding:
+    return Finding(check, "doubtful", text, advice, "condition")
 
 
 def _clock(prepared: Prepared) -> Iterator[Finding]:
-    """Time stamps that are not those of the samples."""
     retimed = [source for source in prepared.sources.training if source.retimed]
     if retimed:
-        more = f"; likewise in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
-        words = f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}"
-        yield _condition("clock", words, "log the controller's own time beside each sample")
+        more = f"; also in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
+        text = f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}"
+        yield _condition("clock", text, "log the controller's time with each sample")
 
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
-    """A delay or a low-pass of the torque that prediction chose, and nobody stated."""
+    """Yield findings about a delay or low-pass of the torque chosen by inner prediction."""
     chosen = [one.name for one in prepared.settings.choices if one.chosen]
     how = prepared.settings.preprocessing
     if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
         yield _condition(
             "delay",
-            f"the fitted part is predicted best with a torque that lags the position by"
-            f" {1e3 * how.torque_delay:.3g} ms; that was compensated",
-            "state it (`hil identify --delay SECONDS`), or correct it where it arises",
+            f"the torque lags the position by {1e3 * how.torque_delay:.3g} ms (chosen by inner"
+            " prediction); this was compensated",
+            "state it (`hil identify --delay SECONDS`), or correct it in the recording program",
         )
     width, advice = how.torque_bandwidth, "record the torque unfiltered"
     if LOW_PASS in chosen and width is not None:
@@ -162,8 +159,8 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
             advice += ", or state its low-pass with --torque-bandwidth"
         yield _condition(
             "torque bandwidth",
-            f"the recorded torque seems to have come through a low-pass of {width:.3g} Hz"
-            f" ({how.torque_shape}) before it was recorded; the model is filtered alike",
+            f"the recorded torque is probably filtered by a low-pass of {width:.3g} Hz"
+            f" ({how.torque_shape}); the model is filtered in the same way",
             advice,
         )
         return
@@ -171,17 +168,17 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
         yield _condition(
             "torque bandwidth",
-            f"the recorded torque has nothing above {above:.2g} Hz, not even noise: it came through"
-            " a low-pass before it was recorded, or was computed",
+            f"the recorded torque has no noise above {above:.2g} Hz: it was filtered by a low-pass"
+            " or computed",
             advice,
         )
 
 
 def _resolution(prepared: Prepared) -> Iterator[Finding]:
-    """Positions in steps so coarse that their accelerations are lost in them.
+    """Yield a finding if the resolution of the positions is too low for their accelerations.
 
-    Rounding to a step q is white noise of variance q²/12; smoothed with a bandwidth B it leaves
-    accelerations of variance q²/12 (2 / rate) (2 pi)^4 B^5 / 5.
+    Rounding to a step q is white noise of variance q²/12; after smoothing with a bandwidth B it
+    contributes q²/12 (2 / rate) (2 pi)^4 B^5 / 5 to the variance of the acceleration.
     """
     names, coarse = prepared.sources.cell.joint_names, dict[str, float]()
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
@@ -192,52 +189,50 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
             moves = moves[moves > _ROUNDING * np.ptp(recording.position[:, j])]
             if not moves.size:
                 continue
-            step = float(np.quantile(moves, _SMALL))
+            step = float(np.quantile(moves, _STEP_QUANTILE))
             width = min(samples.position_bandwidth[j], 0.5 / interval)
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
-            if np.sqrt(noise) > _COARSE * samples.motion.acceleration[:, j].std():
+            if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
                 coarse[name] = max(step, coarse.get(name, 0.0))
     if coarse:
         each = joined([f"{name} {step:.2g}" for name, step in coarse.items()])
         yield _condition(
             "resolution",
-            f"the positions are recorded in coarse steps [rad or m]: {each}; more than"
-            f" {_COARSE:.0%} of the accelerations is rounding",
+            f"the positions have a coarse resolution [rad or m]: {each}; more than"
+            f" {_MAX_ROUNDING:.0%} of the accelerations is rounding error",
             "record positions with more digits, or identify with a lower --bandwidth",
         )
 
 
 class Nominal(NamedTuple):
-    """The model that an arm would have by its papers: parameters (p,), and what they are."""
+    """Nominal model of an arm."""
 
-    values: Array
-    words: str
+    values: Array  #: parameters (p,)
+    label: str  #: description
     rotors_known: bool
-    share: float
-    """Relative uncertainty of its torque."""
+    share: float  #: relative uncertainty of its torque
 
 
 def nominal_of(cell: Cell) -> Nominal | None:
-    """The cell's `[nominal]`, or the URDF's inertias without friction; None of a URDF of none."""
+    """Return the model of `[nominal]`, else of the URDF's inertias; None if there are none."""
     table, model = cell.file.nominal, cell.model
     if table is not None:
         known = bool(np.any(table.rotor_inertia))
-        return Nominal(cell.nominal_values(), "the maker's figures", known, table.uncertainty)
+        return Nominal(cell.nominal_values(), "the nominal values", known, table.uncertainty)
     standard = model.nominal
     if not np.any(standard):
         return None
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ standard
     values[model.element_part] = model.elements.nominal
-    words = "the URDF's inertias, without friction and rotors"
-    return Nominal(values, words, False, NOMINAL_SHARE)
+    label = "the URDF's inertias, without friction and rotors"
+    return Nominal(values, label, False, NOMINAL_SHARE)
 
 
 def torque_limits(cell: Cell) -> Array | None:
-    """Largest torque of each joint (n,) [N·m or N], NaN where unknown; None without any.
+    """Return the maximum torque of each joint (n,) [N·m or N], NaN if unknown; None without any.
 
-    What its own motor can give through its gear at the current limit, or the URDF's effort limit
-    where no drive train is known.
+    That of its motor and gear at the current limit, or the URDF's effort limit without drive train.
     """
     if cell.file.drive_train is not None:
         drives = cell.drive_train

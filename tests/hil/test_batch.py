@@ -363,7 +363,7 @@ class TestBroken:
 
     def test_an_estimator_that_is_none_is_refused(self, tmp_path: Path) -> None:
         """A name that nothing knows would be weighted least squares under that name."""
-        with pytest.raises(InputError, match="'lms' is no estimator; use auto, wls"):
+        with pytest.raises(InputError, match="unknown estimator 'lms'; use auto, wls"):
             Options(estimator="lms")  # type: ignore[arg-type]
         with pytest.raises(InputError, match="'huber' reads samples; use auto, wls, consistent"):
             batch(tmp_path, estimator="huber")

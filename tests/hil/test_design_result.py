@@ -395,7 +395,7 @@ def test_archives_of_another_robot_are_refused(campaign, cell):
 
 
 def test_a_folder_without_archives_is_refused(tmp_path, cell):
-    with pytest.raises(InputError, match="holds no whole archive"):
+    with pytest.raises(InputError, match="contains no complete archive"):
         known_from([tmp_path], cell, Silent())
 
 

@@ -22,10 +22,10 @@ from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
 from hil.identify.estimating import (
-    NARROWEST,
+    MIN_IV_BANDWIDTH,
     Estimation,
     estimate_with,
-    widely_smoothed,
+    smoothed_for_instruments,
 )
 from hil.identify.options import ESTIMATORS, FIXED, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
@@ -254,7 +254,7 @@ class TestSources:
     def test_are_not_fitted_and_predicted(self, campaign: Campaign, tmp_path: Path) -> None:
         first = campaign.folder.completed("excitation")[0]
         copy = Path(shutil.copy(first, tmp_path / "another_name.mcap"))
-        with pytest.raises(InputError, match="holds the same as"):
+        with pytest.raises(InputError, match="is a copy of"):
             identify_archives([first, copy], Silent())
         with pytest.raises(InputError, match="in-sample"):
             gather_sources([first], 0.7, [first], in_sample=True)
@@ -262,7 +262,7 @@ class TestSources:
     def test_of_different_robots_are_not_mixed(self, campaign: Campaign, tmp_path: Path) -> None:
         other = imported(tmp_path / "other.mcap")
         first = campaign.folder.completed("excitation")[0]
-        with pytest.raises(ArchiveError, match=r"other\.mcap.*carries another"):
+        with pytest.raises(ArchiveError, match=r"other\.mcap.*has another"):
             identify_archives([first, other], Silent())
 
     def test_without_repetitions_leave_something_open(self, campaign: Campaign) -> None:
@@ -471,9 +471,9 @@ class TestEstimators:
             return replace(prepared, fitted=tuple(fitted))
 
         model, wide = prepared.sources.cell.model, smoothed(40.0)
-        for samples in widely_smoothed(model, smoothed(8.0)):
-            np.testing.assert_allclose(samples.position_bandwidth, NARROWEST, rtol=0.05)
-        assert widely_smoothed(model, wide) == wide.fitted
+        for samples in smoothed_for_instruments(model, smoothed(8.0)):
+            np.testing.assert_allclose(samples.position_bandwidth, MIN_IV_BANDWIDTH, rtol=0.05)
+        assert smoothed_for_instruments(model, wide) == wide.fitted
 
     def test_without_a_consistent_solution_are_least_squares(
         self,

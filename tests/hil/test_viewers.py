@@ -99,7 +99,7 @@ class TestCopies:
         torque = {time: np.array(state.effort) for time, state in seen["/joint_states"]}
         times, predicted = zip(*seen[PREDICTED], strict=True)
         error = np.array([torque[t] - one.effort for t, one in zip(times, predicted, strict=True)])
-        usable, samples = found.unseen[0].usable, found.unseen[0]
+        usable, samples = found.prepared.held_out[0].usable, found.prepared.held_out[0]
         expected = samples.torque - samples.predicted_torque(
             found.cell.model, found.estimate.pooled.values
         )
