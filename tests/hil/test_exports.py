@@ -432,4 +432,4 @@ class TestCommand:
     def test_a_folder_without_archives_is_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(app, ["export", str(tmp_path), "--to", "mjcf"])
         assert str(tmp_path) in str(result.exception)
-        assert "name the folder of a campaign" in str(result.exception)
+        assert "give a campaign folder" in str(result.exception)

@@ -248,7 +248,7 @@ class TestSources:
     def test_without_an_excitation_are_refused(self, campaign: Campaign, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="no excitation"):
             identify_archives(campaign.folder.completed("validation"), Silent())
-        with pytest.raises(InputError, match="names no completed excitation"):
+        with pytest.raises(InputError, match="has no completed excitation"):
             identify_campaign(tmp_path, Silent())
 
     def test_are_not_fitted_and_predicted(self, campaign: Campaign, tmp_path: Path) -> None:
@@ -282,7 +282,7 @@ class TestSources:
             ({"nan": (700, 2)}, r"position of joint joint_3 is nan at sample 700"),
             ({"stuck": 4}, r"joint joint_5 is stuck"),
             ({"fall": 300}, r"clock falls back at sample 300"),
-            ({"torque": False}, "no joint torques"),
+            ({"torque": False}, "neither joint torques"),
             (
                 {"names": tuple(f"joint_{j}" for j in (2, 1, 3, 4, 5, 6))},
                 "the recorded joints are joint_2, joint_1",
@@ -298,7 +298,7 @@ class TestSources:
     def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path: Path) -> None:
         found = identify_archives([imported(tmp_path / "one.mcap", repeat=300)], Silent())
         assert any("1 samples had the time stamp" in note for note in found.results.notes)
-        assert any("temporal split" in one for one in found.results.verdict.warnings)
+        assert any("were fitted and the rest was predicted" in one for one in found.results.verdict.warnings)
         assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
         assert "unseen" not in found.verdict.line.split(":")[0]
 

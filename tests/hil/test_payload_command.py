@@ -178,7 +178,7 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
-            (("empty.mcap",), "name both: hil payload BARE"),
+            (("empty.mcap",), "give both: hil payload BARE"),
             (
                 ("empty.mcap", "--loaded", "full.mcap", "--check", "mass"),
                 "'mass' is no NAME=NUMBER",
@@ -422,7 +422,7 @@ def test_a_folder_stands_for_its_archives(currents: Path, tmp_path: Path) -> Non
 
 
 def test_without_any_payload_nothing_is_determined(currents: Path) -> None:
-    with pytest.raises(InputError, match=r"no recording has a known payload.*--loaded ARCHIVE"):
+    with pytest.raises(InputError, match=r"without a known payload.*--loaded ARCHIVE"):
         gains(currents, "empty.mcap")
 
 
