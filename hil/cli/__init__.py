@@ -1,10 +1,9 @@
-"""The command line: a thin shell over the package.
+"""Command line of the package.
 
-Exit status: 0 done, 1 internal error or a disk that is full or refuses to be written, 2 bad input,
-3 refused as unsafe, 4 controller fault, 5 done, but not good (a model, a PC that is not fit for
-the cycle, archives of a batch that could not be used), 130 stopped by the operator. With `--json`
-stdout is one JSON object, also where the command fails: the sentence for a person goes to stderr
-all the same, and the exit status is the same.
+Exit status: 0 done, 1 internal error or a disk that cannot be written, 2 bad input, 3 refused as
+unsafe, 4 controller fault, 5 done with a negative result (a model that is not good, a PC that is
+not fit, archives that could not be used), 130 stopped by the operator. With `--json` stdout is one
+JSON object, also on failure; the error text is printed to stderr in any case.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ from hil.terminal_text import printable
 from hil.version import software
 
 INTERNAL = 1
-"""Exit status of an internal error, and where a disk is full or refuses to be written."""
+"""Exit status of an internal error, or of a disk that cannot be written."""
 USAGE = 2
-"""Exit status where something that was typed or given cannot be used."""
+"""Exit status of bad input."""
 
 
 def asks_for_json(arguments: Sequence[str]) -> bool:
-    """Whether a command was typed with `--json`; what follows `--` is no option."""
+    """Return whether `--json` is among the options, which end at `--`."""
     options = arguments[: arguments.index("--")] if "--" in arguments else arguments
     return "--json" in options
 
 
 def exit_code_of(error: BaseException) -> int:
-    """The exit status that an error ends the command line with."""
+    """Return the exit status of an error."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in DISK_REFUSES:
@@ -51,12 +50,12 @@ def exit_code_of(error: BaseException) -> int:
         cause = cause.__cause__
     if _comes_from_below(error):
         return USAGE
-    code = getattr(error, "exit_code", 1)  # HilError, and what typer says of a wrong command line
+    code = getattr(error, "exit_code", 1)  # of HilError and of click
     return code if isinstance(code, int) else 1
 
 
 def _comes_from_below(error: BaseException) -> bool:
-    """Whether a package that knows no exit status refused; it is loaded where that was raised."""
+    """Return whether the error is one of the packages below, without importing them."""
     below = {
         "identification": "IdentificationError",
         "planner": "PlannerError",
@@ -69,10 +68,7 @@ def _comes_from_below(error: BaseException) -> bool:
 
 
 def as_json(error: BaseException) -> dict[str, Any]:
-    """What a script receives of an error, and the figures of what was done before.
-
-    `error` is the sentence, `kind` the name of its class.
-    """
+    """Return the JSON form of an error, with the figures of the work done before it."""
     sentence = error.format_message() if hasattr(error, "format_message") else str(error)
     figures = error.figures if isinstance(error, HilError) else {}
     document: dict[str, Any] = {
@@ -93,13 +89,13 @@ def as_json(error: BaseException) -> dict[str, Any]:
 
 @contextmanager
 def errors_as_json(asked: bool) -> Iterator[None]:
-    """Print what ends the block as JSON, if that was asked for; it goes on as it is.
+    """Print an exception of the block as JSON if requested, and raise it again.
 
     Ctrl-C becomes an `OperatorStopError`.
     """
     try:
         yield
-    except typer.Exit:  # a command that has said what there is to say
+    except typer.Exit:  # the command has printed its result
         raise
     except KeyboardInterrupt as interrupt:
         stopped = OperatorStopError("interrupted")
@@ -112,33 +108,33 @@ def errors_as_json(asked: bool) -> Iterator[None]:
 
 def _print(error: Exception, asked: bool) -> None:
     if asked:
-        with suppress(OSError):  # nobody reads any more; the status still counts
+        with suppress(OSError):  # the reader has closed the pipe; the exit status remains
             typer.echo(json.dumps(as_json(error)))
 
 
 class LazyCommands(UserDict[str, Any]):
-    """Commands by name, each from the module of this package that is called like it.
+    """Commands by name, imported on first use from the module of the same name.
 
-    A module has either a function of the command's name, or an `app` of several commands; its
-    first line says what it is for.
+    A module has a function of that name, or an `app` of several commands; its docstring begins
+    with the purpose shown in the help.
     """
 
     def __getitem__(self, name: str) -> Any:
-        """The command, imported if it was not yet."""
+        """Return the command, importing it on first use."""
         known = super().__getitem__(name)
         if known is None:
             known = self[name] = _command(name)
         return known
 
     def purpose(self, name: str) -> str:
-        """What a command is for; nothing is imported."""
+        """Read the purpose of a command from its docstring, without importing it."""
         source = Path(__file__).with_name(f"{_module(name)}.py").read_text("utf-8")
-        words = source.splitlines()[0].partition(": ")[2].removesuffix('"""')
-        return words[0].upper() + words[1:]
+        text = source.splitlines()[0].partition(": ")[2].removesuffix('"""')
+        return text[0].upper() + text[1:]
 
 
 def _module(name: str) -> str:
-    return "imports" if name == "import" else name  # a word of Python
+    return "imports" if name == "import" else name  # a Python keyword
 
 
 def _command(name: str) -> Any:
@@ -155,10 +151,9 @@ def _command(name: str) -> Any:
 
 
 def presented(command: Any) -> Any:
-    """The command as its help shows it.
+    """Return the command with the help of its options from `Options:` in its docstring.
 
-    The paragraphs below `Options:` in its docstring explain its parameters. Nothing stands behind
-    a flag, as nothing is typed there; one that is off has no opposite.
+    Flags have no value in the help, and no negative form if they are off by default.
     """
     if isinstance(commands := getattr(command, "commands", {}), LazyCommands):
         commands = {}
@@ -186,7 +181,7 @@ COMMANDS = LazyCommands(
         )
     )
 )  # fmt: skip
-"""In the order of the help."""
+"""Commands in the order of the help."""
 
 _JSON = "hil.cli.json"
 
@@ -199,13 +194,13 @@ class Group(TyperGroup):
         presented(self)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Show the commands by their purposes: none of them is imported for that."""
+        """Show the commands by their purposes, without importing them."""
         self.commands = {name: TyperCommand(name, help=COMMANDS.purpose(name)) for name in COMMANDS}
         super().format_help(ctx, formatter)
         self.commands = COMMANDS
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
-        """The context of one call, which knows whether JSON is asked for."""
+        """Return the context of one call; it records whether JSON is requested."""
         asked = asks_for_json(args)
         with errors_as_json(asked):
             context = super().make_context(info_name, args, *more, **extra)
@@ -213,12 +208,12 @@ class Group(TyperGroup):
         return context
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; where it fails, say so in the form that was asked for."""
+        """Run the command; print a failure as JSON if requested."""
         with errors_as_json(ctx.meta.get(_JSON, False)):
             return super().invoke(ctx)
 
 
-def _tell_versions(asked: bool) -> None:
+def _print_versions(asked: bool) -> None:
     if asked:
         hil, *others = (f"{name} {number}" for name, number in software().items())
         typer.echo(f"{hil} ({', '.join(others)})")
@@ -227,23 +222,23 @@ def _tell_versions(asked: bool) -> None:
 
 _VERSION = typer.Option(
     "--version",
-    callback=_tell_versions,
+    callback=_print_versions,
     is_eager=True,
-    help="Tell the versions of hil and of what its numbers depend on.",
+    help="Show the versions of hil and its numerical libraries.",
 )
 
 
-def _before_any_command(version: Annotated[bool, _VERSION] = False) -> None:
-    """Nothing: the option alone ends the program."""
+def _global_options(version: Annotated[bool, _VERSION] = False) -> None:
+    """Declare the global option; its callback does the work."""
 
 
 app = typer.Typer(
     name="hil",
     cls=Group,
-    callback=_before_any_command,
+    callback=_global_options,
     help=(
         "Identify the dynamics of an industrial robot with its own controller in the loop.\n\n"
-        "Start with `hil demo`: the whole way on a simulated COMAU NS 16, with a report."
+        "Start with `hil demo`: a complete campaign on a simulated COMAU NS 16, with a report."
     ),
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -253,7 +248,7 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; known errors become one sentence and an exit status."""
+    """Run the command line; known errors become one line on stderr and an exit status."""
     try:
         app(standalone_mode=True)
     except OSError as error:
@@ -270,13 +265,13 @@ def main() -> None:
 
 
 def _fail(text: str, status: int, *, stopped: bool = False) -> None:
-    """End with one sentence; what a person stopped is no error."""
+    """Print one line and exit; a stop by the operator is not labelled an error."""
     word = ("stopped:", "bold yellow") if stopped else ("error:", "bold red")
     console = Console(stderr=True)
     try:
         line = Text.assemble(word, " ", printable(text))
         console.print(line, highlight=False, soft_wrap=not console.is_terminal)
-    except OSError:  # the terminal is gone; the status still counts
+    except OSError:  # the terminal is closed; the exit status remains
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (1, 2):
             os.dup2(nowhere, stream)

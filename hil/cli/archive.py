@@ -1,4 +1,4 @@
-"""`hil archive`: what an archive holds, whether it keeps the profile, and its repair."""
+"""`hil archive`: inspect, check and repair archives."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hil.cli.arguments import JsonOption, print_json
 from hil.errors import ArchiveError, InputError
 from hil.terminal_text import printable
 
-app = typer.Typer(help="Look into archives, check and repair them.", no_args_is_help=True)
+app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 
-PROFILE_BROKEN = 5
+NOT_CONFORMING = 5
 NO_ARCHIVE = 2
 FAILED = 1
 LOST = 3
@@ -29,14 +29,14 @@ Files = Annotated[list[Path], typer.Argument(help="The archives.", show_default=
 
 @app.command("info")
 def info(files: Files, as_json: JsonOption = False) -> None:
-    """Say what archives hold: motion, joints, channels, sizes, attachments."""
+    """Print the content of archives: motion, joints, channels, sizes, attachments."""
     failed = 0
     for path in files:
         try:
             found = overview(path)
         except ArchiveError as error:
             failed = exit_code_of(error)
-            _say_error(path, error, as_json=as_json)
+            _print_error(path, error, as_json=as_json)
             continue
         typer.echo(json.dumps(found.to_dict()) if as_json else _shown(_info_lines(found)))
     raise typer.Exit(failed)
@@ -44,9 +44,9 @@ def info(files: Files, as_json: JsonOption = False) -> None:
 
 @app.command("check")
 def check(files: Files, as_json: JsonOption = False) -> None:
-    """Say whether files keep the archive profile (docs/archive-format.md), aspect by aspect.
+    """Check files against the archive profile (docs/archive-format.md), aspect by aspect.
 
-    Exit status: 0 all keep it, 5 one does not, 2 one is no archive.
+    Exit status: 0 all conform, 5 at least one does not, 2 at least one is not an archive.
     """
     status = 0
     for path in files:
@@ -54,10 +54,10 @@ def check(files: Files, as_json: JsonOption = False) -> None:
             found = check_archive(path)
         except ArchiveError as error:
             status = NO_ARCHIVE
-            _say_error(path, error, as_json=as_json)
+            _print_error(path, error, as_json=as_json)
             continue
         if not found.conforms and not status:
-            status = PROFILE_BROKEN
+            status = NOT_CONFORMING
         typer.echo(json.dumps(_check_dict(found)) if as_json else _shown(_check_lines(found)))
     raise typer.Exit(status)
 
@@ -69,22 +69,22 @@ def repair(
     in_place: bool = False,
     as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
-    """Rewrite a torn or damaged archive so that every reader accepts it.
+    """Rewrite a truncated or damaged archive so that every reader accepts it.
 
-    Exit status: 0 nothing is lost, 3 something is, 1 nothing could be saved.
+    Exit status: 0 nothing lost, 3 some data lost, 1 nothing could be recovered.
 
     Options:
         file: The archive.
-        output: The file to write; FILE_repaired.mcap by default.
-        in_place: Replace the archive, once the repair has succeeded.
-        as_json: Print what was saved and lost as JSON.
+        output: File to write. Default: FILE_repaired.mcap.
+        in_place: Replace the archive if the repair succeeds.
+        as_json: Print one JSON object with recovered and lost data.
     """
     if in_place and output is not None:
         raise InputError(None, "contradicts --output", field="--in-place", remedy="give one")
     try:
         done = repair_archive(file, output, in_place=in_place)
     except ArchiveError as error:
-        _say_error(file, error, as_json=as_json)
+        _print_error(file, error, as_json=as_json)
         raise typer.Exit(FAILED) from error
     if as_json:
         print_json(
@@ -101,15 +101,15 @@ def repair(
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
     if done.output is None:
-        typer.echo(_shown([f"{file}: whole, nothing to repair"]))
+        typer.echo(_shown([f"{file}: complete, nothing to repair"]))
     else:
-        lost = {0: ", none lost", None: "; how many are lost is not known"}
+        lost = {0: ", none lost", None: ", unknown number lost"}
         end = lost.get(done.samples_lost, f", {done.samples_lost} lost")
         typer.echo(_shown([f"wrote {done.output}: {done.samples} samples{end}"]))
     raise typer.Exit(LOST if done.losses else 0)
 
 
-def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
+def _print_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
     if as_json:
         print_json({"file": str(path), "archive": False, "error": str(error)})
     else:
@@ -117,12 +117,12 @@ def _say_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:
 
 
 def _shown(lines: Sequence[str]) -> str:
-    """Lines for a terminal, which untrusted texts must not steer."""
+    """Join lines without control characters of untrusted texts."""
     return "\n".join(printable(line, keep="") for line in lines)
 
 
 def _check_lines(found: Check) -> list[str]:
-    verdict = "keeps" if found.conforms else "does not keep"
+    verdict = "conforms to" if found.conforms else "does not conform to"
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
     if found.repaired:
         lines[0] += ", repaired with loss"
@@ -131,7 +131,7 @@ def _check_lines(found: Check) -> list[str]:
         lines.append(f"  {aspect:<13} {'no' if faults else 'ok':<3} {meaning}")
         lines += [f"  {'':<13}     {fault}" for fault in faults]
     if not found.conforms:
-        lines.append(f"  to mend what can be: hil archive repair {found.path}")
+        lines.append(f"  to repair it: hil archive repair {found.path}")
     return lines
 
 
@@ -172,7 +172,7 @@ def _info_lines(found: Overview) -> list[str]:
             lines += [f"  {title}", *(f"    {line}" for line in content)]
     if found.damage:
         name = repaired_name(found.path).name
-        lines.append(f"  to mend it: hil archive repair {found.path}, which writes {name}")
+        lines.append(f"  to repair it: hil archive repair {found.path}, which writes {name}")
     return lines
 
 

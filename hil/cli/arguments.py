@@ -1,4 +1,4 @@
-"""Arguments that many commands have, and what they refuse alike."""
+"""Arguments shared by several commands, and their checks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 
 from hil.errors import InputError
 
-CampaignArgument = Annotated[Path, typer.Argument(help="The campaign's folder (`hil design -o`).")]
+CampaignArgument = Annotated[Path, typer.Argument(help="Campaign folder (`hil design -o`).")]
 ArchivesArgument = Annotated[
     list[Path],
     typer.Argument(
@@ -21,30 +21,29 @@ ArchivesArgument = Annotated[
         metavar="ARCHIVE...",
     ),
 ]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Only the result.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 AcceptInitOption = Annotated[
     bool,
     typer.Option(
         "--accept-init",
-        help="Use the controller's gear ratios, calibration and coupling where they differ from "
-        "the cell's; the archive says so.",
+        help="Use the controller's gear ratios, calibration and coupling if they differ from the "
+        "cell; the archive records this.",
     ),
 ]
 DhOption = Annotated[
     Path | None,
     typer.Option(
         metavar="TABLE",
-        help="In place of --urdf, a CSV table of DH parameters, where nothing else is known of the "
-        "robot: joint, type, a, alpha, d, theta_offset (m, rad; or a_mm, alpha_deg, …), a row per "
-        "joint. Needs --convention.",
+        help="CSV table of DH parameters in place of --urdf: joint, type, a, alpha, d, "
+        "theta_offset (m, rad; or a_mm, alpha_deg, …), one row per joint. Needs --convention.",
     ),
 ]
 ConventionOption = Annotated[
     str | None,
     typer.Option(
-        help="Of --dh: standard (a row is Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or modified "
-        "(Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+        help="Convention of --dh: standard (Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
+        "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
     ),
 ]
 
@@ -55,7 +54,7 @@ Command = Callable[..., None]
 def with_options(
     group: Callable[..., Any], to: str, *, but: Sequence[str] = ()
 ) -> Callable[[Command], Command]:
-    """Give a command the fields of a dataclass as options, `but` some; it receives them as `to`."""
+    """Add the fields of a dataclass, without `but`, as options; they are passed as `to`."""
     options = {**inspect.signature(group, eval_str=True).parameters}
     for name in but:
         del options[name]
@@ -79,10 +78,10 @@ def with_options(
 
 
 def at_most_one(**given: object) -> None:
-    """Refuse options that exclude each other, by their names in Python.
+    """Refuse options that exclude each other, by their Python names.
 
     Raises:
-        InputError: more than one of them was typed.
+        InputError: more than one was given.
     """
     typed = [_option(name) for name, value in given.items() if value not in (None, False, [])]
     if len(typed) > 1:
@@ -91,15 +90,15 @@ def at_most_one(**given: object) -> None:
 
 
 def exactly_one(**given: object) -> None:
-    """Refuse options of which not exactly one was typed, by their names in Python.
+    """Require one of several options, by their Python names.
 
     Raises:
-        InputError: none of them was typed, or more than one.
+        InputError: none was given, or more than one.
     """
     at_most_one(**given)
     if all(value in (None, False, []) for value in given.values()):
         names = " or ".join(map(_option, given))
-        raise InputError(None, "one of them is needed", field=names, remedy=f"give {names}")
+        raise InputError(None, "one of them is required", field=names, remedy=f"give {names}")
 
 
 def _option(name: str) -> str:
@@ -107,17 +106,17 @@ def _option(name: str) -> str:
 
 
 def print_json(document: object) -> None:
-    """Print what a script reads: one JSON object."""
+    """Print one JSON object."""
     typer.echo(json.dumps(document))
 
 
 def figures(
     texts: Sequence[str], option: str, example: str, *, bare: bool = True
 ) -> dict[str, float]:
-    """Numbers by name, from texts NAME=NUMBER behind an option; NAME alone is 0 where `bare`.
+    """Parse NAME=NUMBER values of an option; with `bare`, NAME alone is 0.
 
     Raises:
-        InputError: what stands behind the = is no number.
+        InputError: a value is not a number.
     """
     found = {}
     for text in texts:
@@ -126,6 +125,6 @@ def figures(
             found[name] = float(number) if equals or not bare else 0.0
         except ValueError as error:
             raise InputError(
-                None, f"{text!r} is no NAME=NUMBER", field=option, remedy=f"write {example}"
+                None, f"{text!r} is not NAME=NUMBER", field=option, remedy=f"write {example}"
             ) from error
     return found

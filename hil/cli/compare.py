@@ -1,4 +1,4 @@
-"""`hil compare`: what changed on an arm from one campaign to another."""
+"""`hil compare`: compare campaigns of one arm."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def compare(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Compare campaigns of one arm: did the friction change, on which axis, what does it carry?
+    """Compare campaigns of one arm: friction of each axis, payload, torque constants.
 
-    The earliest campaign is what the others are compared with; the first one named, where not all
-    have a time of recording. Archives are read as `hil reidentify` reads them. Exit status 0,
-    whatever came out, unless --fail-on-change is given.
+    The reference is the earliest campaign, or the first one named if not all have a recording time.
+    Archives are read as by `hil reidentify`. Exit status 0 for any result, unless --fail-on-change
+    is given.
 
     Options:
-        campaigns: Campaign folders of one arm, two or more, or folders with campaigns below.
-        output: HTML file for the report; none if left out.
-        fail_on_change: Exit status 5 if something has changed.
+        campaigns: Two or more campaign folders of one arm, or folders that contain campaigns.
+        output: HTML file for the report. Default: no report.
+        fail_on_change: Return exit status 5 if something has changed.
     """
     reporter = make_reporter(quiet=quiet or json)
     with LocalWorkers() as workers:

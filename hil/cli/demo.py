@@ -1,4 +1,4 @@
-"""`hil demo`: the whole way on the simulated NS 16."""
+"""`hil demo`: run a complete campaign on the simulated NS 16."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
 PATIENCE = 0.5
-"""s that the simulated controller waits for an answer on a real link, as no real one does: this
-computer need not be fit for a robot."""
+"""Longest extension of a cycle to wait for a reply over a real link, s: this PC need not be fit
+for a robot."""
 
 
 def demo(
@@ -53,37 +53,37 @@ def demo(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Design, run, archive, identify and report, all on the simulated COMAU NS 16.
+    """Design, run, archive, identify and report a campaign on the simulated COMAU NS 16.
 
-    Leaves `archives/*.mcap`, `results.json` and `report.html` in OUTPUT and ends with one line
-    that says whether the identified model predicts motions it has never seen, and how well.
-    Nothing here is hardware: controller, drives and arm are simulated, packet for packet.
-    With --link udp or can the same campaign takes as long as it would on a robot, so ask for
-    fewer repetitions. The CAN bus is one within this computer, with a cycle of 2 ms.
+    Writes `archives/*.mcap`, `results.json` and `report.html` to OUTPUT. The last line printed is
+    the verdict: how well the identified model predicts motions that were not fitted. No hardware is
+    used; controller, drives and arm are simulated down to the packet. With --link udp or can the
+    campaign runs in real time, so reduce --repetitions. The CAN bus is internal to this computer,
+    with a cycle of 2 ms.
 
     Options:
-        output: Campaign folder to make.
-        repetitions: Repetitions; 30 as in the paper if left out.
-        validation: Validation runs, never used for fitting.
-        seed: Seed of the simulated cell: one seed, one run.
-        effects: Switch on what the model leaves out: torque ripple, friction drift, elasticity,
-            delay.
-        excitation: Run this excitation, a result of `hil design` for the NS 16 cell, instead of one
-            found in a few seconds.
-        link: simulated: in virtual time. udp, can: the controller is a process of its own, reached
-            over real sockets in real time.
+        output: Campaign folder to create.
+        repetitions: Number of repetitions of the excitation. Default: 30, as in the paper.
+        validation: Number of validation runs, which are never fitted.
+        seed: Seed of the simulated cell; runs with the same seed are identical.
+        effects: Simulate effects that the model does not contain: torque ripple, friction drift,
+            elasticity, delay.
+        excitation: Run this excitation (a result of `hil design` for the NS 16 cell) instead of
+            searching one for a few seconds.
+        link: simulated: virtual time. udp, can: the controller runs in its own process and is
+            reached over sockets in real time.
         force: Replace an earlier campaign in OUTPUT.
-        resume: Go on with a campaign in OUTPUT that was stopped.
+        resume: Continue an interrupted campaign in OUTPUT.
     """
     reporter = make_reporter(quiet=quiet or json)
     if resume:
         if excitation is not None:
-            problem = "cannot be run in a campaign that has an excitation already"
-            remedy = "leave out --excitation, or name another folder"
+            problem = "contradicts --resume, which continues with the excitation of the campaign"
+            remedy = "omit --excitation, or name another folder"
             raise InputError(excitation, problem, remedy=remedy)
         campaign = Campaign.open(output)
     else:
-        _refuse_what_is_not_ours(output, force=force)
+        _require_replaceable(output, force=force)
         cell = Cell.load(CELL_PATH).with_campaign(
             repetitions=repetitions, validation_runs=validation, simulation_seed=seed
         )
@@ -100,7 +100,7 @@ def demo(
             if excitation is None
             else plan_around(cell, _designed(excitation, cell, reporter))
         )
-        require_runnable(cell, plan)  # before what is there is removed
+        require_runnable(cell, plan)  # before an earlier campaign is removed
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
@@ -108,13 +108,13 @@ def demo(
 
 
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
-    """Run what is missing on a simulated controller; Ctrl-C stops the arm, then the program."""
+    """Run the missing motions on a simulated controller; Ctrl-C stops the arm, then the program."""
     cell, started = campaign.cell, time.perf_counter()
     real_time = cell.controller.transport != "simulated"
     if real_time:
         reporter.say(
-            f"a simulated controller in a process of its own, over {cell.controller.transport}, "
-            f"in real time; it waits up to {PATIENCE:g} s for an answer, as no real one does"
+            f"simulated controller in a separate process, over {cell.controller.transport}, in "
+            f"real time; unlike a real one it waits up to {PATIENCE:g} s for a reply"
         )
     with stop_on_interrupt() as stop, _link(cell, effects=effects) as link:
         try:
@@ -124,16 +124,16 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
                 reporter,
                 provenance=simulated_provenance(cell, effects),
                 durable=real_time,
-                unrehearsed=True,  # nothing but a simulated arm can be moved here
+                unrehearsed=True,  # the arm is simulated
             )
         except ControllerFault as fault:
             if stop.requested:
-                raise OperatorStopError(f"{fault} Go on with --resume.") from fault
+                raise OperatorStopError(f"{fault} Resume with --resume.") from fault
             raise
         finally:
             if isinstance(link, LiveLink):
                 reporter.say(
-                    f"{link.late} answers were late, {link.not_accepted} were not accepted by the "
+                    f"{link.late} replies were late, {link.not_accepted} were not accepted by the "
                     "simulated controller"
                 )
     took = time.perf_counter() - started
@@ -155,15 +155,15 @@ def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
 
 
 def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
-    """The motion of a design; says what it was searched without."""
+    """Load the motion of a design; print what its search did not check."""
     result = DesignResult.load(path)
     result.require_cell(cell, path)
-    lacking = [f"{what} not looked at" for what in result.settings.unchecked]
-    lacking += [] if result.complete else ["stopped before its end"]
+    lacking = [f"{what} not checked" for what in result.settings.unchecked]
+    lacking += [] if result.complete else ["interrupted"]
     if lacking:
         reporter.say(
-            f"note: search for {path}: {', '.join(lacking)}; the motion itself is checked against "
-            "the whole cell before it runs"
+            f"note: search for {path}: {', '.join(lacking)}; the motion is checked against all "
+            "limits of the cell before it runs"
         )
     return result.excitation
 
@@ -173,19 +173,19 @@ _OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json"}
 _OURS |= {"campaign.lock", RESULTS, REPORT, SERIES, *FILES}
 
 
-def _refuse_what_is_not_ours(output: Path, *, force: bool) -> None:
-    """Only an earlier campaign may be replaced, and only if asked to."""
+def _require_replaceable(output: Path, *, force: bool) -> None:
+    """Refuse an output that --force must not replace: only an earlier campaign may be."""
     if not output.exists() and not output.is_symlink():
         return
     if output.is_symlink() or not output.is_dir():
-        raise CampaignFolderError(output, "is no folder of its own", "name a folder")
+        raise CampaignFolderError(output, "is not a folder", "name a folder")
     found = {path.name for path in output.iterdir()}
     if found and not force:
-        remedy = "name another folder, go on with --resume, or add --force"
+        remedy = "name another folder, or add --resume or --force"
         raise CampaignFolderError(output, "is not empty", remedy)
     foreign = sorted(found - _OURS)
     if foreign or (found and "manifest.json" not in found):
-        what = f"holds {foreign[0]}" if foreign else "is no campaign"
+        what = f"contains {foreign[0]}" if foreign else "is not a campaign"
         problem = f"{what}, so --force will not remove it"
         raise CampaignFolderError(output, problem, "name another folder")
 

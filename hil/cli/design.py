@@ -1,4 +1,4 @@
-"""`hil design`: search the motion that tells most about the parameters."""
+"""`hil design`: search for the excitation of a cell."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from identification.excitation import coupling_index_max
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
-    """What was found, for a script; what is no finite number is None."""
+    """Return the content of `--json`; None for values that are not finite."""
     excitation, design = done.result.excitation, done.design
     figures = {k: v for k, v in asdict(excitation.criteria).items() if k != "n_samples"}
     return {
@@ -54,7 +54,7 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
 
 
 def _lines(done: Designed) -> Iterator[str]:
-    """What the criteria are and what limited them."""
+    """Yield the criteria and what limits them."""
     excitation, design = done.result.excitation, done.design
     sines, criteria = done.result.settings.sines, excitation.criteria
     broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
@@ -70,14 +70,14 @@ def _lines(done: Designed) -> Iterator[str]:
         if scaled > WEAK:
             names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
             yield (
-                f"this motion hardly separates {names}: take more "
+                f"this motion hardly separates {names}: use more "
                 f"{'via points' if sines is None else 'harmonics'}, allow a longer motion, search "
-                "longer, or judge by other parameters ([objective] parameters)"
+                "longer, or choose other parameters ([objective] parameters)"
             )
     if design.chosen is None:
         yield f"polished from {criteria_text(design.origin_criteria.measures)}"
     if sines is not None and sines.ramp == 0.0:
-        yield "this motion begins and ends at full speed: no controller can run it; give it a ramp"
+        yield "this motion starts and ends at full speed, which no controller can run; set a ramp"
 
 
 def _draw(
@@ -88,7 +88,7 @@ def _draw(
     *,
     together: bool,
 ) -> None:
-    """Draw the picture; without it the design is as good."""
+    """Draw the picture; a failure is only reported."""
     from hil.plots.design_picture import draw_design  # loads the arm's shapes
 
     design, excitation = done.design, done.result.excitation
@@ -109,11 +109,11 @@ def _draw(
     try:
         save(figure, folder.picture)
     except InputError as error:
-        say(f"warning: {error}; repeat with --resume to draw it again", err=True)
+        say(f"warning: {error}; repeat with --resume to draw it", err=True)
 
 
 def _folder(given: str) -> Path:
-    """The folder named; a name that is empty would be the working directory."""
+    """Refuse an empty name, which would be the working directory."""
     if not given:
         raise InputError(None, "is empty", field="--output", remedy="name a folder")
     return Path(given)
@@ -140,59 +140,60 @@ def design(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Search the motion that excites and decouples the parameters of CELL. Nothing moves.
+    """Search for a motion that excites and decouples the parameters of CELL. Nothing moves.
 
-    The motion keeps the joint limits at every instant, the motors' currents (and joint torques,
-    where the cell limits them) by the nominal model, and the clearance to floor, walls and the arm
-    itself; it begins and ends in the cell's home. What comes of it is judged by two numbers: log
-    det, which grows with the information on all parameters together, and the coupling index I_c,
-    which is the smaller the less the estimates of different parameters get into each other's way.
+    The motion satisfies the joint limits at every instant, the limits of motor current (and joint
+    torque, if the cell states any) by the nominal model, and the clearance to floor, walls and the
+    arm itself. It begins and ends at the home posture of the cell. Two criteria rate it: log det,
+    the information on all parameters together (higher is better), and the coupling index I_c, the
+    correlation between the estimates of different parameters (lower is better).
 
-    Leaves `excitation.toml` (motion, criteria, settings), `excitation.png` (what the robot is
-    going to do), and a journal to resume from in OUTPUT, and makes OUTPUT a campaign: `hil rehearse
-    OUTPUT` comes next. For a cell without [controller] it leaves trajectory files instead: CSV, ROS
-    2 JointTrajectory, and for six axes URScript and a player. Ctrl-C (or SIGTERM) ends the search
-    with the best motion so far once the generation under way is scored: seconds, a few minutes if a
-    motion hangs. A second one leaves at once. `hil demo --excitation OUTPUT` runs the motion.
+    Writes `excitation.toml` (motion, criteria, settings), `excitation.png` (a picture of the
+    motion) and a journal for --resume to OUTPUT, and makes OUTPUT a campaign; the next step is `hil
+    rehearse OUTPUT`. For a cell without [controller], trajectory files are written instead: CSV,
+    ROS 2 JointTrajectory and, for six axes, URScript with a player. Ctrl-C or SIGTERM ends the
+    search after the current generation (seconds; minutes if the evaluation of a motion hangs) and
+    saves the best motion so far; a second one exits at once. `hil demo --excitation OUTPUT` runs
+    the motion.
 
     **Examples:**
 
     - `hil design cell.toml -o runs/mine`
     - `hil design --show-settings front > my.toml`, then `hil design cell.toml --settings my.toml`
-    - `hil design cell.toml --earlier runs/demo -o runs/second`: adds to what is known
+    - `hil design cell.toml --earlier runs/demo -o runs/second`: a motion that complements a
+      campaign
     - `hil design cell.toml --for payload -o runs/load`: a short motion for `hil payload`
 
     Options:
         cell: The cell file.
         output: Folder for the result.
-        method: What is searched. a: the paper's method A, sines of largest determinant. b: its
-            method B, via points of best fitness by eq. 7. balanced: the same with terms of equal
-            weight. front: both criteria at once, and the knee of their front (the default).
-        settings: Settings of your own (TOML) instead of a method's, or those of an earlier
-            excitation.toml; begin with --show-settings.
-        show_settings: Print the settings of a method, explained, and do nothing else.
-        quick: A short search, for a first look: method b, as many motions as `candidates` of
-            [campaign] says.
-        repetitions: How often the motion is run; that of [campaign] if left out.
-        seed: One seed is one result; that of the settings if left out.
-        workers: Processes; as many as there are processors if left out. The result does not depend
-            on it.
-        kinematic: Keep joint limits only, and do not return home: for comparison with the paper,
-            not for a robot.
-        purpose: arm: all parameters of the arm. payload: only the payload, the arm known, by a
-            motion of at most ten seconds (`hil payload`).
-        earlier: A campaign folder, or archives (repeat the option): the new motion adds to what
-            they say, and concentrates on what they leave uncertain.
-        compare: Earlier results to draw on the front, e.g. those of methods a and b; of the same
-            robot, judged by the same parameters, without --earlier.
-        resume: Go on with the search in OUTPUT that was stopped.
+        method: Search method. a: method A of the paper, sines of largest determinant. b: method B
+            of the paper, via points by the fitness of eq. 7. balanced: as b, with terms of equal
+            weight. front: both criteria, and the knee of their Pareto front. Default: front.
+        settings: TOML file with search settings, or an earlier excitation.toml, in place of
+            --method. --show-settings prints a template.
+        show_settings: Print the commented settings of a method and exit.
+        quick: Run a short search: method b with the number of motions in `candidates` of
+            [campaign].
+        repetitions: Number of repetitions of the motion. Default: that of [campaign].
+        seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
+        workers: Number of processes; the result does not depend on it. Default: one per processor.
+        kinematic: Check joint limits only and do not return to the home posture; for comparison
+            with the paper, not for a robot.
+        purpose: arm: all parameters of the arm. payload: the payload only, with the arm known, by a
+            motion of at most 10 s (`hil payload`).
+        earlier: Campaign folder or archives (repeatable); the new motion reduces the uncertainty
+            that they leave.
+        compare: Earlier results to plot beside the front, of the same robot and parameters; not
+            with --earlier.
+        resume: Continue an interrupted search in OUTPUT.
         force: Replace an earlier design in OUTPUT.
     """
     if show_settings is not None:
         typer.echo(preset_text(show_settings), nl=False)
         return
     if cell is None:
-        raise InputError(None, "for which cell?", remedy="name a cell file: hil design CELL")
+        raise InputError(None, "no cell file", remedy="name a cell file: hil design CELL")
     at_most_one(method=method, settings=settings, quick=quick)
     at_most_one(resume=resume, force=force)
     reporter = make_reporter(quiet=quiet or json)
@@ -217,20 +218,20 @@ def design(
     known = known_from(earlier, loaded, reporter) if earlier else None
 
     def finish(done: Designed) -> None:
-        """Say what was found, then draw it, while no other search may enter the folder."""
+        """Report and draw the result, while the folder is locked."""
         for line in _lines(done):
             reporter.say(line)
         if unchecked := ", ".join(done.result.settings.unchecked):
-            words = f"not looked at: {unchecked}; {loaded.name} may refuse this motion"
-            say(f"warning: {words}", err=True)  # however quiet it is to be
+            text = f"not checked: {unchecked}; {loaded.name} may refuse this motion"
+            say(f"warning: {text}", err=True)  # also with --quiet
         lacking, files = _campaign(folder, loaded, done)
         if files:
             reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
         elif lacking is None:
             root = shlex.quote(str(folder.root))
-            reporter.say(f"{folder.root} is a campaign now; next: hil rehearse {root}")
+            reporter.say(f"{folder.root} is now a campaign; next: hil rehearse {root}")
         else:
-            reporter.say(f"note: no campaign was made of it: {lacking}")
+            reporter.say(f"note: no campaign was created: {lacking}")
         found = design_summary(done, folder) | {
             "campaign": str(folder.root) if lacking is None and not files else None,
             "no_campaign": lacking,
@@ -263,48 +264,48 @@ def design(
                 then=finish,
             )
         except NoExcitationError as error:
-            if not folder.settings.exists():  # nothing was begun
+            if not folder.settings.exists():  # the search had not started
                 raise
             raise NoExcitationError(
-                f"{error}; then repeat the command with --force, or with --resume where cell and "
-                "settings stay as they are"
+                f"{error}; then repeat the command with --force, or with --resume if cell and "
+                "settings are unchanged"
             ) from error
     if not done.design.complete:
         raise OperatorStopError(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "
-            "go on with --resume"
+            "continue with --resume"
         )
 
 
 def _campaign(
     folder: DesignFolder, cell: Cell, done: Designed
 ) -> tuple[str | None, tuple[str, ...]]:
-    """Make the design a campaign, or trajectory files where the cell names no controller.
+    """Create a campaign of the design, or trajectory files if the cell has no controller.
 
     Returns:
-        in words why there is neither, None if there is; and the trajectory files.
+        reason why there is neither, or None; and the trajectory files.
     """
     unchecked = done.result.settings.unchecked
     if not done.design.complete:
         return "the search was stopped", ()
     if unchecked:
-        return f"{', '.join(unchecked)} were not looked at", ()
+        return f"{', '.join(unchecked)} were not checked", ()
     try:
         if cell.file.controller is None and cell.file.campaign is not None:
             return None, write_trajectories(folder.root, cell, done.result.excitation)
         campaign_of_design(folder.root, cell, done.result.excitation)
-    except (HilError, OSError) as error:  # the design is as good without one
+    except (HilError, OSError) as error:  # the design is valid without one
         return str(error), ()
     return None, ()
 
 
 @contextmanager
 def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
-    """Turn Ctrl-C and SIGTERM into a request to stop; a second one leaves with a sentence."""
+    """Turn Ctrl-C and SIGTERM into a request to stop; a second one exits at once."""
     try:
         with stop_on_interrupt() as stop:
             yield stop
     except KeyboardInterrupt:
         raise OperatorStopError(
-            f"left at once; what was scored is in {folder.journal}; go on with --resume"
+            f"interrupted; evaluated motions are in {folder.journal}; continue with --resume"
         ) from None

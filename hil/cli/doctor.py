@@ -1,4 +1,4 @@
-"""`hil doctor`: what this PC can do, and what to change."""
+"""`hil doctor`: check whether this PC can serve a controller in real time."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ def doctor(
     quick: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Measure whether this PC can answer a controller every 1 or 2 ms, and say what to change.
+    """Measure whether this PC can answer a controller every 1 or 2 ms, and list what to change.
 
-    Looks at permissions, processor, kernel, network card, route, port or CAN bus, and disk; then
-    measures wake-up and turnaround latency in processes with the real-time settings of the
-    exchange. Sends nothing to the controller, changes nothing, needs no root; run it as the user
-    who will run hil. Every remedy is a command to type. Without CELL the cycle is 1 ms; of
-    a CELL only [controller] has to be filled in.
+    Checks permissions, processor, kernel, network card, route, port or CAN bus, and disk; then
+    measures wake-up and turnaround latency in processes with the real-time settings of an exchange.
+    Sends nothing to the controller, changes nothing and needs no root; run it as the user who will
+    run hil. Each remedy is a command. Without CELL the cycle is 1 ms; of CELL only [controller] has
+    to be complete.
 
-    Exit status: 0 fit for the cell's cycle; 5 not fit, or the link cannot work, or measured for
-    less than 60 s, so that the verdict is provisional; 2 bad input.
+    Exit status: 0 fit for the cycle; 5 not fit, or the link cannot work, or measured for less than
+    60 s (provisional); 2 bad input.
 
     Options:
-        cell: Cell file: its link is looked at, and its cycle has to be fit.
-        duration: Seconds of each of the two measurements.
-        output: Where archives will be written; its disk is tried.
-        quick: 5 s of each; the verdict is provisional (exit 5).
+        cell: Cell file, for its link and cycle.
+        duration: Duration of each of the two measurements, s.
+        output: Folder for archives, on the disk to test.
+        quick: Measure for 5 s each; the result is provisional (exit status 5).
     """
     controller = None if cell is None else controller_in(cell)
     diagnosis = examine(

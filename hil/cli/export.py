@@ -1,4 +1,4 @@
-"""`hil export`: the identified arm for MuJoCo, Gazebo and others."""
+"""`hil export`: write the identified arm for MuJoCo, Gazebo and other simulators."""
 
 from __future__ import annotations
 
@@ -35,21 +35,22 @@ def export(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the identified arm for a simulator, read it back, and say what the format leaves out.
+    """Write the identified arm for a simulator, and verify the file by reading it back.
 
     Identifies from the archives as `hil identify` does, then writes the physically consistent
     parameters. Inverse dynamics of the file, by MuJoCo (extra `mujoco`) or pinocchio, must equal
-    the model's at 1000 random states; parts that the format has no place for are named with their
-    torque over the recorded motion. Exit status 5 if the model is not good.
+    those of the model at 1000 random states. Effects that the format cannot express are listed with
+    their torque over the recorded motion. Exit status 5 if the model is not good.
 
     **Examples:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to sdf --ensemble 100`
 
     Options:
-        to: mjcf: MuJoCo's XML; sdf: Gazebo, Drake; urdf: everything else.
-        output: The file; if left out identified.xml, .sdf or .urdf, in the campaign folder or here.
-        ensemble: Number of variants as far apart as the parameters are uncertain, every one a
-            possible machine; in a folder beside OUTPUT.
-        seed: Of the variants.
+        to: mjcf: MuJoCo XML; sdf: Gazebo, Drake; urdf: other tools.
+        output: File to write. Default: identified.xml, .sdf or .urdf in the campaign folder or the
+            working directory.
+        ensemble: Number of variants, sampled from the uncertainty of the parameters and physically
+            consistent, in a folder next to OUTPUT.
+        seed: Seed of the variants.
     """
     reporter = make_reporter(quiet=quiet or json)
     found = identify_sources(archives, reporter, how.options(estimator=estimator))

@@ -1,4 +1,4 @@
-"""`hil gains`: torque constants from recordings with a known payload."""
+"""`hil gains`: estimate torque constants from recordings with a known payload."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ def gains(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Find the torque constant of every motor, from recordings with and without a known payload.
+    """Estimate the torque constant of each motor from recordings with and without a known payload.
 
-    Prints TOML to paste into a cell or a column map, with 95 % intervals. A motor whose constant
-    the data cannot determine is named, and gets "nan", which neither accepts: exit status 5.
+    Prints TOML for a cell file or a column map, with 95 % intervals. Motors whose constant the data
+    do not determine are listed with the value nan, which cell and map refuse: exit status 5.
 
     Options:
-        archives: Archives with motor currents (*.mcap), or folders of them. One whose cell has a
-            [robot.payload] was recorded with it, the others without load.
-        loaded: Archive or folder recorded with the payload of --mass; may be repeated.
-        mass: Mass of that payload in kg.
+        archives: Archives (*.mcap) with motor currents, or folders of them. Those whose cell has a
+            [robot.payload] were recorded with it, the others without payload.
+        loaded: Archive or folder recorded with the payload of --mass (repeatable).
+        mass: Mass of that payload, kg.
         centre: Its centre of mass in the frame, x,y,z in m.
-        inertia: Its tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes of the
-            frame.
-        frame: Link of the URDF whose frame that is; the last joint's if left out.
-        delay: Time in s by which currents lag positions; the cell's if left out.
+        inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
+            of the frame.
+        frame: URDF link of that frame. Default: the link of the last joint.
+        delay: Delay of the current relative to the position, s. Default: that of the cell.
     """
     bare, full = [*archives_in(archives)], [*archives_in(loaded or [])]
     twice = {path.resolve() for path in bare} & {path.resolve() for path in full}
     if twice:
-        raise InputError(twice.pop(), "is named with load and without", remedy="name it once")
+        raise InputError(twice.pop(), "is listed twice", remedy="give it with or without load")
     if mass is not None and not loaded:
-        raise _refusal("--mass", "which recording was made with it?", "add --loaded")
+        raise _refusal("--mass", "has no recording with this payload", "add --loaded")
     payload = _payload(mass, centre, inertia, frame) if loaded else None
     carried = {path: payload for path in full if payload is not None}
     lag = delay_from(delay)
     if lag == "auto":
-        raise _refusal("--delay", "cannot be found from currents", "give seconds")
+        raise _refusal("--delay", "cannot be estimated from currents", "give seconds")
     found = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
     if json:
         print_json(as_dict(found))
@@ -92,7 +92,7 @@ def _numbers(text: str, count: int, field: str) -> list[float]:
 
 
 def _as_toml(found: GainsFound) -> str:
-    """What is not determined has its place in the list; a cell or map refuses it by name."""
+    """Format the constants as TOML; one that is not determined is nan."""
     side = "motor side" if found.motor_side else "joint side, gears included"
     lines = [
         f"    {one['torque_constant']:.6g},  # {one['name']} ± {one['half_interval']:.2g}"
@@ -104,7 +104,7 @@ def _as_toml(found: GainsFound) -> str:
 
 
 def _motors(found: GainsFound) -> list[dict[str, Any]]:
-    """Name, constant, spread and half of the interval [N·m/A], or why there are none."""
+    """Name, constant, standard deviation and half interval [N·m/A], or why there are none."""
     gains = found.gains
     columns = (gains.motor_names, gains.values, gains.std, gains.determined, gains.reasons)
     return [
@@ -120,7 +120,7 @@ def _motors(found: GainsFound) -> list[dict[str, Any]]:
 
 
 def as_dict(found: GainsFound) -> dict[str, object]:
-    """The same for a program."""
+    """Return the content of `--json`."""
     loads = {name: None if load is None else load.mass for name, load in found.loads.items()}
     return {
         "motors": _motors(found),

@@ -1,4 +1,4 @@
-"""`hil identify`: from archives to a model, a verdict and a report."""
+"""`hil identify`: estimate parameters from archives, with verdict and report."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ def identify(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Estimate the dynamic parameters from archives, and say whether the result is good.
+    """Estimate the dynamic parameters from archives and judge the result.
 
-    Excitations and imported recordings are fitted; validation runs are predicted and never
-    fitted. Everything needed (URDF, friction law, drive train) travels inside the archives.
-    Exit status 0 if the model is good, 5 if it is not.
+    Excitations and imported recordings are fitted; validation runs are predicted and never fitted.
+    The archives contain all inputs: URDF, friction law, drive train. Exit status 0 if the model is
+    good, 5 if it is not.
 
     Options:
-        output: Folder for results.json, report.html and the files for other tools. If left out: the
-            campaign folder (with --paper its folder paper), or none for loose archives.
-        predict: Archive that is predicted and never fitted, whatever its kind. May be repeated.
-        paper: As the paper does it: smooth positions and torques, filter the regressor alike.
-        split: Where there is no validation run: share of the recording that is fitted; the rest is
+        output: Folder for results.json, report.html and the files for other tools. Default: the
+            campaign folder (with --paper its subfolder paper); none for single archives.
+        predict: Archive to predict and not to fit, of any kind (repeatable).
+        paper: Preprocess as in the paper: filter positions, torques and regressor alike.
+        split: Fraction of the recording that is fitted if there is no validation run; the rest is
             predicted.
-        in_sample: Fit everything and hold nothing out: all errors are in-sample, which no verdict
-            can call good.
-        annotate: Also write copies of the archives for viewers, with the predicted torque as a
-            third JointState channel, into the folder annotated of OUTPUT.
+        in_sample: Fit all recordings and hold nothing out. All errors are then in-sample, and the
+            model cannot be judged good.
+        annotate: Also write copies of the archives with the predicted torque as a third JointState
+            channel, for viewers, to the folder annotated of OUTPUT.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"
@@ -59,7 +59,7 @@ def identify(
     if output is not None:
         make_folder(output)
     elif annotate:
-        problem, remedy = "has no folder to write to", "name one: -o FOLDER"
+        problem, remedy = "needs an output folder", "add -o FOLDER"
         raise InputError(None, problem, field="--annotate", remedy=remedy)
     found = identify_sources(archives, reporter, options, predict=predict or ())
     results = found.results

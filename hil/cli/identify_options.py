@@ -1,4 +1,4 @@
-"""Options of an identification, as every command that identifies has them."""
+"""Options shared by the commands that identify."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hil.errors import InputError
 from hil.identify.options import ESTIMATORS, FRICTION_TERMS, Estimator, Options, friction_from
 
 LONGEST_DELAY: Final = 0.5
-"""s; what lags by more belongs to another recording."""
+"""Largest delay accepted, s."""
 
 EstimatorOption = Annotated[
     Estimator,
@@ -22,27 +22,26 @@ DelayOption = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS|auto|stated",
-        help="Time by which the torque lags the position; stated: the cell's. If left out: "
-        "the cell's, unless the recordings show another one. auto: estimated for each axis and "
-        "compensated.",
+        help="Delay of the torque relative to the position, s. stated: that of the cell. auto: "
+        "estimated for each axis. Default: that of the cell, unless the recordings contradict it.",
     ),
 ]
 
 FEW: Final = ("bandwidth", "velocity", "standstill", "torque_bandwidth")
-"""Options that commands lack which identify on the way to something else."""
+"""Options that `hil export` and `hil replay` do not have."""
 
 
 @dataclass(frozen=True)
 class Identifying:
-    """How archives are identified, as it is typed; see `hil.cli.arguments.with_options`."""
+    """Options of an identification; see `hil.cli.arguments.with_options`."""
 
     friction: Annotated[
         str,
         typer.Option(
             metavar="TERMS|auto",
-            help=f"Friction law, whatever the archive says: some of {FRICTION_TERMS}, with commas "
-            "between them. auto: the archive's, with what predicts best at reversals (and, of "
-            "imported recordings, at speed).",
+            help=f"Friction law in place of the archive's: terms of {FRICTION_TERMS}, separated "
+            "by commas. auto: the archive's, extended by the terms that predict better near "
+            "reversals (for imported recordings also at speed).",
         ),
     ] = "auto"
     delay: DelayOption = None
@@ -50,36 +49,36 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ|auto",
-            help="Widest bandwidth of the smoothed positions; auto: the one with which parts of "
-            "the fitted recordings are best predicted from the rest.",
+            help="Largest bandwidth of the position smoothing. auto: the value that predicts "
+            "parts of the fitted recordings best from the rest.",
         ),
     ] = "auto"
     velocity: Annotated[
         Literal["auto", "position", "measured"],
-        typer.Option(help="Slope of the smoothed positions, or the measured velocity, if any."),
+        typer.Option(help="Source of the velocity: smoothed positions, or as measured."),
     ] = "auto"
     standstill: Annotated[
         Literal["auto", "rests", "slow", "none"],
         typer.Option(
-            help="Rows that are not fitted: rests longer than 0.25 s, and the two rows between "
-            "which a velocity changes its sign; all slow rows and those near a velocity reversal; "
-            "or none. auto: slow rows, or rests where that predicts parts of the fitted "
+            help="Rows excluded from the fit. rests: rests longer than 0.25 s, and the two rows "
+            "at each change of sign of a velocity. slow: all rows below the standstill speed or "
+            "near a velocity reversal. auto: slow, or rests if it predicts parts of the fitted "
             "recordings better."
         ),
     ] = "auto"
     torque_bandwidth: Annotated[
         str,
         typer.Option(
-            help="Bandwidth in Hz of a low-pass the torque came through before it was recorded; "
-            'the model is then filtered alike. "none", or "auto": estimated, of imported torques.',
+            help="Bandwidth of a low-pass filter that the recorded torque passed through, Hz; the "
+            "model is filtered alike. none: no filter. auto: estimated, for imported torques.",
         ),
     ] = "auto"
 
     def options(self, **more: Any) -> Options:
-        """The options of an identification, and those that one command alone has.
+        """Return the options of an identification; `more` are those of one command.
 
         Raises:
-            InputError: one of them cannot be used.
+            InputError: an option is invalid.
         """
         low_pass, friction = self.torque_bandwidth, self.friction
         return Options(
@@ -96,17 +95,17 @@ class Identifying:
 
 
 def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
-    """Delay in s as the option says it.
+    """Parse the value of `--delay`, s.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not a delay.
     """
     if text is None or text in ("auto", "stated"):
         return cast('Literal["auto", "stated"] | None', text)
     value = _number(text)
     if not abs(value) <= LONGEST_DELAY:
         remedy = f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto"
-        raise InputError(None, f"{text!r} is no delay", field="--delay", remedy=remedy)
+        raise InputError(None, f"{text!r} is not a delay", field="--delay", remedy=remedy)
     return value
 
 
@@ -116,7 +115,7 @@ def _bandwidth(text: str, option: str) -> float | Literal["auto"]:
     value = _number(text)
     if not 0.0 < value < math.inf:
         remedy = 'give a frequency above 0 Hz, or "auto"'
-        raise InputError(None, f"{text!r} is no bandwidth", field=option, remedy=remedy)
+        raise InputError(None, f"{text!r} is not a bandwidth", field=option, remedy=remedy)
     return value
 
 

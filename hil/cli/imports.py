@@ -1,4 +1,4 @@
-"""`hil import`: foreign recordings into archives."""
+"""`hil import`: convert recordings of other formats to archives."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from hil.terminal_text import printable
 from identification import FrictionLaw
 
 app = typer.Typer(
-    help="Turn other people's recordings into archives that `hil identify` reads.",
+    help="Convert recordings of other formats to archives that `hil identify` reads.",
     no_args_is_help=True,
 )
 
@@ -46,24 +46,24 @@ Source = Annotated[Path, typer.Argument(help="The recording.")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="The archive to write (*.mcap).")]
 Held = Annotated[
     list[str] | None,
-    typer.Option(help="A joint known to have stood still; may be repeated."),
+    typer.Option(help="Joint that did not move during the recording (repeatable)."),
 ]
 Kind = Annotated[
     Use,
     typer.Option(
-        help="What it is for: excitation (to be fitted), validation (only predicted) or standstill "
-        "(the noise of the positions)."
+        help="Use of the recording. excitation: fitted. validation: predicted only. standstill: "
+        "noise of the positions."
     ),
 ]
 
 
 @dataclass(frozen=True)
 class Described:
-    """What describes the robot of a recording, as it is typed."""
+    """Options that describe the robot of a recording."""
 
     urdf: Annotated[Path | None, typer.Option(help="URDF of the robot.")] = None
     cell: Annotated[
-        Path | None, typer.Option(help="A cell file instead of --urdf and --friction.")
+        Path | None, typer.Option(help="Cell file, in place of --urdf and --friction.")
     ] = None
     dh: DhOption = None
     convention: ConventionOption = None
@@ -71,46 +71,46 @@ class Described:
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Gravity in the robot's base frame, m/s², for an arm on a wall, a ceiling or a "
-            "slope: 0 0 9.81 for one that hangs upside down; 0 0 0 if the torques are without "
-            "gravity already. As of an upright arm, or as the cell says, if left out.",
+            help="Gravity in the base frame of the robot, m/s²: 0 0 9.81 for an arm mounted upside "
+            "down, 0 0 0 for torques without gravity. Default: that of the cell, else upright.",
         ),
     ] = None
     friction: Annotated[
         str,
-        typer.Option(help=f"Friction law: some of {FRICTION_TERMS}, with commas between them."),
+        typer.Option(help=f"Friction law: terms of {FRICTION_TERMS}, separated by commas."),
     ] = "coulomb,viscous,offset"
     standstill: Annotated[
-        float, typer.Option(min=0.0, help="Speed in rad/s below which a joint's row is not fitted.")
+        float,
+        typer.Option(min=0.0, help="Joint speed below which rows are not fitted, rad/s."),
     ] = 0.01
     locked: Annotated[
         list[str] | None,
         typer.Option(
-            help="A joint of the URDF that was not recorded, NAME or NAME=POSITION (rad or m), "
-            "held there (at 0); may be repeated."
+            help="Joint of the URDF that was not recorded, NAME (fixed at 0) or NAME=POSITION (rad "
+            "or m; repeatable)."
         ),
     ] = None
     lock_others: Annotated[
         bool,
         typer.Option(
-            help="Lock every joint of the URDF that was not recorded, at 0 or at the middle of a "
-            "range without 0; the command says which. A log names those that were recorded in "
-            "`joints` of its map."
+            help="Fix all joints of the URDF that were not recorded, at 0 or at the middle of a "
+            "range without 0, and list them. For a log, `joints` of the map names the recorded "
+            "ones."
         ),
     ] = False
 
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
-        """The robot of a cell file, a URDF or a DH table; `recorded` gives joints of a recording.
+        """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names.
 
         Raises:
-            InputError: not exactly one of these was named, or a figure cannot be used.
+            InputError: not exactly one of these was given, or a value is invalid.
         """
         exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
         if self.gravity is not None and not all(map(math.isfinite, self.gravity)):
-            problem, remedy = f"{self.gravity} is no vector", "give m/s², as in 0 0 -9.81"
+            problem, remedy = f"{self.gravity} is not a vector", "give m/s², as in 0 0 -9.81"
             raise InputError(None, problem, field="--gravity", remedy=remedy)
         if not math.isfinite(self.standstill):
-            problem, remedy = f"{self.standstill} is no speed", "give rad/s, as in 0.01"
+            problem, remedy = f"{self.standstill} is not a speed", "give rad/s, as in 0.01"
             raise InputError(None, problem, field="--standstill", remedy=remedy)
         law = FrictionLaw.from_table(
             {**friction_from(self.friction), "standstill": self.standstill}
@@ -145,18 +145,18 @@ def rosbag2(
     kind: Kind = "excitation",
     json: JsonOption = False,
 ) -> None:
-    """Import sensor_msgs/JointState from a rosbag2, or from any MCAP file; joints go by name.
+    """Import sensor_msgs/JointState messages from a rosbag2 or MCAP file.
 
-    A bag's folder, its .db3 or .mcap file, compressed or not. Messages of other types in an MCAP
-    file are imported by `hil import log` with a column map. Of a URDF with more joints than were
-    recorded, --locked or --lock-others leaves those out of the model.
+    The source is a bag folder or its .db3 or .mcap file, compressed or not. Joints are matched by
+    name. For MCAP files with other message types use `hil import log` with a column map. If the
+    URDF has more joints than were recorded, --locked or --lock-others removes them from the model.
 
     **Example:** `hil import rosbag2 bag --urdf arm.urdf --lock-others --gravity 0 0 9.81 -o a.mcap`
 
     Options:
-        topic: Topic of the joint states, if there is more than one.
-        effort: What the effort field holds: torque (N·m), motor_current (A) or ignore.
-        rename: A joint that the bag calls by another name than the URDF; may be repeated.
+        topic: Topic of the joint states; needed if the bag has several.
+        effort: Content of the effort field: torque (N·m), motor_current (A) or ignore.
+        rename: Joint whose name in the bag differs from the URDF (repeatable).
     """
     names = _names(rename or [])
     path = import_rosbag2(
@@ -169,7 +169,7 @@ def rosbag2(
         held_joints=held or (),
         use=kind,
     )
-    _tell(path, json=json)
+    _print(path, json=json)
 
 
 @with_options(Described, "arm")
@@ -184,25 +184,25 @@ def log(
     uncoupled: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Import a log of numbers: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
+    """Import a numeric log: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
-    A column map names its columns or arrays, their units and sides: `docs/archive-format.md`. It
-    also says where a quantity has a file of its own, or one per joint; the recording may then be a
-    folder. What looks like a slip of the map is said in warnings: two readings, and their errors.
+    A column map names columns or arrays, their units and sides: `docs/archive-format.md`. It can
+    also name a separate file per quantity or per joint; the source is then a folder. Warnings
+    report probable errors of the map, with the error of each of two interpretations.
 
     **Example:** `hil import log log.csv --map map.toml --urdf arm.urdf -o log.mcap`, with
     `map.toml` of `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`
 
     Options:
-        columns: TOML file that says which columns or arrays hold what.
-        uncoupled: Leave the inertias and the friction of coupled motors out of the model, to see
-            what they explain; angles and torques stay those of the map.
+        columns: TOML file with the column map.
+        uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
+            their contribution. Angles and torques remain those of the map.
     """
 
     def recorded() -> tuple[str, ...]:
         joints = ColumnMap.load(columns).joints
         if joints is None:
-            problem = "does not say which joints were recorded"
+            problem = "does not name the recorded joints"
             remedy = "--lock-others needs joints = [...], the URDF's joint of each column"
             raise InputError(columns, problem, field="joints", remedy=remedy)
         return joints
@@ -216,18 +216,18 @@ def log(
         use=kind,
         coupled=not uncoupled,
     )
-    _tell(path, json=json)
+    _print(path, json=json)
 
 
 app.command("log")(log)
-# Under the names that people look for.
+# Hidden aliases.
 app.command("mcap", hidden=True)(rosbag2)
 for _name in ("csv", "npz"):
     app.command(_name, hidden=True)(log)
 
 
-def _tell(path: Path, *, json: bool) -> None:
-    """What was read, as the archive keeps it."""
+def _print(path: Path, *, json: bool) -> None:
+    """Print the findings in the new archive."""
     found = open_archive(path).header.findings
     if json:
         print_json({"archive": str(path), "found": found.lines, "warnings": found.warnings})
@@ -240,10 +240,10 @@ def _tell(path: Path, *, json: bool) -> None:
 
 
 def _names(renamed: list[str]) -> dict[str, str]:
-    """Name in the URDF by name in the bag."""
+    """Parse RECORDED=URDF pairs."""
     names = dict(text.partition("=")[::2] for text in renamed)
     for recorded, name in names.items():
         if not (recorded and name):
-            problem = f"{recorded or '=' + name!r} is no pair"
+            problem = f"{recorded or '=' + name!r} is not a pair"
             raise InputError(None, problem, field="--rename", remedy="give RECORDED=URDF")
     return names

@@ -1,4 +1,4 @@
-"""`hil move`: the arm goes a checked straight way to a posture."""
+"""`hil move`: move the arm along a checked straight path in joint space."""
 
 from __future__ import annotations
 
@@ -40,38 +40,37 @@ def move(
     only_axis: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Move the arm on a straight way in joint space, slowly, and archive it.
+    """Move the arm slowly along a straight path in joint space, and archive the motion.
 
-    The way is planned from where the arm stands and checked against limits, motor currents, floor,
-    walls and the arm itself; then it is shown, and sent once a person says yes. Without a terminal
-    nothing that may be a real arm moves unless --yes is given. Ctrl-C brings the arm to rest on
-    its way. With transport "simulated" the controller is simulated here, and the arm stands again
-    at initial_deg the next time.
+    The path starts at the present posture and is checked against limits, motor currents, floor,
+    walls and self-collision. It is shown and sent after confirmation. Without a terminal, a
+    controller that may be real receives nothing unless --yes is given. Ctrl-C stops the arm on its
+    path. With transport "simulated" the controller runs in this process, and each call starts at
+    initial_deg.
 
-    **Example:** `hil move cell.toml --joint 1 --by 5 --speed 5`, then
-    `hil move cell.toml --to start`.
+    **Example:** `hil move cell.toml --joint 1 --by 5 --speed 5`, then `hil move cell.toml --to
+    start`.
 
-    Exit status 0 when it arrived (or was there), 2 when what was typed cannot be used or the
-    planner failed, 3 when the way is refused or nobody confirmed it,
-    4 when the controller, the link or the guard ended it, 130 when it was stopped.
+    Exit status: 0 the arm arrived (or was there), 2 bad input or planning failed, 3 the path was
+    refused or not confirmed, 4 controller, link or guard ended the motion, 130 stopped.
 
     Options:
-        where: A cell file, or a campaign's folder.
-        to: home_deg of the cell; the start of the campaign's excitation (of a cell alone: home); or
-            angles in degrees in the frame of [limits], "0,-20,-90,0,60,0".
-        joint: Instead of --to: one joint, by name or number from 1.
-        by: How far it turns, degrees.
-        speed: Percent of the joints' speeds; the cell's approach_speed if left out.
-        output: The archive (*.mcap), or a folder to number it in; runs/move if left out, of a
-            campaign its own archives.
-        yes: Do not ask: the way is free, and somebody looks. What may be a real arm then goes no
-            faster than the cell's approach_speed.
-        only_axis: With --joint: the controller's program opens the axis of that joint only, and the
-            others have to stay closed.
+        where: A cell file or a campaign folder.
+        to: home_deg of the cell; the start of the excitation of the campaign (of a cell: home); or
+            angles in degrees in the frame of [limits], such as "0,-20,-90,0,60,0".
+        joint: Move one joint only, by name or number from 1; with --by, in place of --to.
+        by: Displacement of that joint, degrees.
+        speed: Percent of the joint speed limits. Default: approach_speed of the cell.
+        output: The archive (*.mcap), or a folder for numbered archives. Default: runs/move, or the
+            archives of the campaign.
+        yes: Do not ask for confirmation: the path is clear and an operator watches. A controller
+            that may be real then moves at most at approach_speed of the cell.
+        only_axis: With --joint: the controller's program opens the axis of that joint only; the
+            others must remain closed.
     """
     if (to is None) == (joint is None) or (joint is None) != (by is None):
         remedy = "give either --to, or --joint and --by"
-        raise InputError(None, "where is the arm to go?", remedy=remedy)
+        raise InputError(None, "no target", remedy=remedy)
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
     axis = axis_alone(cell, joint) if only_axis else None
@@ -86,15 +85,19 @@ def move(
             if speed is not None and speed > most:
                 raise UnsafeError(
                     f"--speed {speed:g} with --yes is faster than the cell's approach_speed "
-                    f"({most:g} %), and nobody confirms the way; nothing was sent: leave out "
-                    "--yes, or go slower."
+                    f"({most:g} %), without confirmation; nothing was sent: leave out --yes or "
+                    "reduce --speed."
                 )
         with stop_on_interrupt() as stop:
             here = link.connect(stop)
         target = turned(cell, here, joint or "", by or 0.0) if wanted is None else wanted
         if np.max(np.abs(target - here)) <= THERE:
             link.close()
-            _tell("the arm is there already; nothing was sent", {"outcome": "there"}, json=json)
+            _print(
+                "the arm is at the target; nothing was sent",
+                {"outcome": "there"},
+                json=json,
+            )
             return
         way = straight_way(
             cell,
@@ -106,18 +109,18 @@ def move(
         if not json:
             typer.echo(printable(_described(way, cell, link)))
         _confirm(cell, link, yes=yes, json=json)
-        own = campaign.folder if campaign is not None and output is None else None
-        if own is None:
+        folder = campaign.folder if campaign is not None and output is None else None
+        if folder is None:
             path = archive_path(output or Path("runs/move"), "move")
         else:
-            make_folder(own.archives)
-            path = own.archives / own.next_name("move", 0).filename
+            make_folder(folder.archives)
+            path = folder.archives / folder.next_name("move", 0).filename
         bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
         with stop_on_interrupt() as stop, bar.task("moving (s)", way.duration) as task:
             ended = send(way, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
             stopped = stop.requested
-        if own is not None:
-            own.add(path.name, ended.outcome)
+        if folder is not None:
+            folder.add(path.name, ended.outcome)
         figures: dict[str, object] = {
             "archive": str(path),
             "outcome": ended.outcome,
@@ -126,7 +129,7 @@ def move(
             "duration": way.duration,
             "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
         }
-        said = f"{ended.outcome}: {ended.reason or 'the arm is there'}; archived in {path}"
+        said = f"{ended.outcome}: {ended.reason or 'the arm has arrived'}; archived in {path}"
         if not json:
             typer.echo(printable(said))
         try:
@@ -134,38 +137,38 @@ def move(
         except ControllerFault as fault:
             raise fault.beside(figures) from None
         if json and ended.outcome == "completed":
-            _tell(said, figures, json=json)
+            _print(said, figures, json=json)
     if ended.outcome == "stopped" and stopped:
-        how = f"the arm was stopped on its way; {path} is whole."
+        how = f"the arm was stopped on its path; {path} is complete."
         raise OperatorStopError(how).beside(figures)
     if ended.outcome != "completed":
-        why = f"the move ended {ended.outcome}: {ended.reason}; {path} is whole."
+        why = f"the motion ended {ended.outcome}: {ended.reason}; {path} is complete."
         raise ControllerFault(why).beside(figures)
 
 
 class _Shown:
-    """Moves the bar on with the arm; only Ctrl-C stops the motion."""
+    """Progress bar of a motion, as its operator; only Ctrl-C stops the motion."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._done = task, 0.0
 
     def show(self, progress: MotionProgress) -> None:
-        """Look at the motion."""
+        """Update the bar."""
         done = max(self._done, progress.motion_time or 0.0)
         self._task.advance(done - self._done)
         self._done = done
 
     def request(self) -> OperatorRequest:
-        """The motion as it was planned."""
+        """Request no change."""
         return OperatorRequest()
 
 
 @contextmanager
 def _reserved(campaign: Campaign | None) -> Iterator[None]:
-    """Keep runs out of a campaign's folder from before the controller is connected.
+    """Lock the folder of a campaign before the controller is connected.
 
     Raises:
-        CampaignFolderError: one is at work on it, or the folder was changed.
+        CampaignFolderError: the folder is in use, or was changed.
     """
     with nullcontext() if campaign is None else campaign.folder.locked():
         if campaign is not None:
@@ -174,11 +177,11 @@ def _reserved(campaign: Campaign | None) -> Iterator[None]:
 
 
 def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
-    """Ask the person; what may be a real arm does not move without an answer.
+    """Ask for confirmation, which an arm that may be real needs.
 
     Raises:
-        UnsafeError: nobody is here to answer.
-        OperatorStopError: the answer was no.
+        UnsafeError: there is no terminal to confirm at.
+        OperatorStopError: the operator declined.
     """
     if yes:
         return
@@ -186,12 +189,12 @@ def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
         if link.only_simulated:
             return
         raise UnsafeError(
-            "nobody is here to confirm the way, and the controller may be a real one; nothing was "
-            "sent: run it in a terminal, or add --yes where somebody looks at the arm."
+            "the path needs confirmation, as the controller may be real; nothing was sent: run it "
+            "in a terminal, or add --yes if an operator watches the arm."
         )
     who = "the simulated arm" if link.only_simulated else f"the arm of {cell.name}"
     try:
-        agreed = typer.confirm(f"The way is free, and {who} may move?")
+        agreed = typer.confirm(f"Is the path clear, and may {who} move?")
     except typer.Abort:
         agreed = False
     if not agreed:
@@ -199,7 +202,7 @@ def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
 
 
 def _described(way: Way, cell: Cell, link: MotionLink) -> str:
-    """The way, joint by joint."""
+    """Format the path, one line per joint."""
     frame = AngleFrame.of(cell)
     start, end = frame.shown(way.start), frame.shown(way.target)
     peaks = np.degrees(way.trajectory.extrema().velocity)
@@ -212,12 +215,12 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
     lines.append(
         f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
-        f"limits, motor currents, floor, walls and the arm itself are respected; to {who}"
+        f"checked against limits, motor currents, floor, walls and self-collision; to {who}"
     )
     below = narrower_limits(cell, link.connection, "following_error")
-    lines += [f"the smaller following-error threshold counts, {note}" for note in below]
+    lines += [f"the smaller following-error threshold applies, {note}" for note in below]
     return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
 
 
-def _tell(text: str, figures: dict[str, object], *, json: bool) -> None:
+def _print(text: str, figures: dict[str, object], *, json: bool) -> None:
     typer.echo(json_format.dumps(figures) if json else printable(text))

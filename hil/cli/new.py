@@ -1,4 +1,4 @@
-"""`hil new`: a commented cell file for an arm."""
+"""`hil new`: write a commented cell file for an arm."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from hil.progress import say
 from hil.reading import parse_port
 
 PORT = 1000
-"""On which a PC listens to a C4G Open, as delivered."""
+"""Default UDP port of C4G Open."""
 
 
 def new(
@@ -54,32 +54,31 @@ def new(
     force: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Write a commented cell file for an arm; what nobody has said is marked "?".
+    """Write a commented cell file for an arm, with "?" for each unknown value.
 
-    Limits come from the URDF where it states them. With --from-controller this PC listens until
-    the controller's Open program starts, answers safely (nothing can move), and reads the init
-    packet: start this command first, then that program. With --from-archive the same comes from
-    an archive. Everything else is yours to fill in: a file with a "?" in it is refused, with a
-    list of all that is missing and where each figure is found. An arm of which only the
-    Denavit-Hartenberg parameters are known begins with --dh in place of --urdf.
+    Limits come from the URDF if it states them. With --from-controller this PC waits for the Open
+    program of the controller, replies without moving anything and reads the init packet: start this
+    command first, then that program. With --from-archive the values come from an archive. A file
+    with a "?" is refused with a list of all unknown values and where to find each of them. For an
+    arm with known Denavit-Hartenberg parameters and no URDF use --dh.
 
-    **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`,
-    `hil new --dh table.csv --convention modified -o cell.toml`,
-    `hil new --design-only --urdf robot.urdf -o cell.toml`
+    **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
+    --dh table.csv --convention modified -o cell.toml`, `hil new --design-only --urdf robot.urdf -o
+    cell.toml`
 
     Options:
-        urdf: The arm's URDF.
+        urdf: URDF of the arm.
         output: The cell file to write.
-        from_controller: Take gears, calibration, coupling, current limits, following errors and
+        from_controller: Read gears, calibration, coupling, current limits, following errors and
             cycle from the init packet of the controller at HOST; this PC listens on PORT (1000).
-        from_archive_file: Take what an archive of this arm carries: its cell and its init packet.
-        bind: Address of this PC to listen on; 0.0.0.0 for all of them.
-        arm: Arm of the controller.
-        wait: Seconds to wait for the controller.
-        fix: A joint that is not to move, at a position in rad or m (0 if left out); may be
-            repeated. Sliding joints are fixed in any case.
-        design_only: For an arm whose motions another controller runs: no drive train and no link in
-            the file, what a design needs beside the URDF assumed and named.
+        from_archive_file: Read the cell and the init packet of an archive of this arm.
+        bind: Local address to listen on; 0.0.0.0 for all.
+        arm: Arm number of the controller.
+        wait: Time to wait for the controller, s.
+        fix: Joint that does not move, at a position in rad or m (default 0; repeatable). Prismatic
+            joints are always fixed.
+        design_only: For an arm moved by another controller: no drive train and no link; values that
+            a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
     """
     exactly_one(urdf=urdf, dh=dh)
@@ -119,26 +118,26 @@ def new(
         say(f"note: {note}")
     say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
     if unknown:
-        say(f'still unknown, marked "?": {", ".join(unknown)}')
+        say(f'unknown, marked "?": {", ".join(unknown)}')
         after = "design" if design_only else "doctor"
-        say(f"fill them in, then `hil {after} {output}`; whatever is missing is named again")
+        say(f"fill them in, then `hil {after} {output}`, which lists what is still missing")
     elif design_only:
-        say(f"read what is assumed in it; then `hil design {output}`")
+        say(f"check the assumed values in it, then `hil design {output}`")
 
 
 def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, quiet: bool) -> Known:
-    """What the controller at HOST[:PORT] says of itself."""
+    """Read the init packet of the controller at HOST[:PORT]."""
     from drivers.transports.udp import UdpSpec
 
     host, _, port_text = address.partition(":")
     port = parse_port(port_text or str(PORT))
     if not host or port is None:
         remedy = "e.g. 10.2.12.150:1000"
-        raise InputError(None, f"{address!r} is no HOST or HOST:PORT", remedy=remedy)
+        raise InputError(None, f"{address!r} is not HOST or HOST:PORT", remedy=remedy)
     if not quiet:
         typer.echo(
             f"listening on {bind}:{port}; now start the controller's Open program at {host} "
-            f"(waiting {wait:g} s, Ctrl-C ends it). Nothing is moved"
+            f"(waiting {wait:g} s, Ctrl-C to stop). Nothing moves"
         )
     with stop_on_interrupt() as stop:
         init = read_init(UdpSpec(host, port, bind), n_joints, arm=arm, wait=wait, stop=stop)
@@ -149,9 +148,9 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
 
 
 def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:
-    """Refuse to replace a file that is there, and the URDF that is read in any case."""
+    """Refuse to replace a file without --force, and the URDF that is read."""
     if own is not None and path.resolve() == own.resolve():
-        problem = "is the URDF itself, of which a copy is needed"
+        problem = "is the URDF to read"
         raise InputError(path, problem, remedy="name another --output")
     if path.exists() and not force:
         raise InputError(path, "exists already", remedy="name another --output, or add --force")

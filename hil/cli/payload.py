@@ -1,4 +1,4 @@
-"""`hil payload`: what the arm carries, as figures that a controller is given."""
+"""`hil payload`: identify the payload for the settings of a controller."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ def payload(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Weigh what the arm carries: mass, centre of mass and inertia with 95 % intervals.
+    """Identify the payload: mass, centre of mass and inertia with 95 % intervals.
 
-    The difference of recordings without and with it, on one model of the arm. Prints the figures
-    as they are typed into a COMAU, UR and Franka controller. Exit status 5 if a figure of --check
-    lies outside its interval, or no possible body fits the recordings.
+    Fits the difference between recordings without and with the payload, on one model of the arm.
+    Prints the values in the form that COMAU, UR and Franka controllers expect. Exit status 5 if a
+    value of --check lies outside its interval, or no physically possible body fits.
 
     Options:
         bare: Archives (*.mcap) recorded without the payload, or campaign folders.
-        loaded: Archive recorded with it, or campaign folder; may be repeated.
-        frame: Link of the URDF in whose frame the figures are. If left out: tool0 or flange where
-            one is fixed to the last joint, else the link of that joint.
-        shape: Edges in m of a uniform box along the axes of the frame: what the motion does not
-            determine is that of the possible body closest to it. If left out: to a point.
-        check: A figure that is known, such as mass=4.0 (kg): exit status 5 if it lies outside its
-            95 % interval. May be repeated.
+        loaded: Archive recorded with it, or campaign folder (repeatable).
+        frame: URDF link in whose frame the values are given. Default: tool0 or flange if fixed to
+            the last joint, else the link of that joint.
+        shape: Edges of a uniform box along the axes of the frame, m. Components that the motion
+            does not determine are those of the possible body closest to it. Default: a point mass.
+        check: Known value, such as mass=4.0 (kg): exit status 5 if it lies outside its 95 %
+            interval (repeatable).
         urdf: File for the payload as a link of a URDF.
     """
     box, wanted = _box(shape), figures(check or [], "--check", "mass=4.0", bare=False)
@@ -69,7 +69,7 @@ def payload(
 def payload_lines(
     found: PayloadFound, wanted: Collection[str] = (), outside: Sequence[str] = ()
 ) -> list[str]:
-    """What was found, as a person reads it, and how figures that are known compare with it."""
+    """Format the result and its comparison with known values."""
     lines = [*found.sentences, ""]
     lines += [
         f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
@@ -89,7 +89,7 @@ def _box(shape: tuple[str, float, float, float] | None) -> tuple[float, float, f
         return None
     kind, x, y, z = shape
     if kind != "box" or not all(math.isfinite(edge) and edge > 0.0 for edge in (x, y, z)):
-        problem = f"{kind} {x:g} {y:g} {z:g} is no shape"
+        problem = f"{kind} {x:g} {y:g} {z:g} is not a shape"
         remedy = "give box and three edges above 0 m, such as box 0.2 0.1 0.1"
         raise InputError(None, problem, field="--shape", remedy=remedy)
     return x, y, z

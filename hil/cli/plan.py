@@ -1,4 +1,4 @@
-"""`hil plan`: plan a motion as the controller's interpolator would run it, and draw it."""
+"""`hil plan`: plan a motion as the controller's interpolator would execute it."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def planned_again(path: Path, cell: Cell) -> MotionPlan:
 
 
 def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Return what a planning function returns, called where the solver may crash.
+    """Call a planning function in a child process.
 
     Raises:
-        InputError: it crashed, or did not come to an end; else whatever the function raised.
+        InputError: the child crashed or timed out; else what the function raised.
     """
     try:
         return in_child(function, *args, **kwargs)
@@ -95,25 +95,24 @@ def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
 def read_via_points(path: Path, frame: AngleFrame) -> Array:
     """Read via points (m, n) [rad] from a table of degrees.
 
-    One row per point, values apart by commas, semicolons or blanks; what follows a # is a
-    comment; a first row without a single number is read as names of columns and skipped.
+    One row per point; commas, semicolons or blanks separate values; # begins a comment; a first
+    row without numbers is a header.
 
     Raises:
         InputError: a row is not one finite number per joint.
     """
-    # Spreadsheets and editors begin a file with a byte order mark; it is no part of a cell.
     lines = enumerate(read_input(path).removeprefix("\ufeff").splitlines(), 1)
     rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]
     rows = [(number, cells) for number, cells in rows if cells]
     if rows and all(_number(cell) is None for cell in rows[0][1]):  # names
         del rows[0]
-    remedy = f"write one angle in degrees for each of the {frame.sign.size} joints"
+    remedy = f"write one finite angle in degrees for each of the {frame.sign.size} joints"
     for number, cells in rows:
         for place, cell in enumerate(cells, 1):
             value = _number(cell)
             if value is None or not isfinite(value):
                 field = f"line {number}, cell {place}"
-                raise InputError(path, f"{cell!r} is no finite number", field=field, remedy=remedy)
+                raise InputError(path, f"{cell!r} is not a number", field=field, remedy=remedy)
         if len(cells) != frame.sign.size:
             raise InputError(path, f"{len(cells)} values", field=f"line {number}", remedy=remedy)
     if len(rows) < 2:
@@ -123,7 +122,7 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
 
 
 def _number(cell: str) -> float | None:
-    """The number in a cell, or None; Python's own `1_000` is no number of a table."""
+    """Parse a number; None for other text, and for the `1_000` of Python."""
     try:
         return None if "_" in cell else float(cell)
     except ValueError:
@@ -132,7 +131,7 @@ def _number(cell: str) -> float | None:
 
 _RATES = ("velocity", "acceleration", "jerk")
 _MOST_ROWS = 1_000_000
-"""of a table; it is made in memory."""
+"""Largest table to write, rows."""
 
 
 def plan(
@@ -150,39 +149,36 @@ def plan(
     picture: Path | None = None,
     json: JsonOption = False,
 ) -> None:
-    """Plan a motion through via points and say how each of them is passed. Nothing moves.
+    """Plan a motion through via points and report how each of them is passed. Nothing moves.
 
-    Angles are those in which the cell's limits are written: the teach pendant's where their
-    frame is "controller". A plan file keeps its own speeds and flies, and is planned for the
-    limits of CELL. Only joint limits are checked here: not floor, walls, currents, nor the arm
-    against itself.
+    Angles are in the frame of the cell's limits: those of the teach pendant if it is "controller".
+    A plan file has its own speeds and flies, and is planned for the limits of CELL. Only joint
+    limits are checked here: not floor, walls, currents or self-collision.
 
     **Example:** `hil plan cell.toml --random 6 --fly 50 --picture plan.png`
 
     Options:
         cell: The cell file.
-        via: Via points: a table in degrees, one row per point, the first is the start; or a plan
-            file (*.toml, *.json).
-        random: So many random via points instead.
-        seed: Of the random via points.
-        speed: Percent of the joints' speeds.
-        acceleration: Percent of the joints' accelerations.
-        fly: Fly in percent (FLY_NORM); 0 stops.
-        fly_distance: Instead of --fly: degrees of joint space by which a via point may be missed.
+        via: Via points: a table in degrees, one row per point, first the start; or a plan file
+            (*.toml, *.json).
+        random: Number of random via points, in place of --via.
+        seed: Seed of the random via points.
+        speed: Percent of the joint speed limits.
+        acceleration: Percent of the joint acceleration limits.
+        fly: Fly in percent (FLY_NORM); 0 stops at each point.
+        fly_distance: Largest distance to a via point in joint space, degrees; in place of --fly.
         output: Write a plan file (*.toml, *.json).
         csv: Write a table of time, position, velocity, acceleration.
-        rate: Rows a second of that table; those of the cell's cycle if left out.
-        picture: Draw the plan (*.png, *.svg, *.pdf).
+        rate: Rows per second of that table. Default: one per cycle of the cell.
+        picture: Plot the plan (*.png, *.svg, *.pdf).
     """
     if output is not None and output.suffix.lower() not in PLAN_FILES:
-        problem, remedy = f"{output.suffix!r} is no plan file", f"use {' or '.join(PLAN_FILES)}"
+        problem, remedy = f"{output.suffix!r} is not a plan file", f"use {' or '.join(PLAN_FILES)}"
         raise InputError(output, problem, field="--output", remedy=remedy)
     if picture is not None:
         check_format(picture)
     if rate is not None and not (isfinite(rate) and rate > 0.0):
-        raise InputError(
-            None, f"{rate} rows a second make no table", field="--rate", remedy="give more than 0"
-        )
+        raise InputError(None, f"{rate} rows per second", field="--rate", remedy="give more than 0")
     exactly_one(via=via, random=random)
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
@@ -204,8 +200,8 @@ def plan(
     if rate is None:
         rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
     if csv is not None and planned.duration * rate > _MOST_ROWS:
-        problem = f"{rate:g} rows a second of {planned.duration:.3f} s are too many for a table"
-        remedy = f"give a lower rate; at most {_MOST_ROWS} rows are written"
+        problem = f"{rate:g} rows per second for {planned.duration:.3f} s exceed {_MOST_ROWS} rows"
+        remedy = "give a lower rate"
         raise InputError(None, problem, field="--rate", remedy=remedy)
     if json:
         print_json(_summary(planned, loaded, frame))
@@ -264,16 +260,16 @@ def _table(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> str:
     ratio, quantity, joint = _worst(plan)
     lines += [
         f"{plan.duration:.3f} s; {plan.duration_with_stops:.3f} s with a stop at every target; "
-        f"{plan.reduced_corners} corners rounded less than asked, "
+        f"{plan.reduced_corners} corners rounded less than requested, "
         f"{plan.stopped_corners} not at all",
-        f"nearest to its limit: {quantity} of {cell.joint_names[joint]}, {ratio:.6f} of it "
-        f"({frame.name} angles; floor, walls, currents and the arm itself were not checked)",
+        f"closest to its limit: {quantity} of {cell.joint_names[joint]}, {ratio:.6f} of it "
+        f"({frame.name} angles; floor, walls, currents and self-collision were not checked)",
     ]
     return "\n".join(lines)
 
 
 def _worst(plan: MotionPlan) -> tuple[float, str, int]:
-    """Return the largest share of a limit of rate that is used, of which quantity and joint."""
+    """Return the largest fraction of a rate limit, its quantity and its joint."""
     extrema = plan.trajectory.extrema()
     ratios = np.array([getattr(extrema, q) / getattr(plan.limits, q) for q in _RATES])
     quantity, joint = divmod(int(np.argmax(ratios)), ratios.shape[1])

@@ -1,4 +1,4 @@
-"""`hil plot`: what is in an archive, drawn."""
+"""`hil plot`: plot an archive."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ def plot(
     joint: list[str] | None = None,
     json: JsonOption = False,
 ) -> None:
-    """Draw what is in an archive: position, speed, current, torque, following error, events.
+    """Plot an archive: position, velocity, current, torque, following error, events.
 
-    Works on archives of hil and on imported ones, as far as they have these. Of a long archive the
-    lowest and highest sample of each short stretch are drawn, so that no peak is lost; --start and
-    --stop show a part of it as closely as you like, and a page (*.html) is zoomed into with the
-    mouse, two fingers or the keys + - 0. Seconds count from the first sample.
+    Imported archives are plotted as far as they contain these. Long archives are reduced to minimum
+    and maximum per interval, so that peaks remain; --start and --stop select a part. A page
+    (*.html) can be zoomed with mouse, touch or the keys + - 0. Time is counted from the first
+    sample.
 
     **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.html`
 
     Options:
         archive: The archive (*.mcap).
-        output: The picture (*.png, *.svg, *.pdf) or page (*.html); ARCHIVE's name with .png in this
-            folder if left out.
-        start: From this second of the recording on.
-        stop: Up to this second of it.
-        joint: Only this joint, by name or number from 1; may be repeated.
+        output: The picture (*.png, *.svg, *.pdf) or page (*.html). Default: the name of the archive
+            with .png, in the working directory.
+        start: Start of the plotted part, s.
+        stop: End of the plotted part, s.
+        joint: Plot this joint only, by name or number from 1 (repeatable).
     """
     if archive.is_dir():
         raise InputError(
@@ -52,7 +52,7 @@ def plot(
     if kind not in (PAGE, *FORMATS):
         known = ", ".join((*FORMATS, PAGE))
         raise InputError(
-            target, f"{target.suffix!r} is no format for pictures", remedy=f"use {known}"
+            target, f"{target.suffix!r} is not a picture format", remedy=f"use {known}"
         )
     view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
     make_folder(target.parent)

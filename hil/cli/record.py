@@ -1,4 +1,4 @@
-"""`hil record`: the controller's own program moves the arm, and every cycle is archived."""
+"""`hil record`: record a motion of the controller's own program."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hil.recording import record as record_motion
 from hil.terminal_text import printable
 
 LINE_PERIOD = 5.0
-"""s between two lines where there is no terminal."""
+"""Time between two lines without a terminal, s."""
 
 
 def record(
@@ -39,32 +39,31 @@ def record(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Record while the controller's own program moves the arm. Nothing is commanded from here.
+    """Record while the controller's own program moves the arm. This PC commands nothing.
 
-    The safest first day with a robot: every packet is answered with what the controller sent, so
-    the arm does what its own program says, and each cycle is archived. `hil identify` reads the
-    archives like those of a campaign: record motions that reach far and fast in every joint, some
-    of them with --kind validation, and a few seconds at rest with --kind standstill.
+    Each reply repeats the set-point that the controller sent, so the arm follows its own program
+    and every cycle is archived. It is the safest first test with a robot. `hil identify` reads the
+    archives like those of a campaign: record fast motions over the whole range of every joint, some
+    with --kind validation, and a few seconds at rest with --kind standstill.
 
     **Example:** `hil record cell.toml -o archives --duration 60`, then `hil identify archives/*`.
 
-    Start it before the controller's program, so that the session's beginning is in the file.
-    When the recording ends, answers go on until the arm has stood still for a second, the drive is
-    off or the session has ended; Ctrl-C (a second one, where the first ended the recording) leaves
-    at once.
+    Start it before the controller's program, so that the archive contains the start of the session.
+    After the recording, replies continue until the arm has been at rest for a second, the drive is
+    off or the session has ended. Ctrl-C ends the recording; a second one exits at once.
 
-    Exit status 0 when the recording is complete, 4 when the link or the controller failed, a packet
-    was refused (the line that begins with REFUSED says why), the controller did not come within
-    --wait or ended before --duration was over, 130 when Ctrl-C cut short what --duration asked for,
-    or the wait for the controller.
+    Exit status: 0 complete; 4 the link or the controller failed, a packet was refused (see the line
+    REFUSED), no controller came within --wait, or the session ended before --duration; 130 Ctrl-C
+    ended the recording before --duration, or the wait for the controller.
 
     Options:
         cell: The cell file.
-        output: The archive (*.mcap), or a folder to number it in.
-        duration: Seconds to record; until Ctrl-C if left out.
-        wait: Seconds to wait for the controller; for ever if left out.
-        kind: What it is for: to be fitted, to be predicted, or for the noise.
-        live: Let Foxglove look meanwhile, e.g. 127.0.0.1:8765.
+        output: The archive (*.mcap), or a folder for numbered archives.
+        duration: Time to record, s. Default: until Ctrl-C.
+        wait: Time to wait for the controller, s. Default: unlimited.
+        kind: Use of the recording: excitation is fitted, validation predicted, standstill gives the
+            noise.
+        live: Stream to Foxglove at this address, such as 127.0.0.1:8765.
     """
     loaded = Cell.load(cell)
     path = archive_path(output, kind)
@@ -76,7 +75,7 @@ def record(
         View(loaded, stop, quiet=quiet or json) as view,
     ):
         link.connection.say = view.warn
-        view.say(f"waiting for the controller; recording to {path}. Ctrl-C ends it")
+        view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
             view.say(link.live.invitation)
         for note in link.notes():
@@ -96,15 +95,15 @@ def record(
 
 
 def _early_end(path: Path, done: Recorded, duration: float | None) -> HilError | None:
-    """What to say of a recording that is not what was asked for."""
+    """Return the error of a recording that ended early."""
     if done.outcome == "completed" and (duration is None or done.seconds >= duration):
         return None
     if done.outcome == "completed":
         reached = f"after {done.seconds:.1f} s of {duration:g} s"
-        return ControllerFault(f"{done.reason} {reached}; {path} is whole.")
+        return ControllerFault(f"{done.reason} {reached}; {path} is complete.")
     if done.outcome == "stopped" and done.reason == "ended by the operator":
-        return OperatorStopError(f"the recording was ended early; {path} is whole.")
-    return ControllerFault(f"{done.reason}; {path} is whole up to there.")
+        return OperatorStopError(f"the recording was ended early; {path} is complete.")
+    return ControllerFault(f"{done.reason}; {path} is complete up to there.")
 
 
 def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
@@ -127,13 +126,13 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     lost = "".join(f", {count} {what} LOST" for what, count in losses.items() if count)
     say(
         f"{path}: {done.records * cell.period:.1f} s in {done.records} cycles, {done.missed} "
-        f"packets missed, {done.late} answers late, {done.not_accepted} not accepted{lost}; "
+        f"packets missed, {done.late} replies late, {done.not_accepted} not accepted{lost}; "
         f"{done.outcome}: {done.reason}"
     )
 
 
 class View:
-    """A live line on a terminal, a line now and then elsewhere; a context manager."""
+    """Progress of a recording: a status line on a terminal, else a line every 5 s."""
 
     def __init__(self, cell: Cell, stop: Stop, *, quiet: bool) -> None:
         self._cell, self._stop, self._quiet = cell, stop, quiet
@@ -152,22 +151,22 @@ class View:
             self._status.stop()
 
     def say(self, text: str) -> None:
-        """A line that stays."""
+        """Print a line unless quiet."""
         if not self._quiet:
             typer.echo(printable(text))
             sys.stdout.flush()
 
     def warn(self, text: str) -> None:
-        """A line that is said in any case."""
+        """Print a line to stderr, also when quiet."""
         say(text, err=True)
 
     def show(self, progress: Progress) -> None:
-        """The state of the recording."""
+        """Update the display."""
         if progress.over != self._over:
             self._over = progress.over
-            # Said in any case: who ends the program now may take the answers from a moving arm.
+            # Also when quiet: the arm still moves, and needs replies.
             say(
-                f"{progress.over}; still answering until the arm rests (Ctrl-C to leave at once)",
+                f"{progress.over}; replying until the arm is at rest (Ctrl-C to exit at once)",
                 err=self._quiet,
             )
         line = self._line(progress)
@@ -181,10 +180,10 @@ class View:
         if not progress.heard:
             table = self._cell.controller
             who = table.host if table.transport == "udp" else "the controller"
-            what = f"nothing heard from {who}"
+            what = f"no packet from {who}"
             if progress.not_understood:
                 what = f"{who}: {progress.not_understood}"
-            return f"{what} ({progress.foreign} packets from elsewhere)"
+            return f"{what} ({progress.foreign} packets from other addresses)"
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",

@@ -1,4 +1,4 @@
-"""`hil rehearse`: exactly this plan on the simulated twin of the cell."""
+"""`hil rehearse`: run the plan on a simulated copy of the cell."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import typer
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.cli.verdict import NOT_GOOD
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-
-from .verdict import NOT_GOOD
 
 
 def rehearse(
@@ -22,21 +21,20 @@ def rehearse(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Run exactly the plan of CAMPAIGN on a simulated arm, and judge it. Nothing moves.
+    """Run the plan of CAMPAIGN on a simulated arm and judge the result. Nothing moves.
 
-    The arm is like the cell's, but its masses, inertias, rotors and friction lie up to 10 % from
-    the nominal figures, its currents are noisy, and its link loses a packet now and then. The
-    plan passes if what was planted is found again, unseen motion is predicted down to the noise,
-    no motion is refused and no motor comes near its limit; then everything is run once more with
-    ripple, drift, elasticity and delay. `hil run` demands a rehearsal of exactly this cell, URDF
-    and plan. It takes one or two minutes; Ctrl-C stops it, and the same command goes on.
+    Masses, inertias, rotor inertias and friction of the simulated arm differ by up to 10 % from the
+    nominal ones, its currents are noisy, and its link loses a packet now and then. The rehearsal
+    passes if the estimate contains the simulated parameters, held-out motion is predicted down to
+    the noise, no motion is refused and no motor comes near its limit. Everything is then run again
+    with ripple, drift, elasticity and delay. `hil run` requires a rehearsal of the same cell, URDF
+    and plan. It takes one to two minutes; after Ctrl-C the same command resumes.
 
-    Exit status 0 if it passed, 5 if not.
+    Exit status: 0 passed, 5 failed.
 
     Options:
-        seed: Of what is planted in the simulated arm, its noise and its link's faults; 1 if left
-            out.
-        again: Rehearse once more, even if it passed.
+        seed: Seed of the parameters, noise and link faults of the simulation. Default: 1.
+        again: Rehearse again even if it passed.
     """
     reporter = make_reporter(quiet=quiet or json)
     with stop_on_interrupt() as stop:
@@ -55,4 +53,4 @@ def rehearse(
 
 def _lines(found: Rehearsal) -> list[str]:
     criteria = [f"{'ok' if one.passed else 'FAILED'}: {one.sentence}" for one in found.criteria]
-    return [*criteria, *(f"not seen here: {sentence}" for sentence in found.not_seen)]
+    return [*criteria, *(f"not covered: {sentence}" for sentence in found.not_seen)]

@@ -1,4 +1,4 @@
-"""`hil reidentify`: from any number of archives to parameters by arm, campaign and repetition."""
+"""`hil reidentify`: estimate parameters by arm, campaign and repetition."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
 
 SOME_BROKEN: Final = 5
-"""Exit status: done, but some archives could not be used."""
+"""Exit status if some archives could not be used."""
 
 _MOST_LINES: Final = 20
 _WIDTH: Final = 42
@@ -45,23 +45,23 @@ def reidentify(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Identify every arm from all archives below some folders, campaign by campaign.
+    """Identify every arm from all archives below given folders, campaign by campaign.
 
-    What an archive contributes is cached, so that a second run, by another estimator or with more
-    archives, reads only what is new. Ctrl-C loses nothing of the cache.
+    The factor of each archive is cached, so another run with other estimators or more archives
+    reads only new ones. The cache survives Ctrl-C.
 
-    Exit status: 0 every archive that is meant to be fitted was used, 5 some could not be (they are
-    reported with the reason), 2 there is nothing to fit. What is not meant to be fitted, such as
-    moves, motions that were stopped, and copies, is left alone, and summed up by reason.
+    Exit status: 0 all archives to be fitted were used, 5 some could not be (each is reported with
+    its reason), 2 there is nothing to fit. Archives that are not for fitting, such as moves,
+    stopped motions and copies, are skipped and counted by reason.
 
     Options:
-        places: Folders with archives anywhere below, archives, or URLs of either.
-        output: Folder for the tables (CSV, Parquet) and the trend report; none if left out.
-        estimator: One of those that need no sample: see `hil identify --estimator`.
-        workers: Processes; one for each core if left out.
-        cache: Where factors are cached. If left out: .hil-cache beside the archives, or below the
-            user's cache folder where those cannot be written to.
-        dask: Scheduler of a Dask cluster that does the work, such as tcp://host:8786.
+        places: Folders with archives at any depth, archives, or URLs of either.
+        output: Folder for the tables (CSV, Parquet) and the trend report. Default: none.
+        estimator: Estimator that needs no samples: see `hil identify --estimator`.
+        workers: Number of processes. Default: one per core.
+        cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
+            the user's cache folder if those are read-only.
+        dask: Address of a Dask scheduler that does the work, such as tcp://host:8786.
     """
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
@@ -94,8 +94,8 @@ def reidentify(
         typer.echo(
             f"{plural(len(result.repetitions), 'repetition')} in "
             f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
-            f"{plural(result.read, 'archive')} read, {result.cached} known, "
-            f"{len(result.skipped)} left alone, {len(result.broken)} broken"
+            f"{plural(result.read, 'archive')} read, {result.cached} cached, "
+            f"{len(result.skipped)} skipped, {len(result.broken)} failed"
         )
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
@@ -116,7 +116,7 @@ def _workers(address: str | None, count: int | None, places: Sequence[str]) -> W
 
 
 def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
-    """Each arm: its campaigns, what changed, and what to know of the numbers."""
+    """Format each arm: its campaigns, changes and warnings."""
     by_name = {one.name: one for one in found.arms}
     above = _above([one.campaign for one in result.campaigns])
     if above:
@@ -136,7 +136,7 @@ def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
 
 
 def alarm_lines(found: Trends) -> Iterator[str]:
-    """Only what is to be looked into."""
+    """Format the alarms only."""
     for arm in found.arms:
         for finding in findings(arm):
             if finding.level == "alarm":
@@ -144,7 +144,7 @@ def alarm_lines(found: Trends) -> Iterator[str]:
 
 
 def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[str]:
-    """A table of the last ones, with the payload and delay that they state where these differ."""
+    """Format a table of the last campaigns, with stated payload and delay if these differ."""
 
     def row(name: str, when: str, repetitions: object, fitted: str, unseen: str) -> str:
         short = name if len(name) <= _WIDTH - 2 else "…" + name[3 - _WIDTH :]
@@ -154,7 +154,7 @@ def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[
         return "-" if math.isnan(error) else f"{error:.1%}"
 
     if campaigns:
-        yield row("campaign", "recorded", "repetitions", "torque error", "on unseen motion")
+        yield row("campaign", "recorded", "repetitions", "torque error", "held out")
     if (more := len(campaigns) - _MOST_LINES) > 0:
         yield f"  … {more} more: see --output and --json"
     stated = None
@@ -172,14 +172,14 @@ def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[
 
 
 def _above(folders: Sequence[str]) -> str:
-    """The folder that all of them are in, with its slash; "" if there is none or only one."""
+    """Return the common parent with its slash; "" if there is none or only one folder."""
     parts = zip(*(folder.split("/")[:-1] for folder in folders), strict=False)
     shared = [same[0] for same in takewhile(lambda same: len(set(same)) == 1, parts)]
     return "/".join([*shared, ""]) if shared and len(set(folders)) > 1 else ""
 
 
 def unused_lines(broken: Sequence[Unused]) -> Iterator[str]:
-    """The first of what could not be used, and why."""
+    """Format the first archives that could not be used."""
     for one in broken[:_MOST_LINES]:
         yield f"{one.path} could not be used: {one.reason}"
     if (more := len(broken) - _MOST_LINES) > 0:
@@ -187,7 +187,7 @@ def unused_lines(broken: Sequence[Unused]) -> Iterator[str]:
 
 
 def skipped_line(skipped: Sequence[Unused]) -> str:
-    """How many archives were left alone, by reason without the archive or number it names."""
+    """Count the skipped archives by reason."""
     counts: Counter[str] = Counter()
     for one in skipped:
         short = re.sub(r"^is an? (?=\w+$)", "", one.reason)
@@ -197,11 +197,11 @@ def skipped_line(skipped: Sequence[Unused]) -> str:
         f"{count}: {reason}" if " " in reason else plural(count, reason)
         for reason, count in counts.most_common()
     )
-    return f"left alone, as not meant to be fitted: {reasons}"
+    return f"skipped, not for fitting: {reasons}"
 
 
 def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:
-    """The same for a program; campaigns by folder, and by what is stated where one has several."""
+    """Return the content of `--json`; campaigns by folder, and by setup if one has several."""
     trends = {one.name: _trend(one) for one in found.arms}
     folders = Counter((one.arm, one.campaign) for one in result.campaigns)
     return {

@@ -1,4 +1,4 @@
-"""`hil replay`: held-out motions simulated forwards under the recorded torques."""
+"""`hil replay`: simulate held-out motions under their recorded torques."""
 
 from __future__ import annotations
 
@@ -36,21 +36,22 @@ def replay(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Simulate held-out motions under their recorded torques: how far models go astray.
+    """Simulate held-out motions forward under their recorded torques.
 
-    A light feedback of 1 Hz, the same for every model, keeps errors from adding up. Position errors
-    over time of the identified and of the nominal arm go into a figure, with the spread of an
-    ensemble; their root mean squares are printed. A joint that drifts by more than the parameters
-    are uncertain is named, with the torque that the model leaves out. The figure goes into the
-    report of a campaign that was identified alike. Exit status 5 if the model is not good.
+    Reports the position errors of the models. The same weak feedback of 1 Hz keeps the errors of
+    all models bounded. Position errors over time of the identified and the nominal arm are plotted
+    with the spread of an ensemble, and their RMS is printed. Joints that drift by more than the
+    parameter uncertainty are named, with the torque that the model lacks. The figure is added to
+    the report of a campaign identified with the same options. Exit status 5 if the model is not
+    good.
 
     **Example:** `hil replay runs/demo`
 
     Options:
-        output: The figure (*.png, *.svg, *.pdf); if left out replay.png, in the campaign folder or
-            here.
-        ensemble: Number of variants, as far apart as the parameters are uncertain, that are
-            simulated as well; 0 for none.
+        output: The figure (*.png, *.svg, *.pdf). Default: replay.png in the campaign folder or the
+            working directory.
+        ensemble: Number of variants to simulate, sampled from the uncertainty of the parameters; 0
+            for none.
     """
     reporter = make_reporter(quiet=quiet or json)
     folder = archives[0] if archives[0].is_dir() else Path()

@@ -1,4 +1,4 @@
-"""`hil report`: the report of a campaign, made anew."""
+"""`hil report`: regenerate the report of a campaign."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def report(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Make the report of CAMPAIGN anew and print where it is.
+    """Regenerate the report of CAMPAIGN and print its path.
 
-    From the results that are there, without estimating anything; where archives have come since,
-    or nothing was identified yet, as `hil identify` does it.
+    Uses the existing results without a new estimate. If archives were added since, or there are no
+    results yet, identifies first as `hil identify` does.
 
     Options:
-        csv: Folder for every table of the results as CSV.
+        csv: Folder for all tables of the results as CSV.
     """
     opened = Campaign.open(campaign)
     page = opened.report(reporter=make_reporter(quiet=quiet or json))

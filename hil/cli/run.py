@@ -1,4 +1,4 @@
-"""`hil run`: a campaign on its controller, then identification and report."""
+"""`hil run`: run a campaign on its controller, identify and report."""
 
 from __future__ import annotations
 
@@ -37,42 +37,42 @@ def run(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Run what is missing of a campaign on its controller, then identify and report.
+    """Run the missing motions of a campaign on its controller, then identify and report.
 
-    In this order: the plan's rehearsal must have been passed (`hil rehearse`); every motion is
-    run once at 20 % of its speed and a person accepts what he saw; the excitation is repeated
-    until friction hardly changes any more; then standstill, repetitions, validation motions, and
-    back to where the arm was. A repetition that fails its quality check is archived with the
-    reason and run again. Ctrl-C brings the arm to rest on its path; the same command goes on.
+    The order is: rehearsal (must have passed, see `hil rehearse`); dry run of every motion at 20 %
+    of its speed, which the operator accepts; warm-up until friction hardly changes; standstill,
+    repetitions, validation motions, and return to the initial posture. A repetition that fails the
+    quality check is archived with the reason and run again. Ctrl-C stops the arm on its path; the
+    same command resumes.
 
-    With --payload only the excitation is run, without and with a payload in turns, as pairs; after
-    each pair it says how narrow the intervals are, and prints at the end what `hil payload` does.
+    With --payload only the excitation is run, in pairs without and with a payload; after each pair
+    the intervals are printed, and at the end the result as by `hil payload`.
 
-    **Without a terminal:** `hil run C --dry-run`, somebody looks, then
-    `hil run C --accept-dry-run --json`.
+    **Without a terminal:** `hil run C --dry-run`, an operator watches, then `hil run C
+    --accept-dry-run --json`.
 
-    Exit status 0 when the model is good (with --dry-run or --no-identify: when all was run), 3
-    when a gate refuses, 4 when the controller, the link or the guard ended a motion, 5 when the
-    model is not good or a motion was of no use again and again, 130 when it was stopped.
+    Exit status: 0 the model is good (with --dry-run or --no-identify: all motions were run), 3 a
+    gate refused, 4 controller, link or guard ended a motion, 5 the model is not good or a motion
+    failed its quality check repeatedly, 130 stopped.
 
     Options:
-        rehearse: Rehearse the plan first, where that was not passed yet.
-        dry_run: Only the dry run: every motion at 20 % of its speed.
-        accept_dry_run: I watched the dry run and the motions are free. On a simulated controller it
-            need not have been done before.
-        accept_torque: With --accept-dry-run: I know why the torque of this joint ran against the
-            model's gravity in the dry run that was done before. Repeat it.
-        no_identify: Only run; no parameters, no report.
-        payload: Weigh a payload: run the excitation without and with it in turns, asking for it to
-            be mounted and removed, until another pair is not worth it. The recordings lie in the
-            folder payload/NAME of CAMPAIGN.
-        live: Let Foxglove look at the run as it goes on; on 127.0.0.1 unless a HOST is named.
+        rehearse: Rehearse the plan first, if it has not passed yet.
+        dry_run: Run only the dry run: every motion at 20 % of its speed.
+        accept_dry_run: Confirm that the dry run was watched and its motions are clear. On a
+            simulated controller no earlier dry run is needed.
+        accept_torque: With --accept-dry-run: confirm that the torque of this joint had a known
+            reason to oppose the modelled gravity in the dry run (repeatable).
+        no_identify: Only run; no parameters and no report.
+        payload: Identify a payload: run the excitation without and with it alternately, ask for
+            mounting and removal, and stop when another pair would not narrow the intervals. The
+            recordings are in the folder payload/NAME of CAMPAIGN.
+        live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
     if dry_run and accept_dry_run:
-        remedy = "run the one, look at the arm, then the other"
+        remedy = "run --dry-run first, watch the arm, then --accept-dry-run"
         raise InputError(None, "--dry-run and --accept-dry-run together", remedy=remedy)
     if payload is not None and (dry_run or no_identify):
-        problem = "does its own dry runs, and weighs what it records"
+        problem = "includes dry run and identification"
         remedy = "leave out --dry-run and --no-identify"
         raise InputError(None, problem, field="--payload", remedy=remedy)
     opened = Campaign.open(campaign)
@@ -89,7 +89,7 @@ def run(
         return
     result = _run(opened, choices, quiet=quiet or json, live=live)
     if dry_run or no_identify:
-        _tell(result, json=json)
+        _print(result, json=json)
         return
     _identify(opened, result, quiet=quiet, json=json)
 
@@ -98,11 +98,11 @@ def _weigh(
     campaign: Campaign, name: str, choices: Mapping[str, Any], live: str | None, quiet: bool,
     json: bool,
 ) -> None:  # fmt: skip
-    """Record pairs and weigh; a simulated arm mounts by itself."""
+    """Record pairs and identify the payload; a simulated arm mounts it without asking."""
     silent = quiet or json
     simulated = campaign.cell.controller.transport == "simulated"
     if not simulated and (silent or not can_read(sys.stdin)):
-        problem = "needs somebody at a terminal who mounts the payload"
+        problem = "needs an operator at a terminal to mount the payload"
         remedy = "record both by `hil run` or `hil record`: `hil payload BARE --loaded LOADED`"
         raise InputError(None, problem, field="--payload", remedy=remedy)
 
@@ -145,13 +145,13 @@ def _run(
             )
         except (ControllerFault, OSError) as fault:
             if stop.requested:  # an OSError: of a terminal that was closed
-                again = f"Go on with `hil run {campaign.folder.root}`."
+                again = f"Resume with `hil run {campaign.folder.root}`."
                 raise OperatorStopError(f"{fault} {again}") from fault
             raise
 
 
 def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool) -> None:
-    """Identify from all that is whole, report, and end with the verdict."""
+    """Identify from all complete archives, report, and end with the verdict."""
     found = campaign.identify(reporter=make_reporter(quiet=quiet or json))
     if not json:
         finish(found.results, json=False, quiet=quiet)
@@ -162,8 +162,8 @@ def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool)
         raise typer.Exit(NOT_GOOD)
 
 
-def _tell(result: RunResult, *, json: bool) -> None:
-    """What was done, where nothing is identified."""
+def _print(result: RunResult, *, json: bool) -> None:
+    """Print what was run, without identification."""
     if json:
         print_json({**result.to_dict(), "verdict": None})
         return
@@ -183,4 +183,4 @@ def _tell(result: RunResult, *, json: bool) -> None:
         known = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         why = "you know why, and " if known else ""
         command = f"`hil run {result.campaign} --accept-dry-run{known}`"
-        say(f"if {why}the motions looked right, go on with {command}")
+        say(f"if {why}the motions looked right, continue with {command}")

@@ -1,4 +1,4 @@
-"""`hil simulate`: the controller's end of a real link, for somebody else's PC program."""
+"""`hil simulate`: simulate the controller on a real link to test a PC program."""
 
 from __future__ import annotations
 
@@ -45,16 +45,15 @@ WORDS: Final = {
 
 
 _REPEATED: Final = {Phase.CLOSED, Phase.OPENING, Phase.OPEN}
-"""Phases that an opening lost again and again goes through."""
+"""Phases that repeat when open mode is lost repeatedly."""
 
 
 class Status:
-    """One line for each change of phase and, on a terminal, one that is written over.
+    """Progress display: a line for each change of phase, on a terminal also a status line.
 
-    Where open mode is lost again and again, one line for the 2nd, 4th, 8th ... time. A line is
-    written only if the terminal or pipe can take it at once: a reader that has stopped reading
-    loses lines, the PC program loses nothing. `stretch` are the seconds by which a cycle may be
-    made longer to wait for its answer.
+    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. Lines that the
+    terminal or pipe cannot accept at once are dropped, so that the cycle is never delayed.
+    `stretch` is the largest extension of a cycle, s.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class Status:
         self._reason, self._cycles = "", -1
 
     def introduce(self, name: str) -> None:
-        """Say what this is, and what it is not."""
+        """Print cell, link and settings."""
         settings = self._settings
         self.say(
             f"{name}: a SIMULATED controller for {self._place}; nothing moves.\n"
@@ -78,11 +77,11 @@ class Status:
             f"mode: {settings.missed_replies}, process {os.getpid()}"
         )
         if self._stretch:
-            how = f"cycles are made longer by up to {self._stretch:g} s to wait for an answer"
-            self.say(f"{how}; no real controller does that")
+            how = f"cycles are extended by up to {self._stretch:g} s to wait for a reply"
+            self.say(f"{how}, unlike a real controller")
 
     def watch(self, controller: SimulatedController, tally: ServeCounts) -> None:
-        """Show what has changed since the last cycle."""
+        """Print changes since the last cycle."""
         if self._quiet:
             return
         if controller.phase is not self._phase or tally.cycles < self._cycles:
@@ -94,13 +93,13 @@ class Status:
             self._write("\r\x1b[K" + self._line(tally)[:WIDTH])
 
     def say(self, text: str) -> None:
-        """Write a line that stays."""
+        """Print a line."""
         if not self._quiet:
             self.clear()
             self._write(text + "\n")
 
     def clear(self) -> None:
-        """Take the line that is written over away."""
+        """Erase the status line."""
         if self._terminal:
             self._write("\r\x1b[K")
 
@@ -112,17 +111,17 @@ class Status:
             text += f": {reason}" if reason and reason != self._reason else ""
             self._reason = reason
         elif phase is Phase.CLOSED and lost.bit_count() == 1:
-            text = f"open mode was lost again, {lost} times in a row by now: {reason}"
+            text = f"open mode lost {lost} times in a row: {reason}"
         else:
             return
         self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
 
     def _line(self, tally: ServeCounts) -> str:
         if not tally.cycles:
-            return f"waiting for a PC program at {self._place} (asked {tally.knocks} times)"
+            return f"waiting for a PC program at {self._place} ({tally.knocks} packets sent)"
         return (
             f"{tally.cycles} cycles, {tally.replies} replies, {tally.missed} missed, "
-            f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} begun late by us"
+            f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} started late"
             + (f", {tally.stretched} stretched" if self._stretch else "")
         )
 
@@ -132,15 +131,15 @@ class Status:
         try:
             os.write(self._out, text.encode())
         except OSError:
-            self._quiet = True  # nobody reads any more
+            self._quiet = True  # the reader has closed the pipe
 
 
 OWN_MOVE: Final = 30.0
-"""Seconds that the longest move of the controller's own may take to end."""
+"""Longest time for a motion of the controller's own program to end, s."""
 LOST_OPENINGS: Final = 20
-"""Openings in a row that may be lost to missing replies; then the session ends."""
+"""Consecutive losses of open mode by missing replies after which the session ends."""
 REOPENING: Final = 1.0
-"""Seconds at least until the axes open again after such a loss."""
+"""Shortest time before the axes open again after such a loss, s."""
 
 
 def simulate(
@@ -165,49 +164,49 @@ def simulate(
     priority: Annotated[int | None, typer.Option(min=1, max=99)] = None,
     json: JsonOption = False,
 ) -> None:
-    """Be the controller: a simulated C4G with its arm, for a PC program on a real network or bus.
+    """Simulate a C4G controller with its arm for a PC program on a real network or bus.
 
-    Nothing here is hardware and nothing moves. The PC program under test runs elsewhere, listens,
-    and must do what the real controller asks of it:
+    No hardware is involved and nothing moves. The PC program under test runs elsewhere, listens,
+    and must behave as with the real controller:
 
-    - answer every packet within its cycle, with the number received plus one (after 32767: 1);
+    - reply to every packet within its cycle, with the received number plus one (after 32767: 1);
     - echo the start: nine sync packets, the init packet (number 10, 1200 bytes), two more syncs;
-    - answer modes 501 (driving on) and 0 (closed) with the mode received and no demand;
-    - once every axis reports the open mode and the status byte is 5 (drive on): start from the
-      target received and answer with the next one;
-    - ask for the end of open mode with status byte 1, then stay in step until 504.
+    - reply to modes 501 (driving on) and 0 (closed) with the received mode and no demand;
+    - when every axis reports the open mode and the status byte is 5 (drive on): start from the
+      received target and reply with the next one;
+    - request the end of open mode with status byte 1, then stay synchronous until 504.
 
-    Mode 505 in an answer asks for drive off, 508 reports a following error; targets in such a
-    packet are ignored. A drive that was lost stays off until somebody presses the button.
+    Mode 505 in a reply requests drive off, 508 reports a following error; targets in such a packet
+    are ignored. After a fault the drive stays off until its button is pressed.
 
     **Example**, two terminals: `hil simulate cell.toml --udp 127.0.0.1:2001 --intervals 1` and
     `your_program --listen 2001`.
 
-    The order does not matter: the first packet is repeated every second until it is answered.
-    Ctrl-C ends the session properly (a second one at once); `kill -USR1` presses drive-on,
-    `kill -USR2` the emergency stop. `docs/simulate.md` has more, faults included.
+    The order does not matter: the first packet is repeated every second until the reply. Ctrl-C
+    ends the session properly (a second one at once); `kill -USR1` presses drive-on, `kill -USR2`
+    the emergency stop. See `docs/simulate.md`, also for the faults.
 
     Options:
         cell: Cell file with a [simulation] table.
-        udp: Where the PC program listens.
-        can: A CAN bus instead, by its python-can names, e.g. socketcan:can0.
-        cycle: Cycle in ms; the cell's if left out.
-        mode: Open mode: 1, 2, 4, 5, 7, 8 or 9; the cell's if left out.
-        stagger: Cycles between one axis entering open mode and the next.
-        only_axis: Open this axis only; the others stay closed.
-        missed: Missing replies in a row that end open mode (real: unknown).
-        patience: Make a cycle longer by up to so many seconds until its answer comes. No real
-            controller does: for PCs that are held up now and then.
-        while_silent: What the arm does in a cycle of open mode that no reply came in.
-        warm_start: Begin with the init packet, as after 506.
-        intervals: Intervals of open mode until the session ends; endless if left out.
-        own_motion: In mode 0 the controller's own program moves the arm about, until it is stopped.
-        own_speed: Of that motion: fraction of full speed.
-        effects: Switch on what the identified model leaves out.
-        fault: Something that goes wrong; may be repeated.
+        udp: Address of the PC program.
+        can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
+        cycle: Cycle, ms. Default: that of the cell.
+        mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: that of the cell.
+        stagger: Cycles between two axes entering open mode.
+        only_axis: Open this axis only.
+        missed: Consecutive missing replies that end open mode (unknown for a real controller).
+        patience: Largest extension of a cycle to wait for its reply, s. A real controller does not
+            wait.
+        while_silent: Motion of the arm in a cycle of open mode without a reply.
+        warm_start: Start with the init packet, as after 506.
+        intervals: Number of intervals of open mode before the session ends. Default: unlimited.
+        own_motion: In mode 0 the controller's own program moves the arm.
+        own_speed: Speed of that motion, as a fraction of full speed.
+        effects: Simulate effects that the identified model does not contain.
+        fault: Fault to inject (repeatable).
         seed: Seed of noise and model errors.
-        duration: Seconds after which the session is ended.
-        priority: Real-time priority (SCHED_FIFO) to ask the system for.
+        duration: Time after which the session is ended, s.
+        priority: Real-time priority (SCHED_FIFO) to request.
     """
     loaded = Cell.load(cell)
     if only_axis is not None:
@@ -245,7 +244,7 @@ def simulate(
                 far_end,
                 pressed,
                 faults=FaultyLink(on_link, settings.period) if on_link else None,
-                # Its own program stops at the next posture only.
+                # The controller's own program stops at the next posture only.
                 patience=OWN_MOVE if own_motion else PATIENCE,
                 stretch=patience,
                 watch=status.watch,
@@ -266,14 +265,14 @@ def simulate(
 def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     postures = own_postures(cell)
     if not postures:
-        problem = "no posture about it can be reached clear of floor, walls and the arm itself"
-        remedy = "leave --own-motion out, or give the arm more room"
+        problem = "no posture nearby can be reached without collision"
+        remedy = "omit --own-motion, or enlarge the workspace"
         raise InputError(cell.path, problem, field="campaign.home_deg", remedy=remedy)
     return postures
 
 
 def _figures(served: Served) -> dict[str, object]:
-    """The summary for a script; times in µs."""
+    """Return the content of `--json`; times in µs."""
     summary = served.summary
     times = {"stretch_max_us": summary.stretch_max}
     for name, each in (("answer", summary.answer), ("cost", summary.cost)):
@@ -291,39 +290,39 @@ def _figures(served: Served) -> dict[str, object]:
 
 
 def _sentences(served: Served) -> list[str]:
-    """The summary for a person."""
+    """Format the summary."""
     summary, reason = served.summary, served.controller.reason
     if not summary.cycles:
-        return [f"no PC program answered; the first packet was sent {_times(summary.knocks)}"]
-    end = "the session has ended (504)" if summary.ended else "the session was given up"
+        return [f"no reply of a PC program; the first packet was sent {_times(summary.knocks)}"]
+    end = "the session has ended (504)" if summary.ended else "the session was aborted"
     counts = (
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from elsewhere"
+        f"{served.foreign} from other addresses"
     )
     if summary.stretched:
         counts += (
-            f"; {plural(summary.stretched, 'cycle')} stretched to wait for an answer, by up to "
-            f"{1e3 * summary.stretch_max:.1f} ms, as no real controller does"
+            f"; {plural(summary.stretched, 'cycle')} extended by up to "
+            f"{1e3 * summary.stretch_max:.1f} ms to wait for a reply, unlike a real controller"
         )
     return [
         f"{end}{': ' if reason else ''}{reason}; open mode was reached {_times(served.intervals)}",
         counts,
-        f"answers came after {_spread(summary.answer)}",
-        f"controller and arm took {_spread(summary.cost)} to compute a cycle; "
-        f"{summary.own_late} cycles began late by our own fault, {summary.slips} of them by a "
-        "whole cycle",
+        f"time to reply: {_spread(summary.answer)}",
+        f"time to simulate a cycle: {_spread(summary.cost)}; "
+        f"{summary.own_late} cycles started late by the simulation, {summary.slips} of them by a "
+        "full cycle",
     ]
 
 
 def _parts(times: Histogram) -> tuple[float, float, float]:
-    """Median, 99 % and longest [s]."""
+    """Return median, 99 % quantile and maximum, s."""
     return times.quantile(0.5), times.quantile(0.99), times.largest
 
 
 def _spread(times: Histogram) -> str:
     median, most, longest = (f"{1e6 * seconds:.0f} µs" for seconds in _parts(times))
-    return f"{median} (median), {most} (99 %), {longest} (longest)"
+    return f"{median} median, {most} 99 %, {longest} maximum"
 
 
 def _times(count: int) -> str:

@@ -1,4 +1,4 @@
-"""`hil status`: where a campaign stands, and what to type next."""
+"""`hil status`: show the progress of a campaign and the next command."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from hil.campaign.status import CampaignStatus
 from hil.cli.arguments import CampaignArgument, JsonOption, print_json
 from hil.terminal_text import printable
 
-_MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("waits", "dim")}
+_MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("blocked", "dim")}
 
 
 def status(
     campaign: CampaignArgument,
     json: JsonOption = False,
 ) -> None:
-    """Show which steps of CAMPAIGN are done, which is next, and what to type for it.
+    """Show which steps of CAMPAIGN are done, which is next, and its command.
 
-    Names archives that are torn, damaged or rejected. Changes nothing, and may be asked while the
+    Lists truncated, damaged and rejected archives. Changes nothing, and can be used while the
     campaign runs.
     """
     found = Campaign.open(campaign).status()
@@ -34,9 +34,9 @@ def status(
 
 
 def _last(found: CampaignStatus) -> str:
-    """What to type next."""
+    """Return the line with the next command."""
     if found.complete:
-        return "every step is done"
+        return "all steps are done"
     if found.next_command:
         return f"next: {found.next_command}"
     stuck = next(step for step in found.steps if step.state == "next")
@@ -47,7 +47,7 @@ def _table(found: CampaignStatus) -> Table:
     table = Table(title=Text(printable(found.root)), title_justify="left", box=None, pad_edge=False)
     table.add_column("step", no_wrap=True)
     table.add_column("", no_wrap=True)
-    table.add_column("what is known", overflow="fold")
+    table.add_column("detail", overflow="fold")
     for step in found.steps:
         word, style = _MARKS[step.state]
         table.add_row(step.name, Text(word, style=style), Text(printable(step.sentence)))

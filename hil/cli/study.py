@@ -1,4 +1,4 @@
-"""`hil study`: the paper's two methods, run and compared."""
+"""`hil study`: run and compare the two methods of the paper."""
 
 from __future__ import annotations
 
@@ -33,32 +33,32 @@ def study(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Reproduce the paper: A (sines) against B (via points), on the simulated COMAU NS 16.
+    """Reproduce the paper: method A (sines) against B (via points) on the simulated COMAU NS 16.
 
-    Both are designed, executed, and asked to predict motions they have never seen, of three
-    classes; then one thing after another is varied. Leaves `report.html` and `results.json` in
-    OUTPUT, with every archive they rest on. After Ctrl-C the same command resumes there.
+    Designs and runs both excitations, and predicts held-out motions of three classes; then repeats
+    this with one variation at a time. Writes `report.html`, `results.json` and all archives to
+    OUTPUT. After Ctrl-C the same command resumes.
 
     **Examples:**
 
-    - `hil study --quick --output runs/quick`: the whole way in minutes
-    - `hil study --output runs/study`: as the paper's, some 40 minutes on two free processors
+    - `hil study --quick --output runs/quick`: some minutes
+    - `hil study --output runs/study`: as in the paper, about 40 minutes on two processors
 
     Options:
-        output: Folder for the whole study.
-        quick: Short searches, few repetitions and motions: minutes.
-        cell: Cell file of another simulated arm than the paper's NS 16.
-        repetitions: Executions of each excitation; 30 if left out, 4 with --quick.
-        motions: Held-out motions of each class; 30 if left out, 10 with --quick.
-        seed: One seed, one study; 1 if left out.
-        effects: Run everything again with what the model leaves out: torque ripple, friction drift,
-            elasticity, delay.
-        workers: Processes; one for each processor if left out.
+        output: Folder for the study.
+        quick: Short searches, few repetitions and motions.
+        cell: Cell file of a simulated arm other than the NS 16.
+        repetitions: Repetitions of each excitation. Default: 30, with --quick 4.
+        motions: Held-out motions of each class. Default: 30, with --quick 10.
+        seed: Seed of the study; the result depends on nothing else. Default: 1.
+        effects: Repeat everything with effects that the model does not contain: torque ripple,
+            friction drift, elasticity, delay.
+        workers: Number of processes. Default: one per processor.
     """
     reporter = make_reporter(quiet=quiet or json)
     count = workers or len(os.sched_getaffinity(0))
     try:
-        with _ended_like_ctrl_c():
+        with _signals_as_ctrl_c():
             settings = study_settings(
                 quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
             )
@@ -66,15 +66,15 @@ def study(
             found = run_study(output, settings, reporter, workers=count, cell=arm)
     except KeyboardInterrupt:
         raise OperatorStopError(
-            f"stopped; what is complete stays in {output}: the same command resumes there"
+            f"stopped; the same command resumes the study in {output}"
         ) from None
     summary = summary_of(found)
     typer.echo(json_format.dumps(summary, indent=1) if json else summary["line"])
 
 
 @contextmanager
-def _ended_like_ctrl_c() -> Iterator[None]:
-    """A terminal that is closed, or `kill`, ends the study's own processes with it."""
+def _signals_as_ctrl_c() -> Iterator[None]:
+    """Handle SIGTERM and SIGHUP like Ctrl-C, so that worker processes end too."""
     in_main = threading.current_thread() is threading.main_thread()
     with ExitStack() as undo:
         for one in (signal.SIGTERM, signal.SIGHUP) if in_main else ():

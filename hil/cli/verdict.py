@@ -1,4 +1,4 @@
-"""How a command that identifies ends: a table, what was found, one line, and an exit status."""
+"""Output of commands that identify: a table, findings, the verdict and an exit status."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ NOT_GOOD = 5
 """Exit status of a command whose model is not good."""
 
 _MISSING: Final = "-"
-_LEVELS: Final = {"wrong": "WRONG", "doubtful": "note", "information": "info", "good": "ok"}
+_LEVELS: Final = {"wrong": "WRONG", "doubtful": "warning", "information": "info", "good": "ok"}
 
 
 def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
-    """Print what was found to stderr and the verdict last; exit 5 if the model is not good.
+    """Print table and findings to stderr, then the verdict; exit 5 if the model is not good.
 
-    With `json` verdict, findings and figures are one JSON object; with `quiet` only the verdict and
-    its warnings are printed.
+    With `json` print one JSON object; with `quiet` only the verdict and its warnings.
     """
     if json:
         typer.echo(as_json(results))
@@ -43,7 +42,7 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
 
 
 def as_json(results: Results) -> str:
-    """Verdict, what it rests on, and the figures per joint."""
+    """Return the verdict, its findings and the errors per joint as JSON."""
     fields = results.model_dump(mode="json")
     judgement = fields["judgement"] or {}
     found = fields["verdict"] | {
@@ -57,7 +56,7 @@ def as_json(results: Results) -> str:
 
 
 def table(results: Results) -> list[str]:
-    """One row per joint: error on unseen motion, and beside what."""
+    """Format one row per joint: errors on held-out motion, with references."""
     if results.judgement is None:
         return []
     joints, in_sample = results.judgement.joints, results.judgement.in_sample
@@ -67,7 +66,7 @@ def table(results: Results) -> list[str]:
         ("in-sample" if in_sample else "relative", lambda joint: _percent(joint.relative)),
         ("fitted", lambda joint: _MISSING if in_sample else _percent(joint.fitted_relative)),
         ("of limit", lambda joint: _percent(joint.share_of_limit)),
-        ("explains", lambda joint: _percent(joint.explained)),
+        ("R²", lambda joint: _percent(joint.explained)),
         ("nominal", lambda joint: _percent(joint.nominal_relative)),
         ("controller", lambda joint: _percent(joint.controller_relative)),
     ]
@@ -82,7 +81,7 @@ def table(results: Results) -> list[str]:
 
 
 def sentences(results: Results, *, quiet: bool = False) -> list[str]:
-    """What is wrong, doubtful and in order, and what to do next."""
+    """Format the findings, from good to wrong, and the next steps."""
     judgement = results.judgement
     if judgement is None or quiet:
         return [f"note: {warning}" for warning in results.verdict.warnings]
@@ -93,7 +92,6 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
         for finding in judgement.findings
         if finding.level == level
     ]
-    # What is known beforehand of the archives is no check of the model.
     lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in said]
     return lines + [f"next: {step}" for step in judgement.next_steps]
 

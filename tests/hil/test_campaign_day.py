@@ -91,7 +91,7 @@ def test_every_command_of_the_document_does_what_it_says(day: dict[str, str]) ->
     assert "next: hil rehearse runs/mine" in day["design cell.toml -o runs/mine"]
     assert "passed all" in day["rehearse runs/mine"]
     assert day["run runs/mine --accept-dry-run"].rstrip().splitlines()[-1].startswith("The model")
-    assert "every step is done" in day["status runs/mine"]
+    assert "all steps are done" in day["status runs/mine"]
     assert day["report runs/mine"].rstrip().endswith("report.html")
     found = json.loads(day["status runs/mine --json"])
     assert [(step["name"], step["state"]) for step in found["steps"]] == [

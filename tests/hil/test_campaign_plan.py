@@ -151,7 +151,7 @@ def test_a_design_that_cannot_be_read_is_named_before_anything_is_made(tmp_path:
 def test_a_campaign_has_one_excitation(tmp_path: Path, designs: dict[str, Path]) -> None:
     done = demo(tmp_path, "--resume", "--excitation", str(designs["b"]), "--quiet")
     assert done.returncode == 2
-    assert "has an excitation already" in done.stderr.replace("\n", " ")
+    assert "contradicts --resume" in done.stderr.replace("\n", " ")
     assert not list(tmp_path.iterdir())
 
 
@@ -354,8 +354,8 @@ def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
     ("constraints", "complete", "words"),
     [
         ({}, True, ()),
-        ({"collision": False}, True, ("the arm itself not looked at",)),
-        ({"current": False}, False, ("motor currents not looked at", "stopped before its end")),
+        ({"collision": False}, True, ("the arm itself not checked",)),
+        ({"current": False}, False, ("motor currents not checked", "interrupted")),
     ],
 )
 def test_what_a_design_was_searched_without_is_said(

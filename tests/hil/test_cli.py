@@ -44,7 +44,7 @@ def test_help_says_where_to_start() -> None:
         assert f" {command} " in done.stdout
         asked = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
         assert asked.exit_code == 0
-        assert len(COMMANDS.purpose(command)) > 20
+        assert len(COMMANDS.purpose(command)) > 10
 
 
 def leaves(command: Any) -> Iterator[Any]:
@@ -169,10 +169,10 @@ def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict
             ["import", "csv", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
             "m.toml",
         ),
-        (["identify", "x.mcap", "--torque-bandwidth", "wide"], "no bandwidth"),
+        (["identify", "x.mcap", "--torque-bandwidth", "wide"], "not a bandwidth"),
         (["identify", "x.mcap", "--output", str(CELL_PATH)], "cannot be made a folder"),
         (["identify", "x.mcap", "--delay", "nan"], "--delay"),
-        (["demo", "--output", str(CELL_PATH)], "no folder of its own"),
+        (["demo", "--output", str(CELL_PATH)], "is not a folder"),
     ],
 )
 def test_bad_input_gets_one_sentence_and_status_2(

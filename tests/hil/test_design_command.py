@@ -261,9 +261,9 @@ def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
     path = tmp_path / "bare.toml"
     path.write_text('method = "a"\n[search]\npopulation = 8\ngenerations = 1\n[sines]\nramp = 0\n')
     output = invoke(CELL_PATH, "--settings", path, "--kinematic", "-o", tmp_path / "o").output
-    assert "no controller can run it; give it a ramp" in output
+    assert "which no controller can run; set a ramp" in output
     unchecked = "floor, walls, the arm itself, motor currents, rest at both ends"
-    assert f"warning: not looked at: {unchecked}" in output
+    assert f"warning: not checked: {unchecked}" in output
 
 
 def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
@@ -277,7 +277,7 @@ def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
     lasts = r"the shortest motion tried lasts [\d.]+ s, where 0 to 0.5 s are asked for: allow more "
     assert re.search(lasts + r"time \(\[constraints\] max_duration\)", said)
     assert "search longer" not in said
-    assert "repeat the command with --force, or with --resume where cell and settings" in said
+    assert "repeat the command with --force, or with --resume if cell and settings" in said
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
@@ -298,7 +298,7 @@ def test_a_wall_that_home_touches_is_named_with_depth_before_anything_is_tried(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "for which cell"),
+        ([], "no cell file"),
         (
             [CELL_PATH, "--method", "b", "--settings", "SETTINGS"],
             "--method and --settings: exclude each other",
@@ -359,7 +359,7 @@ def test_what_was_not_looked_at_is_in_picture_json_and_stderr_however_quiet(invo
     seen = Seen()
     said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
     assert list(seen.drawn["unchecked"]) == unchecked
-    assert f"warning: not looked at: {', '.join(unchecked)}" in said.stderr
+    assert f"warning: not checked: {', '.join(unchecked)}" in said.stderr
     assert json.loads(bare[1])["unchecked"] == unchecked
     assert seen.drawn["margins"] == "" and not seen.drawn["together"]
 
@@ -434,7 +434,7 @@ def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(inv
     command = [sys.executable, "-m", "hil", "design", *arguments, "-o", str(out)]
     code, said = interrupted(command, out / "search.journal")
     assert code == 130, said
-    assert "go on with --resume" in said
+    assert "continue with --resume" in said
     half = DesignResult.load(out)
     assert not half.complete and 1 <= half.data["search"]["generations"] < 25
     assert invoke(CELL_PATH, "--resume", "-o", out).exit_code == 0

@@ -1178,7 +1178,7 @@ LOADED = "gains a.mcap --loaded b.mcap --mass 4"
 NONSENSE = {
     "gains a.mcap --delay nan": "--delay",
     "gains a.mcap --delay 20": "--delay",
-    "gains a.mcap --loaded a.mcap --mass 4": "with load and without",
+    "gains a.mcap --loaded a.mcap --mass 4": "listed twice",
     f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
     f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
     "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "is no term of",

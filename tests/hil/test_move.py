@@ -169,7 +169,7 @@ def test_a_real_controller_is_not_driven_unless_a_person_confirms(
         arguments = ["move", str(controller.cell_path), "--to", "home", "-o", str(tmp_path / "m")]
         result = CliRunner().invoke(app, arguments)
         assert isinstance(result.exception, UnsafeError)
-        assert "nobody is here to confirm" in str(result.exception)
+        assert "the path needs confirmation" in str(result.exception)
         result = CliRunner().invoke(app, [*arguments, "--yes", "--speed", "100"])
         assert isinstance(result.exception, UnsafeError)
         assert "faster than the cell's approach_speed" in str(result.exception)

@@ -257,9 +257,9 @@ def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
     [
         (["--fix", "elbow"], "has no moving joint elbow; it has hip, knee"),
         (["--fix", "hip=high"], "'hip=high' is no NAME=NUMBER"),
-        (["--from-controller", "a:b"], "is no HOST or HOST:PORT"),
-        (["--from-controller", "a:70000"], "is no HOST or HOST:PORT"),
-        (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is no HOST or HOST:PORT"),
+        (["--from-controller", "a:b"], "is not HOST or HOST:PORT"),
+        (["--from-controller", "a:70000"], "is not HOST or HOST:PORT"),
+        (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is not HOST or HOST:PORT"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_in_a_sentence(

@@ -285,7 +285,7 @@ class TestRun:
         ("words", "sentence"),
         [
             (("--payload", "../x"), "no name of a payload"),
-            (("--payload", "x", "--dry-run"), "does its own dry runs"),
+            (("--payload", "x", "--dry-run"), "includes dry run"),
         ],
     )
     def test_what_cannot_be_run_is_named(
@@ -304,7 +304,7 @@ class TestRun:
             cell.text.replace('transport = "simulated"', link), cell.urdf, cell.path
         )
         campaign = Campaign.create(tmp_path / "real", real, designed.plan)
-        with pytest.raises(InputError, match="needs somebody at a terminal"):
+        with pytest.raises(InputError, match="needs an operator at a terminal"):
             CliRunner().invoke(
                 app,
                 ["run", str(campaign.folder.root), "--payload", "gripper"],
@@ -402,7 +402,7 @@ def test_an_axis_parallel_to_gravity_is_named_and_gets_no_number(tmp_path: Path)
     ("arguments", "sentence"),
     [
         (("empty.mcap", "--loaded", "full.mcap"), "--mass: the payload needs a mass above 0"),
-        (("empty.mcap", "--mass", "4"), "which recording was made with it"),
+        (("empty.mcap", "--mass", "4"), "has no recording with this payload"),
         ((*("empty.mcap", *BOTH[:4]), "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
     ],
 )

@@ -248,7 +248,7 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
         running(*own_motion(path, port)) as controller,
         recorder_of(path, "--duration", "1.5", "--json") as recorder,
     ):
-        assert "recording complete; still answering" in recorder.stderr.readline()
+        assert "recording complete; replying until" in recorder.stderr.readline()
         assert open_archive(path.parent / "a.mcap").complete
         time.sleep(1.5)
         assert recorder.poll() is None, "it left a moving arm alone"
@@ -279,12 +279,12 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(on_udp: tuple[Pa
         wait_until_recorded(archive, recorder)
         recorder.send_signal(signal.SIGINT)
         assert recorder.stdout is not None
-        next(line for line in recorder.stdout if "still answering" in line)
+        next(line for line in recorder.stdout if "replying until" in line)
         recorder.send_signal(signal.SIGINT)
         said, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
     assert "ended by the operator" in said
-    assert "answers late" in said
+    assert "replies late" in said
     assert open_archive(archive).complete
 
 
@@ -352,8 +352,8 @@ def test_a_hanging_archive_process_is_ended_and_answers_go_on(on_udp: tuple[Path
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
         assert recorder.stdout is not None
-        told = next(line for line in recorder.stdout if "still answering" in line)
-        assert "sent no heartbeat for 5 s and was ended" in told
+        told = next(line for line in recorder.stdout if "replying until" in line)
+        assert "gave no sign of life for 5 s and was ended" in told
         controller.send_signal(signal.SIGTERM)
         counts, _ = controller.communicate(timeout=60)
         _, errors = recorder.communicate(timeout=60)
@@ -379,7 +379,7 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Pat
         record_command(CELL_PATH, output=path.parent / "a.mcap")
     with recorder_of(path) as recorder:
         assert "waiting for the controller" in recorder.stdout.readline()
-        assert "nothing heard from 127.0.0.1 (0 packets from elsewhere)" in until_heard(recorder)
+        assert "no packet from 127.0.0.1 (0 packets from other addresses)" in until_heard(recorder)
         recorder.send_signal(signal.SIGINT)
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 130

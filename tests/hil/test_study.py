@@ -636,4 +636,4 @@ class TestCommand:
         ended = CliRunner().invoke(app, ["study", "--quick", "-o", str(tmp_path)])
         assert isinstance(ended.exception, OperatorStopError)
         assert ended.exception.exit_code == 130
-        assert f"what is complete stays in {tmp_path}" in str(ended.exception)
+        assert f"the same command resumes the study in {tmp_path}" in str(ended.exception)
