@@ -1,4 +1,4 @@
-"""The HTML report of one identification: a single file that opens anywhere, offline."""
+"""HTML report of one identification: a single file for offline use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages on what changed from campaign to campaign: campaigns compared, and the trend of a batch."""
+"""Pages on changes between campaigns: comparison of campaigns, and trend of a batch."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _RULES: Final = {
 
 
 def comparison_page(found: Comparison) -> bytes:
-    """The page as one HTML file; the same input gives the same bytes."""
+    """Return the comparison as one HTML file; the same input gives the same bytes."""
     differ = [
         ", ".join(found.axes[j].joint for j in np.flatnonzero(own))
         for own in found.friction.changed.T
@@ -80,7 +80,7 @@ def comparison_page(found: Comparison) -> bytes:
 
 
 def trend_page(trends: Trends) -> bytes:
-    """The page as one HTML file; the same input gives the same bytes."""
+    """Return the trend report as one HTML file; the same input gives the same bytes."""
     names = [arm.name for arm in trends.arms]
     return _page(
         title=names[0] if len(names) == 1 else f"{len(names)} arms",
@@ -127,22 +127,22 @@ def _trend(arm: ArmTrend, key: str) -> dict[str, Any]:
 def _panel(
     panels: list[Panel], arm: ArmTrend, axis: AxisTrend, watched: Watched, key: str, what: str
 ) -> None:
-    """An axis over the campaigns: 95 % intervals, limits, drift; those that depart are squares."""
+    """Draw an axis over the campaigns: 95 % intervals, limits, drift; departures as squares."""
     values, half = watched.values, _INTERVAL * np.nan_to_num(watched.stds)
     known, judged = np.isfinite(values), np.isfinite(watched.limits[:, 0])
     if not known.any():
         return
-    # Days of matplotlib, or numbers of the campaigns.
-    first = parse_time(arm.campaigns[0].when) if arm.dated else None
+    # Matplotlib days, or campaign numbers.
+    first = instant(arm.campaigns[0].when) if arm.dated else None
     at = arm.time + (0.0 if first is None else first.timestamp() / _DAY)
     low, high = float((values - half)[known].min()), float((values + half)[known].max())
-    # Never a scale that makes a change of nothing look like much; limits far away may leave it.
+    # A scale that does not exaggerate small changes; distant limits may lie outside.
     room = max(0.2 * (high - low), 0.06 * float(np.median(np.abs(values[known]))), 1e-9)
     low, high = low - room, high + room
     note = f"{sum(watched.departs)} of {judged.sum()} outside" if judged.any() else ""
     ends = " to ".join(significant(float(one)) for one in values[known][[0, -1]])
     caption = Caption(
-        key, label(axis.joint), note or "too few to judge", f"{what}, {ends} {axis.unit}"
+        key, label(axis.joint), note or "too few for limits", f"{what}, {ends} {axis.unit}"
     )
     with panel(
         panels, 180.0, caption, f"[{axis.unit}]", left=50.0, right=12.0, bottom=32.0

@@ -1,8 +1,7 @@
-"""Drawings of the pages: from matplotlib to SVG that may stand inside a page, many times over.
+"""Drawings of the pages: matplotlib figures as SVG for inclusion in a page.
 
-matplotlib writes a document: sizes in points, its own fonts, fixed colours, names that repeat from
-figure to figure. Inside a page the size comes from the layout, the font from the page and the
-colours from the style sheet (light, dark, print), and every id must be the only one.
+The size of a drawing comes from the layout of the page, its font and colours from the style sheet
+(light, dark, print), and its ids are unique in the page.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Figures draw with stand-ins, colours that no one would draw with: each becomes a variable of the
-# style sheet when the figure enters the page, so that light, dark and print need one drawing.
+# Figures are drawn with placeholder colours, which become variables of the style sheet.
 CSS_VARIABLES: Final = {
     f"#0102{k:02x}": f"var(--{name})"
     for k, name in enumerate(
@@ -44,7 +42,7 @@ CSS_VARIABLES: Final = {
     )
 }
 INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, OUTSIDE_3 = CSS_VARIABLES
-"""`WIDE` is a light, broad line that another one may lie upon."""
+"""`WIDE` is a light colour for a broad line below another one."""
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0
 PANEL_WIDTH: Final = 370.0  #: Of most figures, px
@@ -56,12 +54,12 @@ _LONG_DECIMAL: Final = re.compile(r"-?\d+\.\d{3,}")
 _FONT_FAMILY: Final = re.compile(r"font-family:[^;]*;?\s*")
 _REFERENCE: Final = re.compile(r"url\(#([^)]+)\)")
 _LABEL_LENGTH: Final = 28
-FEWEST_FOR_A_BOX: Final = 5  #: Quartiles of fewer are nearly the values themselves
+FEWEST_FOR_A_BOX: Final = 5  #: Fewest values that a box summarises
 _settings = threading.RLock()
 
 
 class Caption(NamedTuple):
-    """Words of a panel: `key` makes its ids unique in the page, `what` says what it shows."""
+    """Texts of a panel: `key` makes its ids unique in the page, `what` is the description."""
 
     key: str
     title: str
@@ -70,7 +68,7 @@ class Caption(NamedTuple):
 
     @property
     def alt(self) -> str:
-        """What is read to those who cannot see it."""
+        """Alternative text."""
         parts = [f"{self.title}: {self.what}", self.note]
         return (
             "; ".join("".join(c if c.isprintable() else " " for c in p) for p in parts if p) + "."
@@ -79,23 +77,23 @@ class Caption(NamedTuple):
 
 @dataclass(frozen=True)
 class Panel:
-    """One drawing: `title` stands above it, `note` beside the title."""
+    """One drawing with the title above it and a note beside the title."""
 
     title: str
     note: str
     svg: Markup
-    width: float  #: Width [px] at which its letters have their intended size
+    width: float  #: Nominal width [px]
 
 
 def blank(width: float, height: float) -> Figure:
-    """A transparent figure of `width` x `height` page pixels."""
+    """Return a transparent figure of `width` x `height` page pixels."""
     figure = Figure(figsize=(width / 72.0, height / 72.0))
     figure.patch.set_visible(False)
     return figure
 
 
 def place(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Axes at (`left`, `top`) pixels from the upper left corner of the figure."""
+    """Return axes at (`left`, `top`) pixels from the upper left corner of the figure."""
     full_width, full_height = figure.get_size_inches() * 72.0
     bottom = (full_height - top - height) / full_height
     axes = figure.add_axes(
@@ -112,7 +110,7 @@ def place(figure: Figure, left: float, top: float, width: float, height: float) 
 
 
 def log_ticks(axis: Axis, locator: Locator) -> None:
-    """Ticks of a logarithmic axis as decimal numbers, and none between them."""
+    """Set decimal ticks on a logarithmic axis, without minor ticks."""
     axis.set_major_locator(locator)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
@@ -121,36 +119,33 @@ def log_ticks(axis: Axis, locator: Locator) -> None:
 def ruled(
     axes: Axes, axis: Literal["x", "y", "both"], *, x_ticks: int = 5, y_ticks: int = 4
 ) -> None:
-    """Light rules at few, round ticks."""
+    """Draw a light grid at few, round ticks."""
     axes.grid(True, axis=axis, color=GRID, linewidth=0.8)
     axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_locator(MaxNLocator(y_ticks, steps=[1, 2, 5, 10]))
 
 
 def headed(axes: Axes, text: str) -> None:
-    """`text` (what the vertical axis is, and its unit) above the axes, to be read level."""
+    """Write quantity and unit of the vertical axis above the axes."""
     axes.set_title(text, loc="left", fontsize=TEXT_SIZE, color=MUTED, pad=5.0)
 
 
 def footed(axes: Axes, text: str) -> None:
-    """`text` below the axes."""
+    """Write `text` below the axes."""
     axes.set_xlabel(text, fontsize=TEXT_SIZE, color=MUTED, labelpad=3.0)
 
 
 def dots(axes: Axes, x: Array, y: Array, color: str, size: float = 2.2) -> None:
-    """Small dots at (c,) points as one path, a tenth of what c marks would take of the page."""
+    """Draw small dots at (c,) points as one path, a tenth of the size of c markers."""
     gap = np.full(x.shape, np.nan)
-    # A line without length, with round ends, is a dot.
+    # A line of zero length with round caps is a dot.
     rows = [np.column_stack([v, v, gap]).ravel() for v in (x, y)]
     with mpl.rc_context({"path.simplify": False}):
         axes.plot(*rows, color=color, linewidth=size, solid_capstyle="round")
 
 
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
-    """Lowest and highest sample of each of `bins` equal stretches, in order; (m,) -> (<= 2 bins,).
-
-    Unlike taking every k-th sample this keeps every peak that a screen could show.
-    """
+    """Return minimum and maximum of each of `bins` equal intervals, (m,) -> (<= 2 bins,)."""
     if time.size <= 2 * bins:
         return time, values
     edges = np.linspace(0, time.size, bins + 1).astype(np.intp)
@@ -161,7 +156,7 @@ def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
 
 
 def runs(time: Array, values: Array, bins: int = 500) -> Iterator[tuple[Array, Array]]:
-    """Stretches of finite values (m,), each :func:`thinned`, with so many bins in all."""
+    """Yield intervals of finite values (m,), each :func:`thinned`, with `bins` bins in total."""
     edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
@@ -169,12 +164,9 @@ def runs(time: Array, values: Array, bins: int = 500) -> Iterator[tuple[Array, A
 
 @contextmanager
 def drawing() -> Iterator[None]:
-    """Draw inside this: matplotlib's own defaults, whatever the caller's settings are.
-
-    The settings of matplotlib belong to the process, hence one figure at a time.
-    """
+    """Draw with the default settings of matplotlib, one thread at a time (settings are global)."""
     with _settings, warnings.catch_warnings(), mpl.rc_context():
-        # Letters are left to the page's fonts; that DejaVu lacks one does not matter.
+        # Text is drawn with the fonts of the page; glyphs missing in DejaVu do not matter.
         warnings.filterwarnings("ignore", message=r"Glyph \d+")
         mpl.rcdefaults()
         mpl.rcParams.update(
@@ -184,13 +176,13 @@ def drawing() -> Iterator[None]:
 
 
 def label(text: str) -> str:
-    """A name fit for a figure: one line, printable, not too long."""
+    """Shorten a name to one printable line."""
     line = "".join(c if c.isprintable() else " " for c in text).strip()
     return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
 
 
 def to_panel(figure: Figure, caption: Caption, traces: str = "") -> Panel:
-    """`figure` as SVG; with `traces` (see :func:`traces_text`) a reader can zoom into it."""
+    """Return a figure as SVG; `traces` (see :func:`traces_text`) make it zoomable."""
     out = io.BytesIO()
     metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(out, format="svg", metadata=metadata)
@@ -245,7 +237,7 @@ def _rename_ids(root: ET.Element, key: str) -> None:
 
 
 def _restyle(element: ET.Element) -> None:
-    """Page fonts, page colours, and no more decimals than a screen has."""
+    """Apply fonts and colours of the page, and round coordinates."""
     style = element.get("style")
     if style:
         style = _FONT_FAMILY.sub("", style)
@@ -261,9 +253,9 @@ def _restyle(element: ET.Element) -> None:
         del element.attrib["transform"]
 
 
-MOST_POINTS: Final = 3000  #: Of a line; more than three times what a panel shows at once
+MOST_POINTS: Final = 3000  #: Samples of a line; for a zoom of more than three
 _STEPS: Final = 65534
-_NOTHING: Final = 65535  # Stands where nothing was recorded
+_NOTHING: Final = 65535  # Code of a missing sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,8 +265,8 @@ class Trace:
     values: Array  #: (m,); NaN where nothing was recorded
     colour: str  #: of the palette
     width: float  #: of the line [px]
-    name: str  #: what it is, in a word
-    dashed: bool = False  #: so that two of a colour's lightness differ in print
+    name: str  #: label
+    dashed: bool = False  #: for print
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,10 +274,10 @@ class Plot:
     """Axes of a panel with time to the right."""
 
     box: tuple[float, float, float, float]  #: left, top, width and height in the panel [px]
-    heading: str  #: what stands above: the quantity and its unit
+    heading: str  #: quantity and unit
     traces: Sequence[Trace]  #: its lines, the lowest first
     limits: Sequence[float] = ()  #: values at which dashed lines are drawn
-    #: stretches of time [s] that are shaded, from the first instant on
+    #: shaded intervals of time, from the first sample [s]
     shaded: Sequence[tuple[float, float]] = ()
     #: largest value of a range about zero; the range of the lines if None
     reach: float | None = None
@@ -294,10 +286,10 @@ class Plot:
 def traces_text(
     time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS, marks: Sequence[float] = ()
 ) -> str:
-    """Plots over time (m,) [s] as the page's script reads them: JSON.
+    """Return plots over time (m,) [s] as JSON for the script of the page.
 
-    Lines are resampled evenly, to at most `points`; "" where there is nothing to zoom into. At
-    `marks` upright lines are drawn [s].
+    Lines are resampled evenly to at most `points`; "" for fewer than two samples. Vertical lines
+    are drawn at `marks` [s].
     """
     if time.size < 2 or not time[-1] > time[0]:
         return ""
@@ -349,10 +341,7 @@ def panel(
     right: float = 10.0,
     bottom: float = 40.0,
 ) -> Iterator[Axes]:
-    """Axes to draw on, of the page's usual width; what was drawn is then added to some panels.
-
-    Above the axes stands the quantity and its unit; beside them there is room for labels [px].
-    """
+    """Yield axes of the usual width, and append the drawing to `panels`; margins in px."""
     with drawing():
         figure = blank(PANEL_WIDTH, height)
         axes = place(figure, left, _TOP, PANEL_WIDTH - left - right, height - _TOP - bottom)
@@ -367,9 +356,9 @@ def panel(
 def marked(
     axes: Axes, limits: Sequence[float], colour: str, marks: Sequence[tuple[float, str]]
 ) -> None:
-    """Dashed lines at limits that are within reach of the values, dotted ones at instants."""
+    """Draw dashed lines at limits inside the range of the axis, dotted ones at instants."""
     low, high = axes.get_ylim()
-    if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:  # noise at rest does not fill the page
+    if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:  # noise at standstill is not magnified
         low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
     for limit in limits:
         if low <= limit <= high:
@@ -391,10 +380,7 @@ def time_panel(
     foot: str = "time [s]",
     marks: Sequence[tuple[float, str]] = (),
 ) -> Panel:
-    """Plots over the same time, one above the other, with their samples to zoom into.
-
-    At `marks` dotted lines are drawn: time [s] and colour.
-    """
+    """Draw plots over the same time, one above the other, zoomable; `marks` are time and colour."""
     with drawing():
         figure = blank(width, height)
         for k, plot in enumerate(plots):
@@ -434,10 +420,7 @@ def box_panel(
     labels: Sequence[str] = (),
     level: float = math.nan,
 ) -> Panel:
-    """Columns of values (m,) side by side: each value as a dot, and a box where there are enough.
-
-    At `level` a dashed line is drawn.
-    """
+    """Draw columns of values (m,) as dots with a box, and a dashed line at `level`."""
     lines = max([label.count("\n") for label in labels], default=-1) + 1
     thin = {"color": MUTED, "linewidth": 1.1}
     with drawing():
@@ -457,7 +440,7 @@ def box_panel(
                     whiskerprops=thin,
                     capprops=thin,
                 )
-            # Side steps that keep neighbours in value apart; the golden ratio never lines up.
+            # Horizontal offsets by the golden ratio separate neighbouring values.
             rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
             side = k + 0.34 * ((rank * 0.6180339887498949) % 1.0 - 0.5)
             axes.scatter(side, values, s=14.0, color=colour, alpha=0.85, linewidths=0.0, zorder=3)
@@ -467,7 +450,7 @@ def box_panel(
         axes.set_xticks(range(1, len(columns) + 1) if labels else [], labels, fontsize=TICK_SIZE)
         axes.set_xlim(0.4, len(columns) + 0.6)
         axes.tick_params(axis="x", length=0.0)
-        # A scale that shows every value, and never makes a small change look large.
+        # A scale that shows every value and does not exaggerate small changes.
         every = np.concatenate([*columns, [level] if math.isfinite(level) else []])
         middle = float(np.median(every))
         low, high = min(float(every.min()), 0.9 * middle), max(float(every.max()), 1.1 * middle)

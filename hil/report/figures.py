@@ -1,4 +1,4 @@
-"""Figures of the report: panels, one for each joint or stretch of parameters."""
+"""Figures of the report: one panel for each joint."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ PARTS: Final = (
     ("coriolis", ROUTES[3], 1.2),
     ("friction", SECOND, 1.2),
 )
-"""Parts of a predicted torque with their colours and widths, the lowest line first."""
+"""Contributions to the predicted torque with colours and line widths, in order of drawing."""
 
 
 class Joint(NamedTuple):
-    """A joint in figures of the example: its number from 0, name, unit of torque, and its error."""
+    """A joint with its number from 0, name, unit of torque, and error on the example."""
 
     number: int
     name: str
@@ -81,7 +81,7 @@ class Joint(NamedTuple):
 
 
 def joints_of(results: Results) -> list[Joint]:
-    """Joints with their errors on the example: the first run, or what was fitted."""
+    """Return the joints with their errors on the first run, or else on the fitted recording."""
     units = [joint.unit for joint in results.judgement.joints] if results.judgement else []
     example: ValidationResult | FittedResult | None = None
     if results.validation:
@@ -92,10 +92,10 @@ def joints_of(results: Results) -> list[Joint]:
     def error(j: int) -> str:
         if example is None:
             return ""
-        words = f"error {percent(example.relative_error[j])} %"
+        text = f"error {percent(example.relative_error[j])} %"
         if example.all_rows_joint_errors:
-            words += f", every row {percent(example.all_rows_joint_errors[j])} %"
-        return words
+            text += f", all rows {percent(example.all_rows_joint_errors[j])} %"
+        return text
 
     return [
         Joint(j, name, units[j] if units else "N·m", error(j))
@@ -107,7 +107,7 @@ def joints_of(results: Results) -> list[Joint]:
 
 
 def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[Panel]:
-    """Position and velocity of each joint (the paper's Fig. 1)."""
+    """Draw position and velocity of each joint (paper, Fig. 1)."""
     time = series.excitation_time - series.excitation_time[0]
     panels = []
     for j, name in enumerate(joint_names):
@@ -125,7 +125,7 @@ def excitation_panels(series: ReportSeries, joint_names: Sequence[str]) -> list[
 
 
 def torque_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Measured and predicted torque of each joint, and their difference (the paper's Fig. 4)."""
+    """Draw measured and predicted torque of each joint, and their difference (paper, Fig. 4)."""
     if series.example_time.size == 0:
         return []
     time = series.example_time - series.example_time[0]
@@ -145,7 +145,7 @@ def torque_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
 
 
 def split_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Predicted torque of each joint split, and the measured one behind it."""
+    """Draw the contributions to the predicted torque of each joint, and the measured torque."""
     if series.example_time.size == 0 or series.example_gravity.size == 0:
         return []
     time = series.example_time - series.example_time[0]
@@ -170,12 +170,12 @@ def _plot(
     traces: Sequence[Trace],
     shaded: Sequence[tuple[float, float]],
 ) -> Plot:
-    """A plot of the panels' width at its place below their upper edge [px]."""
+    """Return a plot of the panel width, `top` below the upper edge [px]."""
     return Plot((_LEFT, top, _INNER, height), heading, traces, shaded=shaded)
 
 
 def _left_out(time: Array, used: Array, joint: int) -> Sequence[tuple[float, float]]:
-    """Stretches of time (m,) in which rows (m, n) of a joint are zero, to midway to the next."""
+    """Return intervals of time (m,) in which rows (m, n) of a joint are zero."""
     if used.size == 0:
         return ()
     out = np.concatenate([[False], used[:, joint] < 0.5, [False]])
@@ -212,12 +212,12 @@ def replay_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
 _HEIGHT, _TOP, _BOTTOM = 210.0, 20.0, 40.0
 _TURN, _GAP = 74.0, 22.0
 _ROOM: Final = 0.08
-# Points far beyond all others (a stop, a knock) may leave the axes.
+# Percentiles of the torque inside the axes; outliers may lie outside.
 _SHOWN: Final = (0.5, 99.5)
 
 
 def friction_curve_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Friction law of each joint through zero, with the data behind it."""
+    """Draw the friction law of each joint with the fitted rows."""
     known = joints if series.law_speed.size else ()
     return [_curve(series, one) for one in known if np.ptp(series.law_speed[:, one.number])]
 
@@ -244,7 +244,7 @@ def _curve(series: ReportSeries, joint: Joint) -> Panel:
         ruled(axes, "both")
         headed(axes, f"friction [{joint.unit}]")
         footed(axes, f"speed [{per}/s]")
-        if travel.size:  # dry friction that turns round, to the scale of the curve over speed
+        if travel.size:  # presliding, to the scale of the curve over speed
             turn = place(figure, _LEFT + wide + _GAP, _TOP, _TURN, height)
             turn.axhline(0.0, color=MUTED, linewidth=0.8)
             turn.plot(1e3 * travel, turning, color=SECOND, linewidth=1.8)
@@ -255,11 +255,11 @@ def _curve(series: ReportSeries, joint: Joint) -> Panel:
             headed(turn, "at reversal")
             footed(turn, f"travel [m{per}]")
         note = f"{ends} {joint.unit}".replace("-", "−")
-        return to_panel(figure, Caption(f"k{j}", joint.name, note, "friction over its speed"))
+        return to_panel(figure, Caption(f"k{j}", joint.name, note, "friction over velocity"))
 
 
 def _known(horizontal: Array, vertical: Array, j: int) -> tuple[Array, Array]:
-    """Column j of both, without what is not there."""
+    """Return column j of both without missing values."""
     if horizontal.size == 0:
         return np.empty(0), np.empty(0)
     there = np.isfinite(horizontal[:, j]) & np.isfinite(vertical[:, j])
@@ -267,7 +267,7 @@ def _known(horizontal: Array, vertical: Array, j: int) -> tuple[Array, Array]:
 
 
 def warm_up_panels(results: Results) -> list[Panel]:
-    """Friction of each joint motion by motion, and the change that it was judged by."""
+    """Draw friction of each joint motion by motion, and the largest change."""
     warm = None if results.conduct is None else results.conduct.warm_up
     if warm is None or len(warm.friction) < 2:
         return []
@@ -277,14 +277,14 @@ def warm_up_panels(results: Results) -> list[Panel]:
         known = column[np.isfinite(column)]
         if known.size:
             share = 100.0 * (known[-1] / known[0] - 1.0) if known[0] else 0.0
-            note = f"at last {significant(float(known[-1]))} N·m, {share:+.1f} %".replace("-", "−")
+            note = f"last {significant(float(known[-1]))} N·m, {share:+.1f} %".replace("-", "−")
             caption = Caption(f"wu{len(panels)}", label(name), note, "friction in the warm-up")
             with _in_order(panels, column, caption, "friction [N·m]", foot):
                 pass
     change = 100.0 * np.array(warm.change, dtype=np.float64)
     known, most = change[np.isfinite(change)], 100.0 * warm.threshold
     last = f"{known[-1]:.2g} %" if known.size else "unknown"
-    note = f"at last {last}, at most {most:.2g} % wanted"
+    note = f"last {last}, threshold {most:.2g} %"
     caption = Caption("wu", "Change per motion", note, "largest change of friction")
     with _in_order(panels, change, caption, "largest change per motion [%]", foot) as axes:
         axes.axhline(most, color=SECOND, linewidth=1.3, linestyle=DASHED)
@@ -296,7 +296,7 @@ def warm_up_panels(results: Results) -> list[Panel]:
 def _in_order(
     panels: list[Panel], values: Array, caption: Caption, heading: str, foot: str
 ) -> Iterator[Axes]:
-    """Values motion by motion, on a scale that does not make a small change look large."""
+    """Draw values motion by motion, on a scale that does not exaggerate small changes."""
     known = values[np.isfinite(values)]
     room = max(0.1 * np.ptp(known), 0.025 * abs(float(known[-1]))) if known.size else 1.0
     with panel(panels, 180.0, caption, heading, foot, left=50.0, right=12.0, bottom=42.0) as axes:
@@ -308,18 +308,18 @@ def _in_order(
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
 
 
-# What the residual follows
+# Residuals
 
 
 def residual_panels(results: Results) -> dict[str, list[Panel]]:
-    """By name: what the residual of each joint follows; {} where nothing was judged."""
+    """Draw the residual of each joint over speed, position, lag and time; {} without judgement."""
     judgement = results.judgement
     if judgement is None:
         return {}
     speed, position, autocorrelation, friction = (list[Panel]() for _ in range(4))
     lag = [1e3 * one for one in judgement.lag]
     shares = 100.0 * np.array(judgement.friction_over_time or [], dtype=np.float64)
-    # The same scale for all, and never one that makes a change of nothing look like much.
+    # One scale for all joints, which does not exaggerate small changes.
     reach = max(2.0, 1.15 * np.abs(shares[np.isfinite(shares)]).max(initial=0.0))
     for j, joint in enumerate(judgement.joints):
         angle = "rad" if joint.unit == "N·m" else "m"
@@ -336,7 +336,7 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
             with panel(panels, 170.0, caption, heading, foot) as axes:
                 axes.axhspan(-joint.rms, joint.rms, color=BAND, linewidth=0.0)
                 axes.axhline(0.0, color=MUTED, linewidth=0.9)
-                # No line across a bin that was not seen.
+                # NaN interrupts the line at empty bins.
                 axes.errorbar(
                     profile.centre, mean, yerr=_INTERVAL * std, color=FIRST, marker="o",
                     markersize=4.5, linewidth=1.2, elinewidth=1.2, capsize=2.5,
@@ -345,7 +345,7 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
         column = judgement.autocorrelation[j]
         values = [value for value in column if value is not None]
         if len(values) == len(column):
-            note = f"worth {judgement.effective_rows[j]:.0f} independent samples"
+            note = f"equivalent to {judgement.effective_rows[j]:.0f} independent samples"
             caption = Caption(f"w{j}", joint.joint, note, "autocorrelation of the residual")
             heading = "autocorrelation of the residual"
             with panel(autocorrelation, 170.0, caption, heading, "lag [ms]") as axes:
@@ -356,7 +356,7 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
                 ruled(axes, "both", x_ticks=6)
         there = np.flatnonzero(np.isfinite(shares[j])) if j < len(shares) else np.empty(0, np.intp)
         if there.size:
-            axis = "friction beside the estimate [%]", "recording, or equal part of one, in order"
+            axis = "friction minus estimate [%]", "recording, or equal part of one, in order"
             caption = Caption(f"f{j}", joint.joint, "", "friction over the recordings")
             with panel(friction, 150.0, caption, *axis) as axes:
                 axes.axhline(0.0, color=MUTED, linewidth=0.9)
@@ -373,11 +373,11 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
 
 
 _FREQUENCY_TICKS: Final = [m * 10.0**e for e in range(-2, 5) for m in (1, 3)]
-_DEEPEST: Final = 1e-5  # of the highest: below it lies rounding
+_DEEPEST: Final = 1e-5  # of the highest, below which is rounding noise
 
 
 def spectrum_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Amplitude spectra of measured torque and residual of each joint on the example."""
+    """Draw amplitude spectra of measured torque and residual of each joint on the example."""
     panels: list[Panel] = []
     frequency = series.spectrum_frequency
     for j, name, unit, _ in joints if frequency.size > 1 else ():
@@ -405,7 +405,7 @@ def spectrum_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel
 
 
 def error_boxes(results: Results) -> list[Panel]:
-    """Mean |e| of every validation run, one panel and scale per joint; one run has no spread."""
+    """Draw mean |e| of the validation runs of each joint; [] for fewer than two runs."""
     every = np.array([run.mean_abs_error for run in results.validation])
     if len(every) < 2 or not np.isfinite(every).any(axis=0).all():
         return []
@@ -428,7 +428,7 @@ _SMALLEST_CELL, _LARGEST_CELL = 11.0, 26.0
 
 
 def correlation_matrix(results: Results) -> Panel | None:
-    """|Ψ_ij| / sqrt(Ψ_ii Ψ_jj): 0 white, 1 black; friction left out, as in the paper."""
+    """Draw |Ψ_ij| / sqrt(Ψ_ii Ψ_jj) of the base parameters, 0 white, 1 black (paper, Fig. 2)."""
     n = results.n_base
     if n == 0:
         return None
@@ -437,7 +437,7 @@ def correlation_matrix(results: Results) -> Panel | None:
 
 
 def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> Panel:
-    """|ρ| of a normalised matrix (n, n), one label for each row."""
+    """Draw |ρ| of a normalised matrix (n, n), one label for each row."""
     n, matrix = len(labels), np.abs(matrix)
     names = [label(text) for text in labels]
     note = f"{int(np.sum(np.triu(matrix, 1) > 0.9))} of {n * (n - 1) // 2} pairs above 0.9"
@@ -464,7 +464,7 @@ def matrix_panel(matrix: Array, labels: Sequence[str], key: str, title: str) -> 
 
 
 def shade_scale(axes: Axes, ink: str = INK, muted: str = MUTED) -> None:
-    """The shade scale, as an image of its own (a colour bar would be 256 rectangles)."""
+    """Draw the grey scale as one image; a colour bar would be 256 rectangles."""
     shades = np.linspace(1.0, 0.0, 64)[:, None]
     axes.imshow(
         shades, cmap="gray_r", vmin=0.0, vmax=1.0, aspect="auto", extent=(0.0, 1.0, 0.0, 1.0)

@@ -1,6 +1,6 @@
-"""Numbers as a reader wants them: as many digits as mean something, and no more.
+"""Formats of numbers in tables.
 
-Minus is the ASCII hyphen, so that a table pasted into a spreadsheet stays a table of numbers.
+Minus is the ASCII hyphen, so that tables can be pasted into a spreadsheet.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ _MOST_DECIMALS = 6
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """`value` with `digits` significant digits; an exponent only where zeros would pile up."""
+    """Format with `digits` significant digits; with an exponent below 1e-4 and from 1e6."""
     if value is None or not math.isfinite(value) or value == 0.0:
         return fixed(value, 0)
     if not _SMALLEST_DECIMAL <= abs(value) < _LARGEST_DECIMAL:
         return _short_exponent(f"{value:.{digits - 1}e}")
-    # Rounding first: 9.996 to three digits is 10.0, with one decimal and not two.
+    # Round first: 9.996 to three digits is 10.0.
     exponent = int(f"{abs(value):.{digits - 1}e}".split("e")[1])
     return fixed(value, max(0, digits - 1 - exponent))
 
 
 def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
-    """`value` with `decimals` decimals; never "-0.00"."""
+    """Format with `decimals` decimals; never "-0.00"."""
     if value is None or math.isnan(value):
         return MISSING
     if math.isinf(value):
@@ -35,7 +35,7 @@ def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
 
 
 def beside(value: float | None, std: float) -> str:
-    """`value` rounded where the second significant digit of `std` stands."""
+    """Round `value` at the second significant digit of `std`."""
     if value is None or value == 0.0:
         return significant(value)
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
@@ -50,7 +50,7 @@ def beside(value: float | None, std: float) -> str:
 
 
 def percent(fraction: float | None, decimals: int | None = None) -> str:
-    """A fraction in per cent, without the sign: the column head carries it."""
+    """Format a fraction in per cent, without the % sign."""
     if fraction is None or math.isnan(fraction) or decimals is not None:
         return fixed(None if fraction is None else 100.0 * fraction, decimals or 0)
     size = abs(100.0 * fraction)
@@ -60,24 +60,24 @@ def percent(fraction: float | None, decimals: int | None = None) -> str:
 
 
 def with_std(value: float | None, std: float | None) -> str:
-    """`value ± std`; the value alone if it is exact, and none where either is not known."""
+    """Format `value ± std`; the value alone if it is exact, a dash if either is missing."""
     if value is None or std is None or not math.isfinite(value) or not math.isfinite(std):
         return MISSING
     return f"{beside(value, std)} ± {significant(std, 2)}" if std > 0.0 else significant(value)
 
 
 def speed_text(speed: float | None, unit: str) -> str:
-    """A speed at which friction is compared; None or NaN is any."""
+    """Format the speed at which friction is compared; None or NaN is any."""
     return "any speed" if speed is None or math.isnan(speed) else f"{speed:.2g} {unit}"
 
 
 def unit_text(unit: str) -> str:
-    """A unit as pages print it: N·m for `N m`."""
+    """Replace blanks of a unit: N·m for `N m`."""
     return unit.replace(" ", "·")
 
 
 def capitalised(text: str) -> str:
-    """A text with a capital first letter, all others as they are."""
+    """Capitalise the first letter only."""
     return text[:1].upper() + text[1:]
 
 

@@ -1,7 +1,4 @@
-"""The page: results and series in, one self-contained HTML file out.
-
-Templates read the results themselves; here is what has to be computed for them.
-"""
+"""Identification report: results and series to one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -18,14 +15,14 @@ from hil.report.series import ReportSeries
 from hil.results import ChoiceResult, RecordedResult, Results, UncertaintyResult, outside_mark
 
 _MOST_CANDIDATES: Final = 6
-"""Candidates of one choice that are shown: the first, and the best of the others."""
+"""Candidates shown of one choice: the first, and the best of the others."""
 
 
 def report_bytes(results: Results, series: ReportSeries) -> bytes:
-    """The report as one HTML file; the same input gives the same bytes.
+    """Return the report as one HTML file; the same input gives the same bytes.
 
     Raises:
-        SeriesError: the series belong to another number of joints than the results.
+        SeriesError: series and results have different numbers of joints.
     """
     series = series.checked_for(len(results.joint_names))
     joints, runs = figures.joints_of(results), results.validation
@@ -62,9 +59,9 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
 
 
 def every_row_errors(results: Results) -> list[float]:
-    """Error of each joint over every row, as a share; empty where no file says it.
+    """Return the error of each joint over all rows, as a fraction; [] for older results.
 
-    The median of the runs on unseen motion, or the error on what was fitted.
+    It is the median of the held-out runs, or the error on fitted motion.
     """
     known = [run.all_rows_joint_errors for run in results.validation]
     if not known and results.fitted is not None:
@@ -73,7 +70,7 @@ def every_row_errors(results: Results) -> list[float]:
 
 
 def routes(results: Results) -> dict[str, dict[str, Any]]:
-    """The routes to a standard deviation that were computed, compared with the reported one."""
+    """Return the computed methods for the standard deviation, compared with the reported one."""
     uncertainty, reported = results.uncertainty, np.array([p.std for p in results.parameters])
     far = np.array(
         [abs(p.estimate - p.truth) if p.truth is not None else np.nan for p in results.parameters]
@@ -93,30 +90,28 @@ def routes(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def shown_candidates(choice: ChoiceResult) -> list[int]:
-    """Indices of the candidates of a choice that the page shows, the first one first."""
+    """Return the indices of the candidates to show, the first one first."""
     errors = [math.inf if error is None else error for error in choice.errors]
     shown = list(range(len(errors)))
     if len(shown) <= _MOST_CANDIDATES:
         return shown
-    # The first is the simplest, against which the others had to pay: least squares.
+    # The first is the default, with which the others were compared.
     best = sorted(shown[1:], key=lambda k: (k != choice.chosen, errors[k]))
     return [0, *best[: _MOST_CANDIDATES - 1]]
 
 
 def when(recorded: Sequence[RecordedResult]) -> str:
-    """From the first archive's begin to the last one's, in a sentence."""
+    """Format the time from the start of the first archive to that of the last."""
     begins = sorted(one.when for one in recorded if one.when is not None)
     if not begins:
-        return (
-            "No date is on record; virtual time has none." if recorded else "Nothing was recorded."
-        )
+        return "No date: virtual time." if recorded else "Nothing was recorded."
     first, last = (one[:16].replace("T", " ") for one in (begins[0], begins[-1]))
     if first[:10] == last[:10]:
         last = last[11:]
-    return f"{first} to {last}, where the last motion began (UTC)."
+    return f"{first} to {last} (UTC, start of the first and the last motion)."
 
 
 def motion_name(one: RecordedResult) -> str:
-    """The motion of an archive as a person calls it."""
+    """Return the motion of an archive, such as "repetition 2"."""
     name = ArchiveName.parse(one.archive)
     return one.kind if name is None else name.motion

@@ -1,4 +1,4 @@
-"""What every page is made with: the templates, and the numbering of figures and tables."""
+"""Templates of the pages, and the numbering of figures and tables."""
 
 from __future__ import annotations
 
@@ -25,16 +25,12 @@ _FORMATS: Final = (
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
 )
-"""Control characters, and those that turn the order of the others (Unicode Annex 9)."""
+"""Control characters, and those that change the text direction (Unicode Annex 9)."""
 
 
 def environment() -> Environment:
-    """The templates of the pages: `page.html.j2` is what all of them extend.
-
-    It has the one style sheet and the one script that the policy of the page lets run, and the
-    formats of :mod:`hil.report.numbers` as filters.
-    """
-    # Autoescape without conditions: names come out of archives, and archives out of anywhere.
+    """Return the template environment, with the formats of :mod:`hil.report.numbers` as filters."""
+    # Autoescape always: names come from archives, which may be untrusted.
     found = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -45,7 +41,7 @@ def environment() -> Environment:
     )
     style, script = ((_TEMPLATES / name).read_text("utf-8") for name in (_STYLE, _SCRIPT))
     found.globals |= {"style": Markup(style), "script": Markup(script), "policy": policy(script)}
-    # Figures and tables are numbered in the order in which the page shows them.
+    # Figures and tables are numbered in the order of the page.
     figures, tables = itertools.count(1), itertools.count(1)
     numbering = {"figure": lambda: next(figures), "table": lambda: next(tables)}
     found.globals |= {"numbers": numbers, "numbering": numbering}
@@ -55,14 +51,14 @@ def environment() -> Environment:
 
 
 def _shown(value: object) -> object:
-    """A text with what turns others round written out; anything else as it is."""
+    """Escape control and direction characters of a text."""
     if isinstance(value, Markup) or not isinstance(value, str):
         return value
     return _STEERING.sub(lambda found: written_out(found[0]), value)
 
 
 def policy(script: str) -> str:
-    """What a browser lets the page do: nothing from outside, and no script but this one."""
+    """Return the content security policy: no external resource, and this script only."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "
@@ -71,6 +67,6 @@ def policy(script: str) -> str:
 
 
 def page_bytes(text: str) -> bytes:
-    """A page as it is written; the same text gives the same bytes."""
-    # A name read from an archive may hold what UTF-8 cannot; the page must come out all the same.
+    """Encode a page."""
+    # A name from an archive may contain lone surrogates, which UTF-8 cannot encode.
     return text.encode("utf-8", errors="replace")

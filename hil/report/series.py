@@ -1,4 +1,4 @@
-"""The time series behind the figures; everything else is in the results."""
+"""Time series for the figures of the report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _TOO_LARGE: Final = 1e100
 
 
 class SeriesError(ValueError):
-    """A series does not fit the others, or holds what cannot be drawn: names field and shapes."""
+    """A series has a wrong shape or values that cannot be drawn."""
 
 
 # The field whose length each letter is; n is the number of joints.
@@ -35,57 +35,54 @@ def _empty() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ReportSeries:
-    """Motion of the excitation, one validation run in time, and what friction and residual are.
+    """Motion of the excitation, one validation run, friction and residual.
 
-    Shapes stand beside the types, n being the number of joints. Times are in s; torques in N·m, of
-    joints that slide in N; likewise rad is m. Series with a default may be empty: figures that need
-    them are then left out.
+    Shapes are in the annotations, with n joints. Units are s, rad, N·m; of prismatic joints m, N.
+    Series with a default may be empty; their figures are then omitted.
 
     Raises:
-        SeriesError: the shapes do not belong together.
+        SeriesError: shapes are inconsistent.
     """
 
     excitation_time: Annotated[Array, "m"]
     excitation_position: Annotated[Array, "mn"]
     excitation_velocity: Annotated[Array, "mn"]
     example_archive: str  #: name of the archive the example was read from
-    example_time: Annotated[Array, "k"]  #: empty where no validation run exists
+    example_time: Annotated[Array, "k"]  #: empty without a validation run
     #: low-passed for display
     example_measured: Annotated[Array, "kn"]
     example_predicted: Annotated[Array, "kn"]
-    #: 1 where the row was fitted and 0 where not
+    #: 1 for fitted rows, else 0
     excitation_fitted: Annotated[Array, "mn"] = field(default_factory=_empty)
-    #: 1 where the row counts in the error of the verdict, else 0
+    #: 1 for rows used for the error of the verdict, else 0
     example_used: Annotated[Array, "kn"] = field(default_factory=_empty)
-    #: parts of the predicted torque, which add up to it
+    #: contributions to the predicted torque
     example_inertia: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_coriolis: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_gravity: Annotated[Array, "kn"] = field(default_factory=_empty)
     example_friction: Annotated[Array, "kn"] = field(default_factory=_empty)
-    #: of fitted rows, the measured torque less what is predicted without friction; NaN where there
-    #: are fewer
+    #: measured torque of fitted rows minus prediction without friction; padded with NaN
     friction_speed: Annotated[Array, "cn"] = field(default_factory=_empty)
     friction_torque: Annotated[Array, "cn"] = field(default_factory=_empty)
-    #: along the friction law of sliding, without presliding
+    #: friction law without presliding
     law_speed: Annotated[Array, "sn"] = field(default_factory=_empty)
     law_torque: Annotated[Array, "sn"] = field(default_factory=_empty)
-    #: displacement since a reversal and torque of a joint that creeps forwards after it has gone
-    #: backwards; NaN where friction jumps
+    #: displacement and friction torque after a reversal at low speed; NaN without presliding
     reversal_travel: Annotated[Array, "rn"] = field(default_factory=_empty)
     reversal_torque: Annotated[Array, "rn"] = field(default_factory=_empty)
     spectrum_frequency: Annotated[Array, "f"] = field(default_factory=_empty)  #: [Hz]
-    #: of the example, every row [N·m/√Hz]
+    #: of the example, all rows [N·m/√Hz]
     spectrum_torque: Annotated[Array, "fn"] = field(default_factory=_empty)
     spectrum_residual: Annotated[Array, "fn"] = field(default_factory=_empty)
     #: of the smoothed positions of the example [Hz]; NaN where unknown
     motion_bandwidth: Annotated[Array, "n"] = field(default_factory=_empty)
     replay_time: Annotated[Array, "q"] = field(default_factory=lambda: np.empty(0))
-    #: simulated less recorded position of the identified and of the nominal model [° or mm]
+    #: simulated minus recorded position of the identified and the nominal model [° or mm]
     replay_error: Annotated[Array, "qn"] = field(default_factory=_empty)
     replay_nominal: Annotated[Array, "qn"] = field(default_factory=_empty)
     #: standard deviation of variants of the identified model
     replay_spread: Annotated[Array, "qn"] = field(default_factory=_empty)
-    replay_words: str = ""  #: why the identified model drifts, a sentence a line
+    replay_words: str = ""  #: causes of drift of the identified model, one sentence per line
 
     def __post_init__(self) -> None:
         position = self.excitation_position
@@ -101,11 +98,10 @@ class ReportSeries:
                 continue
             shape = tuple(sizes[letter] for letter in letters[0])
             numbers = found.dtype == np.float64
-            # No number is so large that an axis cannot be divided.
             if found.shape != shape or not numbers or np.any(np.abs(found) >= _TOO_LARGE):
                 raise SeriesError(
-                    f"{one.name} has shape {found.shape}, or is of no numbers that can be drawn; "
-                    f"{shape} was expected"
+                    f"{one.name} has shape {found.shape} (expected {shape}), or values that "
+                    "cannot be drawn"
                 )
 
     @property
@@ -114,10 +110,10 @@ class ReportSeries:
         return int(self.excitation_position.shape[1])
 
     def checked_for(self, n_joints: int) -> ReportSeries:
-        """Itself, if it has `n_joints` columns.
+        """Check the number of joints.
 
         Raises:
-            SeriesError: it has another number of joints.
+            SeriesError: it differs.
         """
         if self.n_joints != n_joints:
             raise SeriesError(f"excitation_position has {self.n_joints} columns, not {n_joints}")

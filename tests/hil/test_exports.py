@@ -426,7 +426,7 @@ class TestCommand:
         few = ("replay", "--ensemble", "2")
         for words in (("identify",), (*few, "--estimator", "ols"), few, ("identify",)):
             command(*words, tmp_path)
-            reports.append("Simulated forwards" in (tmp_path / "report.html").read_text())
+            reports.append("Forward simulation" in (tmp_path / "report.html").read_text())
         assert reports == [False, False, True, False]
 
     def test_a_folder_without_archives_is_refused(self, tmp_path: Path) -> None:

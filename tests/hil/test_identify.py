@@ -507,7 +507,7 @@ class TestCommand:
         ran = CliRunner().invoke(app, [*command, "--output", str(tmp_path)])
         assert ran.exit_code == 0, ran.output
         assert json.loads(ran.stdout)["good"] is True
-        assert "How it was estimated" in (tmp_path / "report.html").read_text()
+        assert "Condition number" in (tmp_path / "report.html").read_text()
         written = Results.load(tmp_path / "results.json")
         assert written.estimator.name == "huber"
         assert "Huber" in written.uncertainty.method

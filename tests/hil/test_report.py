@@ -383,8 +383,8 @@ class TestPage:
     def test_says_what_was_simulated(self, whole: Page, recording: Page) -> None:
         assert "SIMULATED. No robot moved" in whole.text
         assert all(effect in whole.text for effect in make_results().effects)
-        assert "best case" not in whole.text
-        assert "best case" in rendered(make_results(effects=[])).text
+        assert "lower bound" not in whole.text
+        assert "lower bound" in rendered(make_results(effects=[])).text
         assert not {"simulated", "truth:", "planned"} & set(recording.text.lower().split())
         assert not any("Truth" in rows[0] for rows in recording.tables)
         assert len(recording.table("Estimate")) == 58
@@ -466,7 +466,7 @@ class TestEstimation:
             results.estimator.grouping,
             results.notes[0],
             results.endogeneity.sentence,
-            "58 of 58 parameters were learned from the data",
+            "58 of 58 parameters are determined by the data",
         ):
             assert words in whole.text
 
@@ -477,7 +477,7 @@ class TestEstimation:
         update = {"estimator": estimator, "parameters": parameters}
         text = rendered(recording.model_copy(update=update)).text
         assert "The recordings hold no commanded positions." in text
-        assert "Nothing: the URDF gives no inertia." in text
+        assert "None: the URDF gives no inertia." in text
 
     def test_shows_the_chosen_candidate_and_the_best(self, results: Results, whole: Page) -> None:
         estimator = results.choices[1]
@@ -489,7 +489,7 @@ class TestEstimation:
         assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
         assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
         assert "✓ ridge 0 20.00" in whole.text and "least squares 50.00" in whole.text
-        assert whole.text.count("Inner prediction:") == 1
+        assert whole.text.count("Inner prediction (cross-validation):") == 1
         assert "Inner prediction" not in rendered(make_results()).text
 
 
@@ -521,7 +521,7 @@ class TestParameters:
         assert remarks[: len(cases)] == [remark for *_, remark in cases]
 
     def test_have_routes_to_their_deviation(self, whole: Page, results: Results) -> None:
-        rows = {row["Route"]: row for row in whole.table("Route")}
+        rows = {row["Method"]: row for row in whole.table("Method")}
         assert [name.endswith("(reported)") for name in rows] == [False, False, True, False]
         pairs = zip(results.parameters, results.uncertainty.least_squares, strict=True)
         inside = sum(abs(p.estimate - p.truth) <= 2.0 * std for p, std in pairs)
@@ -546,20 +546,20 @@ class TestErrors:
 
     def test_are_of_unseen_and_fitted_motion(self, results: Results, html: str) -> None:
         head = Page(html[: html.index("<main>")])
-        median, worst, fitted = (list(row.values()) for row in head.table("Every row [%]"))
+        median, worst, fitted = (list(row.values()) for row in head.table("All rows [%]"))
         assert fitted == ["fitted", "2.10", "4.30"]
         assert median[2] == "5.00" == worst[2]
         assert float(worst[1]) >= float(median[1]) > 0.0
         assert "median of 12 runs" in median[0]
-        assert Page(html).text.count("standstill and reversals included") == 1
+        assert Page(html).text.count("includes standstill and reversals") == 1
 
     def test_over_every_row_stand_beside_each_joint(self, results: Results) -> None:
         assert page.every_row_errors(results) == [0.06] * N
         assert page.every_row_errors(make_results()) == []
-        assert all("every row 6.00 %" in one.error for one in figures.joints_of(results))
+        assert all("all rows 6.00 %" in one.error for one in figures.joints_of(results))
         alone = make_results(fitted=FITTED, validation=[], repetitions=["log.mcap"])
         assert "fitted (in-sample: nothing was held out)" in rendered(alone).text
-        assert figures.joints_of(alone)[0].error == "error 2.00 %, every row 5.00 %"
+        assert figures.joints_of(alone)[0].error == "error 2.00 %, all rows 5.00 %"
 
 
 class TestFigures:
@@ -653,18 +653,18 @@ class TestConduct:
 
     def test_is_shown_with_what_was_run_again_and_why(self, whole: Page) -> None:
         text = whole.text
-        assert "How it was run" in text
+        assert "Execution" in text
         assert "6 of 6 criteria passed" in text and "Accepted by ada" in text and "2 late" in text
         assert "Repetition 2 ( excitation_001_a1.mcap ) rejected: it was held" in text
         assert "3 packets missed (205 in a million)" in text
-        rows = whole.table("Recorded as")
+        rows = whole.table("Archive")
         assert [row["Outcome"] for row in rows] == ["completed", "▲ rejected", "completed"]
         assert [row["Missed"] for row in rows] == ["3", "0", "0"]
-        assert "0.15 %, at most 0.2 % wanted" in text
+        assert "0.15 %, threshold 0.2 %" in text
         assert "not warm" not in text
 
     def test_may_be_missing_or_empty_or_of_a_cold_arm(self) -> None:
-        assert "How it was run" not in rendered(make_results()).text
+        assert "Execution" not in rendered(make_results()).text
         text = rendered(make_results(conduct=conduct(warm_up=None, recorded=[]))).text
         assert "No archive could be read" in text and "Warm-up" not in text
         cold = conduct()
@@ -673,7 +673,7 @@ class TestConduct:
         cold["steps"] = [{"step": "warm-up", **words}]
         text = rendered(make_results(conduct=cold)).text
         assert "▲ Not warm after 3 motions" in text and "still 1.3%" in text
-        assert "the arm was not warm when the repetitions began" in text
+        assert "the arm was not warm at the first repetition" in text
 
 
 class TestNumbers:
@@ -770,9 +770,12 @@ class TestTrust:
             assert words in text
         for parameter in part.parameters:
             assert f'<th scope="row">{parameter.name}</th>' in html
-        assert "too short to tell" in Sections(arm, essential={"blind": None}).html
+        assert (
+            "too short for an independent selection"
+            in Sections(arm, essential={"blind": None}).html
+        )
         blind = BlindResult(left=7, essential=0.0612, full=0.0534)
-        words = "7 parameters predict the held-out motion with an error of 6.12%, against 5.34%"
+        words = "held-out motion with an error of 6.12%, all parameters with 5.34%"
         assert words in Sections(arm, essential={"blind": blind}).html
         html = Sections(arm, essential=None, consistency=None).html
         assert 'id="trust"' in html
@@ -782,12 +785,12 @@ class TestTrust:
         bound = "rotor inertia of elbow would be negative (-0.3)"
         html = Sections(arm, consistency={"bounds": [bound], "moved": ["mc2x", "f0_1"]}).html
         assert bound in html
-        assert "moved by more than three standard deviations: mc2x, f0_1." in html
+        assert "by more than three standard deviations: mc2x, f0_1." in html
         for joint in ("shoulder", "elbow"):
             assert f'<th scope="row">{joint}</th>' in html
         mass = arm.consistency.consistent.standard[arm.cell.model.layout.links[1, 9]]
         assert f"<td>{mass:.2f}</td>" in html
-        assert "At odds" not in Sections(arm, consistency={"moved": []}).html
+        assert "Moved by the constraints" not in Sections(arm, consistency={"moved": []}).html
         link = Sections(arm).consistency.links[0].model_copy(update={"joint": "<script>alert(1)"})
         assert "<script>" not in Sections(arm, consistency={"links": [link]}).html
 
