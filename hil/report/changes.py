@@ -133,7 +133,7 @@ def _panel(
     if not known.any():
         return
     # Matplotlib days, or campaign numbers.
-    first = instant(arm.campaigns[0].when) if arm.dated else None
+    first = parse_time(arm.campaigns[0].when) if arm.dated else None
     at = arm.time + (0.0 if first is None else first.timestamp() / _DAY)
     low, high = float((values - half)[known].min()), float((values + half)[known].max())
     # A scale that does not exaggerate small changes; distant limits may lie outside.
